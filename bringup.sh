@@ -1,0 +1,260 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+#
+# Runs the whole system on the emulated arm. This is the launch file: what is started, with which
+# parameters, stands at the end, under "The system".
+set -u
+repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
+
+usage() {
+  cat <<'EOF'
+Usage: ./bringup.sh [options]
+
+Sets up what is missing, then runs the whole system on an emulated arm and prints one status line a
+second: estimation error, anomaly A, samples learned, number of checkpoints. Ctrl-C stops it all.
+
+  --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
+                             (default: musashi_left_arm)
+  --checkpoint FILE          MAE to start from (default: train one, once, and keep it in the cache)
+  --bag DIR                  a recording instead of the emulator: no controller, no emulator
+  --explore | --no-explore   random exploration, so that learning has data (default: on)
+  --no-learner               no online learning
+  --preset default|paper     the best we can measure, or as printed in the paper (default: default)
+  --seed N                   which individual arm the emulator is (default: 0)
+  --namespace NS             run everything under /NS
+  --duration S               stop after S seconds, counted from when the system is up
+                             (default: run until Ctrl-C)
+  --record DIR               record the topics to an mcap bag
+  -h, --help                 this text
+
+Exit status: 0 at the end of --duration, 130 on Ctrl-C, 1 if a part died, 2 for a wrong option.
+EOF
+}
+
+refuse() {
+  printf 'bringup.sh: %s\n' "$1" >&2
+  exit 2
+}
+
+# --- options -------------------------------------------------------------------------------------
+
+robot=musashi_left_arm
+checkpoint=
+explore=true
+preset=default
+seed=0
+namespace=
+duration= # until Ctrl-C
+
+while [ $# -gt 0 ]; do
+  # Both "--seed 1" and "--seed=1".
+  if [[ $1 == --*=* ]]; then set -- "${1%%=*}" "${1#*=}" "${@:2}"; fi
+  case $1 in
+    --robot | --checkpoint | --bag | --preset | --seed | --namespace | --duration | --record)
+      if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
+      ;;
+  esac
+  case $1 in
+    --robot) robot=$2 && shift ;;
+    --checkpoint) checkpoint=$2 && shift ;;
+    --bag | --record) refuse "$1 is not yet available" ;;
+    --explore) explore=true ;;
+    --no-explore) explore=false ;;
+    --no-learner) ;; # there is no learner yet
+    --preset) preset=$2 && shift ;;
+    --seed) seed=$2 && shift ;;
+    --namespace) namespace=$2 && shift ;;
+    --duration) duration=$2 && shift ;;
+    -h | --help) usage && exit ;;
+    *)
+      refuse "unknown option '$1'; legal are --robot, --checkpoint, --bag, --explore,\
+ --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --help"
+      ;;
+  esac
+  shift
+done
+
+if [ -d "$repository/config/$robot" ] && [[ $robot != */* ]]; then
+  robot_directory=$repository/config/$robot
+elif [ -d "$robot" ]; then
+  robot=$(cd "$robot" && pwd -P) || exit 2
+  robot_directory=$robot
+else
+  refuse "--robot '$robot' is neither a directory nor one of: $(
+    cd "$repository/config" && for each in */; do [ -d "$each" ] && printf '%s ' "${each%/}"; done
+  )"
+fi
+if [ -n "$checkpoint" ]; then
+  if [ ! -r "$checkpoint" ] || [ ! -f "$checkpoint" ]; then
+    refuse "--checkpoint '$checkpoint' is not a file that can be read"
+  fi
+  checkpoint=$(cd "$(dirname "$checkpoint")" && pwd -P)/$(basename "$checkpoint")
+fi
+case $preset in
+  default | paper) ;;
+  *) refuse "--preset '$preset' must be default or paper" ;;
+esac
+[[ $seed =~ ^[0-9]{1,9}$ ]] || refuse "--seed '$seed' must be a whole number from 0 to 999999999"
+seed=$((10#$seed))
+if [ -n "$duration" ]; then
+  [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
+    refuse "--duration '$duration' must be a number of seconds above 0, such as 30 or 2.5"
+fi
+namespace=${namespace#/}
+[[ -z $namespace || $namespace =~ ^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$ ]] ||
+  refuse "--namespace '$namespace' must be letters, digits and _ (and / between levels)"
+
+# --- environment ---------------------------------------------------------------------------------
+
+# shellcheck source=.ci/environment.sh
+. "$repository/.ci/environment.sh"
+environment_setup
+
+# Emulated arms are nobody else's business on the network, unless the user says so.
+export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+
+logs=$(mktemp -d "$repository/log/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
+export ROS_LOG_DIR=$logs
+say "logs in $logs"
+
+# --- processes: start, watch, stop, always by pid ------------------------------------------------
+
+declare -A pid_of=()
+
+# Even if this script is killed with SIGKILL, the kernel ends what it started.
+with_us=()
+if setpriv --pdeathsig TERM true 2>/dev/null; then with_us=(setpriv --pdeathsig TERM); fi
+
+# Usage: start NAME EXECUTABLE ARGUMENT…   Output goes to NAME.log.
+start() {
+  local name=$1 executable=$2
+  shift 2
+  say "starting $name"
+  # Through $python, because a #! line cannot name a path with a space in it.
+  "${with_us[@]}" "$python" "$executables/$executable" "$@" >"$logs/$name.log" 2>&1 </dev/null &
+  pid_of[$name]=$!
+}
+
+is_running() { kill -0 "$1" 2>/dev/null; }
+
+stop() {
+  local name pid deadline=$((SECONDS + 5))
+  for pid in "${pid_of[@]}"; do kill -TERM "$pid" 2>/dev/null; done
+  for name in "${!pid_of[@]}"; do
+    pid=${pid_of[$name]}
+    while is_running "$pid" && [ $SECONDS -lt $deadline ]; do sleep 0.1; done
+    if is_running "$pid"; then
+      printf '%s\n' "$name did not stop within 5 s: killed" >&2
+      kill -KILL "$pid"
+    fi
+    wait "$pid" 2>/dev/null
+  done
+  pid_of=()
+}
+
+finish() { # STATUS
+  trap '' INT TERM HUP PIPE
+  trap - EXIT
+  stop
+  [ -z "${training-}" ] || rm -rf "$training"
+  exit "$1"
+}
+trap 'say stopping; finish 130' INT
+trap 'finish 143' TERM
+trap 'finish 129' HUP
+trap 'finish 141' PIPE
+trap 'finish $?' EXIT
+
+died() { # NAME STATUS
+  trap '' PIPE
+  printf '%s\n' "$1 ended with status $2. The end of $logs/$1.log:" >&2
+  tail -n 20 "$logs/$1.log" >&2
+  finish 1
+}
+
+# Watches everything until NAME has ended, and returns its status; any other end is a failure.
+watch_until_ended() { # NAME [SECONDS]
+  local name status deadline=${2:+$((SECONDS + $2))}
+  while true; do
+    if [ -n "$deadline" ] && [ $SECONDS -gt "$deadline" ]; then
+      printf '%s\n' "the system did not come up: $1 is still waiting after $2 s" >&2
+      tail -n 5 "$logs"/*.log >&2
+      finish 1
+    fi
+    for name in "${!pid_of[@]}"; do
+      if ! is_running "${pid_of[$name]}"; then
+        status=0
+        wait "${pid_of[$name]}" || status=$?
+        unset "pid_of[$name]"
+        [ "$name" = "$1" ] || died "$name" "$status"
+        return "$status"
+      fi
+    done
+    sleep 0.2
+  done
+}
+
+# --- checkpoint ----------------------------------------------------------------------------------
+
+# Sets $checkpoint. The name of the cached file tells what it was made from, so that another robot or
+# another network is another file.
+train_once() {
+  local cache=${XDG_CACHE_HOME:-${HOME-}/.cache}/musculoskeletal_ae hash status=0
+  mkdir -p "$cache" 2>/dev/null && [ -w "$cache" ] || cache=$repository/.cache
+  hash=$(
+    {
+      (cd "$robot_directory" && find . -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum)
+      cd "$repository/musculoskeletal_ae" &&
+        find robot mae tools/train.py -name '*.py' -print0 | LC_ALL=C sort -z |
+        xargs -0 sha256sum
+    } | sha256sum | cut -c 1-16
+  )
+  checkpoint=$cache/$(basename "$robot_directory")-$preset-$hash.safetensors
+  if [ -s "$checkpoint" ]; then
+    say "checkpoint from an earlier run: $checkpoint"
+    return
+  fi
+  # In a folder of its own, then renamed: neither an interruption nor a second run leaves half a file.
+  training=$(mktemp -d "$cache/.training-XXXXXX") || exit 1
+  [ -t 1 ] || export TQDM_MININTERVAL=5 # a progress bar in a file: a line now and then
+  say "training the MAE of $(basename "$robot_directory"), once (about a minute)"
+  "${with_us[@]}" "$python" "$executables/train" --robot "$robot" --preset "$preset" \
+    --out "$training/$(basename "$checkpoint")" \
+    > >(tee "$logs/train.log") 2>&1 </dev/null &
+  pid_of[train]=$!
+  watch_until_ended train || status=$?
+  [ $status -eq 0 ] || died train $status
+  mv -f "$training"/* "$cache"/
+  rmdir "$training"
+  training=
+}
+
+# --- The system ----------------------------------------------------------------------------------
+
+quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
+
+common=(--ros-args --params-file "$repository/config/nodes.yaml"
+  -p "robot:=$(quoted "$robot")" -p "preset:=$preset"
+  -p "seed:=$seed")
+[ -z "$namespace" ] || common+=(-r "__ns:=/$namespace")
+
+start hardware_emulator hardware_emulator "${common[@]}"
+
+[ -n "$checkpoint" ] || train_once
+common+=(-p "checkpoint:=$(quoted "$checkpoint")")
+
+start estimator estimator "${common[@]}"
+start controller controller "${common[@]}" -p "explore:=$explore"
+
+# The status line. It counts --duration from when estimates arrive, and ends after it.
+seconds=${duration:-0} # 0: without end
+[[ $seconds == *.* ]] || seconds+=.0 # a ROS double
+"${with_us[@]}" "$python" "$executables/bringup_status" "${common[@]}" \
+  -p "duration:=$seconds" 2>"$logs/bringup_status.log" </dev/null &
+pid_of[bringup_status]=$!
+
+status=0
+watch_until_ended bringup_status ${duration:+$((10#${duration%.*} + 60))} || status=$?
+if [ $status -ne 0 ] || [ -z "$duration" ]; then died bringup_status $status; fi
+say "stopping after $duration s"
+finish 0

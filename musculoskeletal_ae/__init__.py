@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate, control and simulate musculoskeletal arms with a musculoskeletal autoencoder."""

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated arm: an individual body with muscle modules and sensors, stepped without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.emulator import mechanics
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
+
+# Sensors; chosen: noise is one standard deviation, then rounded to the resolution.
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0 * np.pi / 2**14  # [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 5.0e-5  # [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 0.1  # [N]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 0.1  # [°C]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
+
+
+class Readings(NamedTuple):
+    """One sample of the arm's sensors.
+
+    Attributes:
+        theta: Joint angles [rad], shape (D,).
+        length: Muscle lengths [m], shape (M,).
+        tension: Muscle tensions [N], shape (M,).
+        temperature: Housing temperatures of the modules [°C], shape (M,).
+    """
+
+    theta: Array
+    length: Array
+    tension: Array
+    temperature: Array
+
+
+class EmulatedArm:
+    """Rigid bodies by pinocchio, muscles and modules by `mechanics`, faults on request.
+
+    Attributes:
+        robot: The geometric model that the description gives.
+        individual: The true body that `seed` picked.
+        command_timeout: Seconds without a command until the modules go safe.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int = 0,
+        individual: Individual | None = None,
+        command_timeout: float = 0.5,
+    ) -> None:
+        """Build an arm at rest, modules safe.
+
+        Args:
+            robot: The description's nominal body.
+            seed: Which individual, and its sensor noise.
+            individual: The true body; drawn from `seed` by default.
+            command_timeout: Seconds without a command until the modules go safe.
+        """
+        self.robot = robot
+        self.individual = individual or Individual(robot, seed)
+        self.command_timeout = command_timeout
+        self._rng = np.random.default_rng([seed, 0x5E45])
+        self._order = robot.kinematics.order
+        self._model = pin.Model(robot.kinematics.model)
+        self._model.armature = np.full(self._model.nv, ARMATURE)
+        self._data = self._model.createData()
+        frame = self._model.frames[robot.kinematics.end_effector_frame]
+        self._effector_joint = int(frame.parentJoint)
+        self._effector: Array = np.array(frame.placement.translation)
+        self._bare_inertia = self._model.inertias[self._effector_joint].copy()
+        self._wrench = np.zeros(6)
+        self._payload = 0.0
+        self._body = self._constants()
+        muscles, joints = robot.muscle_count, robot.joint_count
+        self._length_offset = np.zeros(muscles)
+        self._command = mechanics.Command(np.zeros(muscles), self.individual.length_bias.copy())
+        tree_joints = self.individual.tree.parent.shape[0]
+        self._scratch = mechanics.Scratch(
+            np.zeros((tree_joints, 3, 3)),
+            np.zeros((tree_joints, 3)),
+            np.zeros((tree_joints, 3)),
+            np.zeros(self.individual.routes.point.shape),
+            np.zeros(muscles),
+            np.zeros(3),
+            np.zeros(3),
+        )
+        self._muscle = mechanics.MuscleState(*(np.zeros(muscles) for _ in range(8)))
+        self._joint = mechanics.JointState(*(np.zeros(joints) for _ in range(4)))
+        self.reset()
+
+    def _constants(self) -> mechanics.Body:
+        robot, true = self.robot, self.individual
+        span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0)))
+        span = span - true.length_at_zero
+        stretch = true.elastic.elongation(
+            true.length_at_zero, np.full(robot.muscle_count, robot.tension.max)
+        )
+        in_tree = np.argsort(self._order)
+        return mechanics.Body(
+            true.elastic.force,
+            true.elastic.rate,
+            true.elastic.wire_stretch,
+            true.length_at_zero,
+            true.cable_friction,
+            true.joint_friction[in_tree],
+            robot.lower[in_tree],
+            robot.upper[in_tree],
+            span.min(axis=0) - stretch - 0.05,
+            span.max(axis=0) + 0.05,
+            robot.stiffness,
+            robot.tension.bias,
+            robot.tension.max,
+            true.tension_gain,
+            true.tension_bias,
+        )
+
+    def reset(self, theta: Array | None = None) -> None:
+        """Put the arm at rest at θ (default: hanging, θ = 0 within the limits), heal and cool it.
+
+        Payload, length offsets and the external wrench stay as set.
+        """
+        posture = np.zeros(self.robot.joint_count) if theta is None else np.asarray(theta, float)
+        posture = np.clip(posture, self.robot.lower, self.robot.upper)
+        for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
+            state[:] = 0.0
+        self._joint.q[self._order] = posture
+        bias = self.robot.tension.bias
+        self._muscle.sliding[:] = 0.0
+        self._muscle.ruptured[:] = 0.0
+        self._muscle.reference[:] = bias
+        self._muscle.winding[:] = mechanics.AMBIENT
+        self._muscle.housing[:] = mechanics.AMBIENT
+        self._attach(np.ones(self.robot.muscle_count, dtype=bool))
+        self._kind = mechanics.SAFE
+        self._age = 0.0
+
+    def _attach(self, which: NDArray[np.bool_]) -> None:
+        """Wind the given muscles so that they carry T_bias in the present posture."""
+        bias = np.full(self.robot.muscle_count, self.robot.tension.bias)
+        length = self.individual.muscle_lengths(self.theta[None], bias)[0]
+        self._muscle.length[which] = length[which]
+        self._muscle.tension[which] = bias[which]
+        self._muscle.end_tension[which] = bias[which]
+
+    @property
+    def theta(self) -> Array:
+        """True joint angles [rad], shape (D,): what errors are measured against."""
+        angles: Array = self._joint.q[self._order]
+        return angles
+
+    @property
+    def velocity(self) -> Array:
+        """True joint velocities [rad/s], shape (D,)."""
+        rates: Array = self._joint.velocity[self._order]
+        return rates
+
+    @property
+    def tension(self) -> Array:
+        """True muscle tensions at the modules [N], shape (M,)."""
+        return self._muscle.tension.copy()
+
+    @property
+    def safe(self) -> bool:
+        """Whether the modules went safe for want of commands."""
+        return self._kind == mechanics.SAFE
+
+    def command_length(self, length: Array) -> None:
+        """Follow target lengths [m], shape (M,), by muscle stiffness control."""
+        self._follow(mechanics.FOLLOW_LENGTH, length)
+
+    def command_tension(self, tension: Array) -> None:
+        """Follow target tensions [N], shape (M,)."""
+        self._follow(mechanics.FOLLOW_TENSION, tension)
+
+    def _follow(self, kind: int, value: Array) -> None:
+        self._kind, self._age = kind, 0.0
+        self._command.value[:] = value
+
+    def set_payload(self, mass: float) -> None:
+        """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
+        self._payload = mass
+        load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
+        placed = load.se3Action(pin.SE3(np.eye(3), self._effector))
+        self._model.inertias[self._effector_joint] = self._bare_inertia + placed
+
+    def set_wrench(self, wrench: Array) -> None:
+        """Push the end effector with force [N] and torque [N·m], axes of the root link, (6,)."""
+        self._wrench[:] = wrench
+
+    def set_length_offset(self, offset: Array) -> None:
+        """Shift the length sensors by an offset [m], shape (M,), as after re-wiring."""
+        self._command.length_error[:] = self.individual.length_bias + offset
+
+    def set_ruptured(self, muscles: Iterable[str]) -> None:
+        """Cut the named muscles and mend all others, which take up T_bias where they are."""
+        names = set(muscles)
+        cut = np.array([name in names for name in self.robot.muscles])
+        mended = (self._muscle.ruptured > 0.0) & ~cut
+        self._muscle.ruptured[:] = cut
+        self._attach(mended)
+
+    def step(self, duration: float) -> None:
+        """Let time pass [s], in whole steps of `mechanics.STEP`."""
+        individual, model, data = self.individual, self._model, self._data
+        joint = self._joint
+        for _ in range(round(duration / mechanics.STEP)):
+            self._age += mechanics.STEP
+            if self._age > self.command_timeout:
+                self._kind = mechanics.SAFE
+            acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
+            mechanics.muscle_step(
+                individual.tree,
+                individual.routes,
+                self._body,
+                self._muscle,
+                joint,
+                self._scratch,
+                self._kind,
+                self._command,
+                self._wrench,
+                self._effector,
+                self._effector_joint,
+                acceleration,
+            )
+
+    def sense(self) -> Readings:
+        """Read all sensors once, with their noise, bias and resolution."""
+        muscle, true = self._muscle, self.individual
+        tension = true.tension_gain * muscle.tension + true.tension_bias
+        # A cut wire pulls on no sensor, and a tension unit does not read below zero.
+        tension = np.where(muscle.ruptured > 0.0, 0.0, tension)
+        noisy = self._noisy(tension, TENSION_NOISE, TENSION_RESOLUTION)
+        length = muscle.length + self._command.length_error
+        return Readings(
+            self._noisy(self.theta, ANGLE_NOISE, ANGLE_RESOLUTION),
+            self._noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION),
+            np.where(muscle.ruptured > 0.0, 0.0, np.maximum(noisy, 0.0)),
+            self._noisy(muscle.housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION),
+        )
+
+    def _noisy(self, value: Array, noise: float, resolution: float) -> Array:
+        read: Array = value + self._rng.normal(0.0, noise, value.shape)
+        return np.round(read / resolution) * resolution
+
+    def marker_pose(self) -> pin.SE3:
+        """See the end effector's pose in the root link's frame, with a camera's noise."""
+        pose = self.robot.kinematics.end_effector_pose(self.theta)
+        turn = pin.exp3(self._rng.normal(0.0, MARKER_TURN_NOISE, 3))
+        shift = self._rng.normal(0.0, MARKER_NOISE, 3)
+        return pin.SE3(pose.rotation @ turn, pose.translation + shift)
+
+    def route_points(self) -> Array:
+        """True route points in the root link's frame [m], shape (P, 3)."""
+        return self._scratch.world.copy()

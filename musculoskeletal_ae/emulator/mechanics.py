@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One millisecond of muscles, modules and friction, compiled by numba.
+
+Each muscle is a massless wire between a motor and an elastic unit at its far end:
+
+    far end    L_e(l_abs, T_end) = f(θ) − l           elastic unit and wire, what pulls the bones
+    friction   T = T_end exp(μ s),  |s| ≤ 1           s follows the wire's sliding (Dahl)
+    MSC        T_ref = T_bias + max(0, K (l − l_target))      (paper, eq. muscle stiffness control)
+    motor      dl/dt = −gain (T_ref − T), within the speed limit and the length limits
+    heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
+
+Joint friction is Dahl's as well, so that the arm rests where it rubs, without creeping.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.emulator.wrapping import (
+    Tree,
+    WrappedRoutes,
+    add_torque,
+    place_points,
+    segment_length,
+    tree_poses,
+)
+
+Array = NDArray[np.float64]
+
+STEP = 0.001  # [s]
+
+# What a module follows.
+SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
+
+# Muscle modules; chosen, plausible for Musashi's (not public).
+SPEED_LIMIT = 0.25  # [m/s]
+RELEASE_RATE = 100.0  # [N/s] at which a module that went safe approaches T_bias
+MOTOR_GAIN = 0.004  # [m/s/N]
+SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
+# Joints.
+STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up
+VISCOUS = 0.5  # [N·m·s/rad] or [N·s/m]
+STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
+# Heat: 200 N for good settles at 85 °C at the housing and 105 °C in the winding.
+AMBIENT = 25.0  # [°C]
+LOSS = 5.0e-4  # [W/N²]
+WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
+WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
+
+
+class Body(NamedTuple):
+    """Constants of one individual, as the compiled step wants them (orders of the tree)."""
+
+    force: Array
+    rate: Array
+    wire_stretch: Array
+    length_at_zero: Array
+    cable_friction: Array
+    joint_friction: Array
+    lower: Array
+    upper: Array
+    length_low: Array
+    length_high: Array
+    stiffness: float
+    tension_bias: float
+    tension_max: float
+    sensor_gain: Array
+    sensor_offset: Array
+
+
+class Command(NamedTuple):
+    """What the modules follow and how they read their length sensors.
+
+    Attributes:
+        value: Target lengths [m] or tensions [N], shape (M,).
+        length_error: Reading of the length sensor minus the true l [m], shape (M,).
+    """
+
+    value: Array
+    length_error: Array
+
+
+class MuscleState(NamedTuple):
+    """What changes, each of shape (M,); the compiled step writes into it.
+
+    Attributes:
+        length: l at the motor, true [m].
+        tension: T at the motor, true [N].
+        end_tension: T at the elastic unit [N].
+        sliding: Friction state s in [−1, 1].
+        winding: c₁ [°C].
+        housing: c₂ [°C].
+        reference: T_ref of the module [N].
+        ruptured: 1 where the wire is cut.
+    """
+
+    length: Array
+    tension: Array
+    end_tension: Array
+    sliding: Array
+    winding: Array
+    housing: Array
+    reference: Array
+    ruptured: Array
+
+
+class JointState(NamedTuple):
+    """q, q̇, friction state in [−1, 1], and generalised torque, each (D,) in tree order."""
+
+    q: Array
+    velocity: Array
+    sticking: Array
+    torque: Array
+
+
+class Scratch(NamedTuple):
+    """Work arrays, so that a step allocates nothing."""
+
+    rotation: Array
+    translation: Array
+    axis: Array
+    world: Array
+    absolute: Array
+    leave: Array
+    arrive: Array
+
+
+@njit(cache=True)
+def tension_from_elongation(
+    elongation: float, force: float, rate: float, stretch: float
+) -> float:
+    """Return T with ln(1 + T/force)/rate + stretch·T = elongation; 0 for a slack wire.
+
+    Newton in u = ln(1 + T/force), where the equation is convex and u = rate·elongation lies
+    beyond the root, so that it converges from there without overshooting.
+    """
+    if elongation <= 0.0:
+        return 0.0
+    # A cut-off far beyond any tension of a module keeps exp() finite.
+    u = min(rate * elongation, 6.0)
+    for _ in range(20):
+        grown = math.exp(u)
+        step = (u / rate + stretch * force * (grown - 1.0) - elongation) / (
+            1.0 / rate + stretch * force * grown
+        )
+        u -= step
+        if abs(step) < 1e-9:
+            break
+    return force * (math.exp(u) - 1.0)
+
+
+@njit(cache=True)
+def module_reference(
+    kind: int, command: float, length: float, before: float, body: Body
+) -> float:
+    """Return T_ref [N] of one module that reads `length` [m] and had T_ref `before`."""
+    if kind == FOLLOW_LENGTH:
+        wished = body.tension_bias + max(0.0, body.stiffness * (length - command))
+    elif kind == FOLLOW_TENSION:
+        wished = max(0.0, command)
+    else:
+        change = STEP * RELEASE_RATE
+        wished = before + min(change, max(-change, body.tension_bias - before))
+    return min(body.tension_max, wished)
+
+
+@njit(cache=True)
+def muscle_step(
+    tree: Tree,
+    routes: WrappedRoutes,
+    body: Body,
+    muscle: MuscleState,
+    joint: JointState,
+    scratch: Scratch,
+    kind: int,
+    command: Command,
+    wrench: Array,
+    effector: Array,
+    effector_joint: int,
+    acceleration: Array,
+) -> None:
+    """Move joints and motors by one STEP and leave the generalised torque in joint.torque.
+
+    Args:
+        tree: Kinematic tree.
+        routes: True routes.
+        body: Constants of the individual.
+        muscle: Muscle state, changed.
+        joint: Joint state, changed.
+        scratch: Work arrays.
+        kind: SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
+        command: What the modules follow.
+        wrench: External force and torque on the end effector, axes of the root link, shape (6,).
+        effector: End effector in its joint's frame [m], shape (3,).
+        effector_joint: Tree joint that carries it.
+        acceleration: q̈ from the rigid-body dynamics, shape (D,).
+    """
+    for i in range(joint.q.shape[0]):
+        joint.velocity[i] += STEP * acceleration[i]
+        joint.q[i] += STEP * joint.velocity[i]
+    tree_poses(tree, joint.q, scratch.rotation, scratch.translation, scratch.axis)
+    place_points(routes, scratch.rotation, scratch.translation, scratch.world)
+    world = scratch.world
+    scratch.absolute[:] = 0.0
+    for s in range(routes.first.shape[0]):
+        scratch.absolute[routes.muscle[s]] += segment_length(
+            world[routes.first[s]],
+            world[routes.second[s]],
+            scratch.translation[routes.sphere_joint[s]],
+            routes.radius[s],
+            scratch.leave,
+            scratch.arrive,
+        )
+    _wires_and_modules(body, muscle, kind, command, scratch.absolute)
+    joint.torque[:] = 0.0
+    _friction_and_stops(body, joint)
+    for s in range(routes.first.shape[0]):
+        i, k, ball = routes.first[s], routes.second[s], routes.sphere_joint[s]
+        centre = scratch.translation[ball]
+        segment_length(
+            world[i], world[k], centre, routes.radius[s], scratch.leave, scratch.arrive
+        )
+        pull = muscle.end_tension[routes.muscle[s]]
+        translation, axis = scratch.translation, scratch.axis
+        add_torque(
+            tree, translation, axis, routes.point_joint[i], world[i], scratch.leave, pull,
+            joint.torque,
+        )  # fmt: skip
+        add_torque(
+            tree, translation, axis, routes.point_joint[k], world[k], scratch.arrive, pull,
+            joint.torque,
+        )  # fmt: skip
+        if routes.radius[s] > 0.0:
+            for r in range(3):
+                scratch.leave[r] += scratch.arrive[r]
+            add_torque(
+                tree, translation, axis, ball, centre, scratch.leave, -pull, joint.torque
+            )
+    _external_wrench(tree, joint, scratch, wrench, effector, effector_joint)
+
+
+@njit(cache=True)
+def _wires_and_modules(
+    body: Body, muscle: MuscleState, kind: int, command: Command, absolute: Array
+) -> None:
+    for m in range(absolute.shape[0]):
+        route = absolute[m] - body.length_at_zero[m]
+        before = muscle.length[m]
+        reading = before + command.length_error[m]
+        muscle.reference[m] = module_reference(
+            kind, command.value[m], reading, muscle.reference[m], body
+        )
+        if muscle.ruptured[m] > 0.0:
+            speed = -SPEED_LIMIT
+        else:
+            pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
+            speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
+            speed = min(SPEED_LIMIT, max(-SPEED_LIMIT, speed))
+        after = min(body.length_high[m], max(body.length_low[m], before + STEP * speed))
+        muscle.length[m] = after
+        slid = before - after
+        direction = 1.0 if slid > 0.0 else -1.0
+        keep = math.exp(-abs(slid) / SLIDING_DISTANCE)
+        muscle.sliding[m] = direction + (muscle.sliding[m] - direction) * keep
+        if muscle.ruptured[m] > 0.0:
+            muscle.end_tension[m] = 0.0
+        else:
+            muscle.end_tension[m] = tension_from_elongation(
+                route - after, body.force[m], body.rate[m], body.wire_stretch[m] * absolute[m]
+            )
+        muscle.tension[m] = muscle.end_tension[m] * math.exp(
+            body.cable_friction[m] * muscle.sliding[m]
+        )
+        inner = (muscle.winding[m] - muscle.housing[m]) / WINDING_RESISTANCE
+        outer = (muscle.housing[m] - AMBIENT) / HOUSING_RESISTANCE
+        heat = LOSS * muscle.tension[m] * muscle.tension[m]
+        muscle.winding[m] += STEP * (heat - inner) / WINDING_CAPACITY
+        muscle.housing[m] += STEP * (inner - outer) / HOUSING_CAPACITY
+
+
+@njit(cache=True)
+def _friction_and_stops(body: Body, joint: JointState) -> None:
+    for i in range(joint.q.shape[0]):
+        turned = STEP * joint.velocity[i]
+        direction = 1.0 if turned > 0.0 else -1.0
+        keep = math.exp(-abs(turned) / STICKING_ANGLE)
+        joint.sticking[i] = direction + (joint.sticking[i] - direction) * keep
+        joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
+        joint.torque[i] -= VISCOUS * joint.velocity[i]
+        beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])
+        if beyond != 0.0:
+            joint.torque[i] -= STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
+
+
+@njit(cache=True)
+def _external_wrench(
+    tree: Tree,
+    joint: JointState,
+    scratch: Scratch,
+    wrench: Array,
+    effector: Array,
+    effector_joint: int,
+) -> None:
+    point = scratch.leave
+    for r in range(3):
+        point[r] = scratch.translation[effector_joint, r]
+        for k in range(3):
+            point[r] += scratch.rotation[effector_joint, r, k] * effector[k]
+    add_torque(
+        tree, scratch.translation, scratch.axis, effector_joint, point, wrench[:3], 1.0,
+        joint.torque,
+    )  # fmt: skip
+    i = effector_joint
+    while i > 0:
+        if not tree.prismatic[i]:
+            for r in range(3):
+                joint.torque[i - 1] += scratch.axis[i, r] * wrench[3 + r]
+        i = tree.parent[i]

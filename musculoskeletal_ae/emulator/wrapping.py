@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Muscle routes that wrap round bones, compiled by numba: the true lengths of the emulated arm.
+
+A segment between two route points may pass a sphere (a bone's head) of radius r at centre c. Where
+the straight line would cut the sphere, the wire leaves along a tangent, follows the great circle
+and arrives along the other tangent:
+
+    length = √(a² − r²) + √(b² − r²) + r (φ − acos(r/a) − acos(r/b))
+
+with a, b the distances of the end points from c and φ the angle between them. Nothing here is
+shared with the geometric model of `robot/routes.py`, which the estimators know.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Tree(NamedTuple):
+    """Joints in pinocchio's order, joint 0 being the root link.
+
+    Attributes:
+        parent: Shape (J,).
+        rotation: Fixed placement in the parent, shape (J, 3, 3).
+        translation: Fixed placement in the parent [m], shape (J, 3).
+        axis: In the joint's frame, shape (J, 3).
+        prismatic: Shape (J,).
+    """
+
+    parent: Ints
+    rotation: Array
+    translation: Array
+    axis: Array
+    prismatic: NDArray[np.bool_]
+
+
+class WrappedRoutes(NamedTuple):
+    """True routes: points on joints of the tree, segments between them, a sphere for each segment.
+
+    Attributes:
+        point_joint: Tree joint that carries each point, shape (P,).
+        point: In that joint's frame [m], shape (P, 3).
+        first: Point where each segment starts, shape (S,).
+        second: Point where it ends, shape (S,).
+        muscle: Muscle it belongs to, shape (S,).
+        sphere_joint: Tree joint at whose origin the sphere sits, shape (S,).
+        radius: Radius of the sphere, 0 for none [m], shape (S,).
+    """
+
+    point_joint: Ints
+    point: Array
+    first: Ints
+    second: Ints
+    muscle: Ints
+    sphere_joint: Ints
+    radius: Array
+
+
+@njit(cache=True)
+def tree_poses(
+    tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array
+) -> None:
+    """Fill rotation (J, 3, 3), translation (J, 3), axis (J, 3) of all joints for q (J−1,)."""
+    rotation[0] = np.eye(3)
+    translation[0] = 0.0
+    for i in range(1, tree.parent.shape[0]):
+        up = tree.parent[i]
+        ux, uy, uz = tree.axis[i]
+        sine, cosine = math.sin(q[i - 1]), math.cos(q[i - 1])
+        if tree.prismatic[i]:
+            sine, cosine = 0.0, 1.0
+        rest = 1.0 - cosine
+        turn = np.array(
+            (
+                (cosine + ux * ux * rest, ux * uy * rest - uz * sine, ux * uz * rest + uy * sine),
+                (uy * ux * rest + uz * sine, cosine + uy * uy * rest, uy * uz * rest - ux * sine),
+                (uz * ux * rest - uy * sine, uz * uy * rest + ux * sine, cosine + uz * uz * rest),
+            )
+        )
+        for r in range(3):
+            translation[i, r] = translation[up, r]
+            axis[i, r] = 0.0
+            for k in range(3):
+                translation[i, r] += rotation[up, r, k] * tree.translation[i, k]
+                placed = 0.0
+                for j in range(3):
+                    placed += rotation[up, r, j] * tree.rotation[i, j, k]
+                axis[i, r] += placed * tree.axis[i, k]
+        for r in range(3):
+            for c in range(3):
+                total = 0.0
+                for k in range(3):
+                    placed = 0.0
+                    for j in range(3):
+                        placed += rotation[up, r, j] * tree.rotation[i, j, k]
+                    total += placed * turn[k, c]
+                rotation[i, r, c] = total
+        if tree.prismatic[i]:
+            for r in range(3):
+                translation[i, r] += axis[i, r] * q[i - 1]
+
+
+@njit(cache=True)
+def place_points(
+    routes: WrappedRoutes, rotation: Array, translation: Array, world: Array
+) -> None:
+    """Fill world (P, 3) with the route points in the root link's frame."""
+    for p in range(routes.point.shape[0]):
+        j = routes.point_joint[p]
+        for r in range(3):
+            world[p, r] = translation[j, r]
+            for k in range(3):
+                world[p, r] += rotation[j, r, k] * routes.point[p, k]
+
+
+@njit(cache=True)
+def segment_length(
+    start: Array, end: Array, centre: Array, radius: float, leave: Array, arrive: Array
+) -> float:
+    """Return the length of one segment and fill the unit pulls at its ends.
+
+    `leave` is the direction in which the wire pulls the start point, `arrive` the end point; the
+    sphere is pushed by −(leave + arrive), through its centre.
+    """
+    line = end - start
+    straight = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2) + 1e-12
+    if radius > 0.0:
+        a, b = start - centre, end - centre
+        da = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
+        db = math.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+        if da > radius and db > radius:
+            cosine = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / (da * db)
+            angle = math.acos(min(1.0, max(-1.0, cosine)))
+            alpha, beta = math.acos(radius / da), math.acos(radius / db)
+            arc = angle - alpha - beta
+            if arc > 0.0:
+                sine = math.sin(angle)
+                # The tangent points lie at alpha from a and beta from b, in the plane of a and b.
+                for r in range(3):
+                    ea, eb = a[r] / da, b[r] / db
+                    if sine > 1e-6:
+                        across_a = (eb - cosine * ea) / sine
+                        across_b = (ea - cosine * eb) / sine
+                    else:
+                        # Through the centre every way round is as short: take one.
+                        k = int(abs(a[0]) > 0.5 * da)
+                        away = -a[k] * a[r] / (da * da) + (1.0 if r == k else 0.0)
+                        across_a = across_b = away / math.sqrt(1.0 - (a[k] / da) ** 2)
+                    leave[r] = -math.sin(alpha) * ea + math.cos(alpha) * across_a
+                    arrive[r] = -math.sin(beta) * eb + math.cos(beta) * across_b
+                tangents = math.sqrt(da * da - radius * radius)
+                tangents += math.sqrt(db * db - radius * radius)
+                return tangents + radius * arc
+    for r in range(3):
+        leave[r] = line[r] / straight
+        arrive[r] = -leave[r]
+    return straight
+
+
+@njit(cache=True)
+def wrapped_lengths(
+    tree: Tree, routes: WrappedRoutes, muscles: int, q: Array
+) -> tuple[Array, Array]:
+    """Return absolute lengths [m] (N, M) and their Jacobian [m/rad] (N, M, J−1) for q (N, J−1)."""
+    count, joints = q.shape[0], tree.parent.shape[0]
+    rotation, translation = np.zeros((joints, 3, 3)), np.zeros((joints, 3))
+    axis = np.zeros((joints, 3))
+    world = np.zeros((routes.point.shape[0], 3))
+    leave, arrive = np.zeros(3), np.zeros(3)
+    lengths = np.zeros((count, muscles))
+    jacobian = np.zeros((count, muscles, joints - 1))
+    for n in range(count):
+        tree_poses(tree, q[n], rotation, translation, axis)
+        place_points(routes, rotation, translation, world)
+        for s in range(routes.first.shape[0]):
+            m, i, k = routes.muscle[s], routes.first[s], routes.second[s]
+            centre = translation[routes.sphere_joint[s]]
+            lengths[n, m] += segment_length(
+                world[i], world[k], centre, routes.radius[s], leave, arrive
+            )
+            row = jacobian[n, m]
+            push = -(leave + arrive)
+            add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, -1.0, row)
+            add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, -1.0, row)
+            if routes.radius[s] > 0.0:
+                joint = routes.sphere_joint[s]
+                add_torque(tree, translation, axis, joint, centre, push, -1.0, row)
+    return lengths, jacobian
+
+
+@njit(cache=True)
+def add_torque(
+    tree: Tree,
+    translation: Array,
+    axis: Array,
+    joint: int,
+    point: Array,
+    force: Array,
+    scale: float,
+    torque: Array,
+) -> None:
+    """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
+    while joint > 0:
+        ax, ay, az = axis[joint]
+        if tree.prismatic[joint]:
+            torque[joint - 1] += scale * (ax * force[0] + ay * force[1] + az * force[2])
+        else:
+            x = point[0] - translation[joint, 0]
+            y = point[1] - translation[joint, 1]
+            z = point[2] - translation[joint, 2]
+            torque[joint - 1] += scale * (
+                ax * (y * force[2] - z * force[1])
+                + ay * (z * force[0] - x * force[2])
+                + az * (x * force[1] - y * force[0])
+            )
+        joint = tree.parent[joint]

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of this package: one base, so that a caller can catch all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class MusculoskeletalError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class RobotDescriptionError(MusculoskeletalError):
+    """A robot directory that cannot be used; names the file, the entry and what is legal."""
+
+
+class CheckpointError(MusculoskeletalError):
+    """A checkpoint that is damaged or does not fit the robot."""
+
+
+class InfeasibleError(MusculoskeletalError):
+    """No muscle tension within its limits does what was asked."""
+
+
+class MessageError(MusculoskeletalError):
+    """A received message that breaks a rule of validity; `reason` is what is counted."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f'{reason}: {detail}')
+        self.reason = reason
+
+
+class BagError(MusculoskeletalError):
+    """A recording that is damaged, or not what it says it is.
+
+    Attributes:
+        file: Which file.
+        offset: Where in it [bytes]; None where no place can be named.
+    """
+
+    def __init__(self, file: Path, offset: int | None, problem: str, remedy: str) -> None:
+        where = f'{file}' if offset is None else f'{file}, byte {offset}'
+        super().__init__(f'{where}: {problem}; {remedy}')
+        self.file = file
+        self.offset = offset
+
+
+class UnfinishedBagError(BagError):
+    """A recording whose recorder was stopped before it could end the file."""

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Musculoskeletal AutoEncoder in torch: what is trained. `mae.py` is what runs.
+
+    z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z),   z of size D+M
+
+(paper, section "Network Structure"). Everything is in scaled units; a masked entry is zero where it
+enters the first layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import Mask, visible
+
+Array = NDArray[np.float64]
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    'tanh': torch.tanh,
+    'silu': nn.functional.silu,
+}
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Shape of a network.
+
+    Attributes:
+        hidden: Units of the encoder's hidden layers; the decoder has them in reverse.
+        activation: After every layer but the latent and the last one, which are linear.
+        standardise: Subtract the mean of the training data and divide by its spread at the input,
+            and the other way round at the output.
+    """
+
+    hidden: tuple[int, ...]
+    activation: str
+    standardise: bool
+
+
+# The paper prints the layers but not the activation. tanh is ours: smooth, as descent through the
+# decoder wants it, and the latent layer stays linear so that z is not confined to a cube.
+PRESETS = {
+    'paper': NetworkSettings(hidden=(200, 30), activation='tanh', standardise=False),
+    'default': NetworkSettings(hidden=(200, 100), activation='tanh', standardise=True),
+}
+
+
+class Network(nn.Module):
+    """D joints, M muscles: layers (D+2M+3, *hidden, D+M, *reversed hidden, D+2M)."""
+
+    mean: Tensor
+    std: Tensor
+    rows: Tensor
+
+    def __init__(
+        self, joints: int, muscles: int, settings: NetworkSettings, mean: Array, std: Array
+    ) -> None:
+        """Create a network with torch's default random weights.
+
+        Args:
+            joints: D.
+            muscles: M.
+            settings: Hidden layers and activation.
+            mean: What the scaled (θ, T, l) are centred by, shape (D+2M,).
+            std: What they are divided by, shape (D+2M,).
+        """
+        super().__init__()
+        self.joints, self.muscles, self.settings = joints, muscles, settings
+        values, latent = joints + 2 * muscles, joints + muscles
+        encoder = (values + 3, *settings.hidden, latent)
+        decoder = (latent, *reversed(settings.hidden), values)
+        self.encoder = nn.ModuleList(map(nn.Linear, encoder[:-1], encoder[1:]))
+        self.decoder = nn.ModuleList(map(nn.Linear, decoder[:-1], decoder[1:]))
+        self.activation = ACTIVATIONS[settings.activation]
+        self.register_buffer('mean', torch.as_tensor(mean, dtype=torch.float32))
+        self.register_buffer('std', torch.as_tensor(std, dtype=torch.float32))
+        entries = np.stack([visible(mask, joints, muscles) for mask in Mask])
+        flags = np.array([mask.value for mask in Mask])
+        # One row per mask: which entries pass, then the three mask inputs themselves.
+        rows = np.concatenate([entries, flags], axis=1)
+        self.register_buffer('rows', torch.as_tensor(rows, dtype=torch.float32))
+
+    def encode(self, values: Tensor, mask: Tensor) -> Tensor:
+        """Return z: scaled (θ, T, l) of shape (N, D+2M), mask indices (N,) into `Mask`."""
+        standard = (values - self.mean) / self.std
+        rows = self.rows[mask]  # (N, D+2M+3)
+        width = standard.shape[-1]
+        x = torch.cat([standard * rows[:, :width], rows[:, width:]], dim=-1)  # (N, D+2M+3)
+        return self._run(self.encoder, x)  # (N, D+M)
+
+    def decode_standard(self, z: Tensor) -> Tensor:
+        """Return the output before mean and spread are put back, shape (N, D+2M)."""
+        return self._run(self.decoder, z)
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Return scaled (θ, T, l), shape (N, D+2M)."""
+        return self.decode_standard(z) * self.std + self.mean
+
+    def forward(self, values: Tensor, mask: Tensor) -> Tensor:
+        """Return what the network restores of scaled (θ, T, l) from two of the three."""
+        return self.decode(self.encode(values, mask))
+
+    def _run(self, layers: nn.ModuleList, x: Tensor) -> Tensor:
+        for layer in layers[:-1]:
+            x = self.activation(layer(x))
+        result: Tensor = layers[-1](x)
+        return result
+
+
+def to_mae(
+    network: Network,
+    joints: tuple[str, ...],
+    muscles: tuple[str, ...],
+    preset: str,
+    training: str,
+    version: int = 0,
+) -> Mae:
+    """Return the numpy network that runs, with float64 copies of a trained network's weights."""
+
+    def array(tensor: Tensor) -> Array:
+        return tensor.detach().cpu().numpy().astype(np.float64)
+
+    def stack(layers: nn.ModuleList) -> tuple[tuple[Array, Array], ...]:
+        return tuple((array(layer.weight), array(layer.bias)) for layer in layers)
+
+    return Mae(
+        joints=joints,
+        muscles=muscles,
+        preset=preset,
+        activation=network.settings.activation,
+        encoder=stack(network.encoder),
+        decoder=stack(network.decoder),
+        mean=array(network.mean),
+        std=array(network.std),
+        version=version,
+        training=training,
+    )
+
+
+def from_mae(mae: Mae) -> Network:
+    """Return a torch network with the weights of a numpy one, to go on learning from."""
+    settings = NetworkSettings(
+        hidden=tuple(len(bias) for _, bias in mae.encoder[:-1]),
+        activation=mae.activation,
+        standardise=PRESETS[mae.preset].standardise,
+    )
+    network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std)
+    with torch.no_grad():
+        for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
+            for layer, (weight, bias) in zip(layers, arrays, strict=True):
+                layer.weight.copy_(torch.from_numpy(weight.copy()))  # type: ignore[operator, union-attr]
+                layer.bias.copy_(torch.from_numpy(bias.copy()))  # type: ignore[operator, union-attr]
+    return network

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic bodies' data: what the geometric model says of random postures and tensions.
+
+    (θ, T, l) = (θ_r, T_r, f_geo(θ_r) − L_e(f_geo,abs(θ_r), T_r))
+
+(paper, section "Initial Training".)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.mae.units import scale_vector
+from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+# Samples drawn at once: large enough that numpy's overhead vanishes, small enough to stay in cache.
+CHUNK = 16384
+# Share of samples, in preset default, with tensions beyond what is planned.
+OVERLOAD_SHARE = 0.2
+
+
+def geometric_samples(
+    robot: Robot, count: int, rng: np.random.Generator, highest_tension: Array | float
+) -> Array:
+    """Return scaled (θ, T, l) of random states, shape (count, D+2M).
+
+    Args:
+        robot: The nominal body.
+        count: Number of samples.
+        rng: Source of randomness.
+        highest_tension: T_r is uniform in [0, this] [N]; a scalar or shape (count, 1).
+    """
+    theta = robot.random_postures(count, rng)
+    tension = rng.uniform(0.0, 1.0, (count, robot.muscle_count)) * highest_tension
+    length = robot.muscle_lengths(theta, tension)
+    values = np.concatenate([theta, tension, length], axis=1)
+    scaled: Array = values * scale_vector(robot.joint_count, robot.muscle_count)
+    return scaled
+
+
+def overload_samples(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Return samples mostly within tension.limit, some beyond it, up to tension.max.
+
+    A payload pulls muscles beyond the limit; an estimator that has seen a few such states degrades
+    gently there.
+    """
+    limit, most = robot.tension.limit, robot.tension.max
+    overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
+    highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
+    return geometric_samples(robot, count, rng, highest)
+
+
+class GeometricSampler:
+    """Endless fresh batches of scaled (θ, T, l) from the geometric model."""
+
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
+        """Draw batches of `robot` from `rng`."""
+        self._robot, self._rng = robot, rng
+        self._stock: Array = np.empty((0, robot.joint_count + 2 * robot.muscle_count))
+
+    def __call__(self, count: int) -> Array:
+        """Return the next batch, shape (count, D+2M)."""
+        if len(self._stock) < count:
+            self._stock = overload_samples(self._robot, max(CHUNK, count), self._rng)
+        batch, self._stock = self._stock[:count], self._stock[count:]
+        return batch
+
+
+def epochs(samples: Array, rng: np.random.Generator, batch: int) -> Iterator[Array]:
+    """Yield the mini-batches of shuffled samples, epoch after epoch, without end."""
+    while True:
+        order = rng.permutation(len(samples))
+        for i in range(0, len(order) - batch + 1, batch):
+            yield samples[order[i : i + batch]]

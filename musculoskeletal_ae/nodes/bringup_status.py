@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
+
+joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, /diagnostics → stdout.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64, UInt8MultiArray
+
+from musculoskeletal_ae.nodes.messages import read_posture
+from musculoskeletal_ae.nodes.shell import LATCHED, RELIABLE, SENSOR, STEADY, Shell, run, text
+
+
+class BringupStatus(Shell):
+    """Prints estimation error, A, samples learned and number of checkpoints."""
+
+    def __init__(self) -> None:
+        """Declare parameters and listen."""
+        super().__init__('bringup_status')
+        self.declare_parameter(
+            'duration', 0.0, text('end so many seconds after the arm is up [s]; 0: never', True)
+        )
+        self.duration = self.get_parameter('duration').value
+        self.theta: np.ndarray | None = None
+        self.errors: list[float] = []
+        self.anomalies: list[float] = []
+        self.detected = False
+        self.checkpoints = 0
+        self.samples = ''
+        self.suspect = ''
+        self.started: float | None = None
+        self.listen(JointState, 'joint_states', self._measured, SENSOR)
+        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
+        self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
+        self.listen(Bool, 'anomaly_detected', self._detected, LATCHED)
+        self.listen(UInt8MultiArray, 'mae_checkpoint', self._checkpoint, LATCHED)
+        self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
+        self.create_timer(1.0, self._print, clock=STEADY)
+
+    def _measured(self, message: JointState) -> None:
+        self.theta = read_posture(message, self.robot.joints)
+
+    def _estimated(self, message: JointState) -> None:
+        if self.theta is not None:
+            estimate = read_posture(message, self.robot.joints)
+            self.errors.append(float(np.linalg.norm(estimate - self.theta)))
+
+    def _detected(self, message: Bool) -> None:
+        self.detected = message.data
+
+    def _checkpoint(self, _: UInt8MultiArray) -> None:
+        self.checkpoints += 1
+
+    def _diagnosed(self, message: DiagnosticArray) -> None:
+        here = self.get_namespace().rstrip('/')
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            if status.name.startswith(f'{here}/learner:'):
+                self.samples = values.get('samples', '')
+            elif status.name.startswith(f'{here}/estimator:'):
+                self.suspect = values.get('suspect muscle', '')
+
+    def _print(self) -> None:
+        now = time.monotonic()
+        if self.anomalies and self.started is None:
+            self.started = now
+        if self.started is None:
+            return
+        elapsed = now - self.started
+        error = np.mean(self.errors) if self.errors else math.nan
+        anomaly = np.mean(self.anomalies) if self.anomalies else math.nan
+        self.errors, self.anomalies = [], []
+        line = f'{elapsed:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
+        line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
+        if self.detected:
+            line += f'  ANOMALY: {self.suspect}'
+        print(line, flush=True)
+        if 0.0 < self.duration <= elapsed:
+            raise ExternalShutdownException
+
+
+def main() -> None:
+    """Run the node."""
+    run(BringupStatus)

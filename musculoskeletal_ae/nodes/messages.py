@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between ROS messages and arrays, with the rules of validity (INTERFACE.md).
+
+Reading raises `MessageError` with a short reason; the node counts it and lives on. JointState is
+matched by name in any order, Float64MultiArray by length and, where given, layout.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+from musculoskeletal_ae.exceptions import MessageError
+
+Array = NDArray[np.float64]
+
+# Far more than any arm has; what is longer is refused before it is looked at.
+MOST_ENTRIES = 10_000
+
+QUANTITIES = ('length', 'tension', 'temperature')
+
+
+def read_array(message: Float64MultiArray, rows: int, columns: int) -> Array:
+    """Return the data of a multi-array as shape (rows, columns); rows = 1 gives (columns,).
+
+    Raises:
+        MessageError: If the length, layout or a value breaks a rule.
+    """
+    if len(message.data) > MOST_ENTRIES:
+        raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
+    if len(message.data) == 0:
+        raise MessageError('empty', f'no values, expected {rows * columns}')
+    if len(message.data) != rows * columns:
+        raise MessageError('wrong length', f'{len(message.data)} values, not {rows * columns}')
+    shape = [columns] if rows == 1 else [rows, columns]
+    sizes = [dim.size for dim in message.layout.dim]
+    # Without labels or strides the sizes alone say the layout; a stride that is given must match.
+    strides = [dim.stride for dim in message.layout.dim]
+    legal = [int(np.prod(shape[i:])) for i in range(len(shape))]
+    if sizes and (sizes != shape or any(s not in (0, e) for s, e in zip(strides, legal))):
+        raise MessageError('wrong layout', f'sizes {sizes}, strides {strides}; expected {shape}')
+    if message.layout.data_offset != 0:
+        raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
+    values = np.asarray(message.data, dtype=float)
+    if not np.isfinite(values).all():
+        raise MessageError('not finite', f'value {np.flatnonzero(~np.isfinite(values))[0]}')
+    return values.reshape(rows, columns) if rows > 1 else values
+
+
+def array_message(values: Array, *labels: str) -> Float64MultiArray:
+    """Return a multi-array of values (…) with one label per dimension."""
+    sizes = values.shape
+    layout = MultiArrayLayout(
+        dim=[
+            MultiArrayDimension(label=label, size=size, stride=int(np.prod(sizes[i:])))
+            for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
+        ]
+    )
+    return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+
+
+def read_joints(
+    message: JointState, joints: Sequence[str], foreign_allowed: bool
+) -> dict[str, tuple[float, float]]:
+    """Return name → (position, effort) of the listed joints; effort is 0 where none is given.
+
+    Args:
+        message: The message.
+        joints: Joints the robot lists.
+        foreign_allowed: Ignore joints the robot does not list (`joint_states`) and ask for all
+            that it does; else refuse unknown ones and accept a subset (targets).
+
+    Raises:
+        MessageError: If names, lengths or a value break a rule.
+    """
+    names = list(message.name)
+    if len(names) > MOST_ENTRIES or len(message.position) > MOST_ENTRIES:
+        raise MessageError('oversized', f'{len(names)} joints, at most {MOST_ENTRIES}')
+    if not names:
+        raise MessageError('empty', 'no joints')
+    efforts = message.effort
+    if len(message.position) != len(names) or len(efforts) not in (0, len(names)):
+        raise MessageError(
+            'wrong length',
+            f'{len(names)} names, {len(message.position)} positions, {len(efforts)} efforts',
+        )
+    listed = set(joints)
+    if not foreign_allowed:
+        for name in names:
+            if name not in listed:
+                raise MessageError('unknown joint', f'{name!r}; legal: {", ".join(joints)}')
+    found: dict[str, tuple[float, float]] = {}
+    for i, name in enumerate(names):
+        if name not in listed:
+            continue
+        if name in found:
+            raise MessageError('duplicate joint', repr(name))
+        # Drivers say NaN for an effort they do not measure; only a target's effort is used.
+        effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
+        found[name] = (message.position[i], effort)
+    if foreign_allowed and len(found) < len(joints):
+        missing = [name for name in joints if name not in found]
+        raise MessageError('missing joint', ', '.join(missing))
+    if not np.isfinite(list(found.values())).all():
+        raise MessageError('not finite', 'a position or effort')
+    return found
+
+
+def read_posture(message: JointState, joints: Sequence[str]) -> Array:
+    """Return θ [rad] (D,) of a message that has all listed joints, others ignored."""
+    found = read_joints(message, joints, foreign_allowed=True)
+    return np.array([found[name][0] for name in joints])

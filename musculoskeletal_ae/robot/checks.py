@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether an arm can be held by its muscles: what `check_robot` measures and judges.
+
+In postures drawn uniformly in the joint limits, the tension nearest to 60 N within [bias, limit]
+that holds the arm's own weight; the joint stiffness under muscle stiffness control at that tension;
+and the moment arms. An arm is sound when at least 95 % of the postures are held, at least 95 % have
+a smallest stiffness eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not
+stiff), and no moment arm is at fault. Beside it, not judged: the one-sided stiffness, in which
+muscles at the bias tension count as slack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.robot import moment_arms as arms
+from musculoskeletal_ae.robot.moment_arms import Finding
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import joint_stiffness
+from musculoskeletal_ae.robot.tension import holding_tension
+
+Array = NDArray[np.float64]
+
+WISHED_TENSION = 60.0  # [N]
+REQUIRED_SHARE = 0.95
+REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
+LEAST_INERTIA = 1e-6  # [kg·m² or kg]; with less a joint cannot be simulated
+SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
+
+
+@dataclass(frozen=True)
+class RobotCheck:
+    """What was measured in N postures, and what is wrong.
+
+    Attributes:
+        postures: θ [rad], shape (N, D).
+        moment_arms: r = −G [m], shape (N, M, D).
+        tension: Holding tension [N], shape (N, M); NaN where the posture is not held.
+        missing_torque: Torque lacking where a posture is not held [N·m], shape (N, D).
+        stiffness: Smallest joint-stiffness eigenvalue [N·m/rad], shape (N,); NaN if not held.
+        softest_joint: Joint that moves most along that eigenvector, shape (N,); -1 if not held.
+        one_sided: Smallest eigenvalue with muscles at the bias tension slack, shape (N,).
+        faults: Why the arm is not sound; empty if it is.
+        warnings: What deserves a look but is not judged.
+    """
+
+    postures: Array
+    moment_arms: Array
+    tension: Array
+    missing_torque: Array
+    stiffness: Array
+    softest_joint: NDArray[np.int_]
+    one_sided: Array
+    faults: tuple[Finding, ...]
+    warnings: tuple[Finding, ...]
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Whether each posture is held, shape (N,)."""
+        return np.isfinite(self.stiffness)
+
+    @property
+    def stiff(self) -> NDArray[np.bool_]:
+        """Whether each posture is held and stiff enough, shape (N,)."""
+        return self.held & (self.stiffness >= REQUIRED_STIFFNESS)
+
+
+def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
+    """Measure and judge a robot in random postures.
+
+    Args:
+        robot: The nominal body.
+        postures: How many postures are drawn.
+        seed: Seed of the draw.
+
+    Raises:
+        RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
+    """
+    actions = arms.read_declared_actions(robot.description)
+    theta = robot.random_postures(postures, np.random.default_rng(seed))
+    jacobian = robot.routes.muscle_jacobian(theta)
+    torque = robot.kinematics.holding_torque(theta)
+    low, high = robot.tension.bias, robot.tension.limit
+    tension = np.full((postures, robot.muscle_count), np.nan)
+    missing = np.zeros((postures, robot.joint_count))
+    stiffness, one_sided = np.full(postures, np.nan), np.full(postures, np.nan)
+    softest = np.full(postures, -1)
+    for n in range(postures):
+        try:
+            tension[n] = holding_tension(jacobian[n], torque[n], low, high, WISHED_TENSION)
+        except InfeasibleError:
+            best = lsq_linear(-jacobian[n].T, torque[n], (low, high)).x
+            missing[n] = torque[n] + jacobian[n].T @ best
+            continue
+        values, vectors = np.linalg.eigh(joint_stiffness(robot, theta[n], tension[n]))
+        stiffness[n], softest[n] = values[0], np.abs(vectors[:, 0]).argmax()
+        slack = tension[n] <= low + SLACK_MARGIN
+        one_sided[n] = np.linalg.eigvalsh(joint_stiffness(robot, theta[n], tension[n], slack))[0]
+    description, arm = robot.description, -jacobian
+    return RobotCheck(
+        postures=theta,
+        moment_arms=arm,
+        tension=tension,
+        missing_torque=missing,
+        stiffness=stiffness,
+        softest_joint=softest,
+        one_sided=one_sided,
+        faults=(
+            *arms.wrong_signs(arm, actions, description),
+            *arms.one_way_joints(arm, description),
+            *arms.useless_muscles(arm, description),
+            *_inertia_faults(robot, theta),
+            *_holding_faults(robot, stiffness, softest, missing),
+        ),
+        warnings=tuple(arms.flipping_muscles(arm, description)),
+    )
+
+
+def _inertia_faults(robot: Robot, theta: Array) -> list[Finding]:
+    least = robot.kinematics.joint_inertia(theta).min(axis=0)
+    return [
+        Finding(
+            'no_inertia',
+            f'joint {name!r} moves no mass (inertia {value:.2g} kg·m²)',
+            'give the links it carries an <inertial> in robot.urdf',
+        )
+        for name, value in zip(robot.joints, least, strict=True)
+        if value < LEAST_INERTIA
+    ]
+
+
+def _holding_faults(
+    robot: Robot, stiffness: Array, softest: NDArray[np.int_], missing: Array
+) -> list[Finding]:
+    held = np.isfinite(stiffness)
+    stiff = held & (np.nan_to_num(stiffness) >= REQUIRED_STIFFNESS)
+    required = f'required {100 * REQUIRED_SHARE:.0f} %'
+    faults = []
+    if held.mean() < REQUIRED_SHARE:
+        lack = np.abs(missing[~held])
+        worst = lack.argmax(axis=1)
+        joints = sorted(set(worst.tolist()), key=lambda k: -int((worst == k).sum()))
+        where = ', '.join(
+            f'{robot.joints[k]} in {(worst == k).sum()} (up to {lack[worst == k, k].max():.2f} N·m)'
+            for k in joints
+        )
+        faults.append(
+            Finding(
+                'not_held',
+                f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
+                f'weight with T in [{robot.tension.bias:g}, {robot.tension.limit:g}] N, '
+                f'{required}; of the {len(lack)} others torque lacks most at {where}',
+                'lengthen the moment arms of the muscles at these joints, raise tension.limit '
+                'or lighten the links',
+            )
+        )
+    if stiff.mean() < REQUIRED_SHARE:
+        soft = softest[held & ~stiff]
+        counts = {robot.joints[k]: int((soft == k).sum()) for k in set(soft.tolist())}
+        where = ', '.join(f'{name} ({count})' for name, count in counts.items())
+        faults.append(
+            Finding(
+                'not_stiff',
+                f'the arm is not stiff: {100 * stiff.mean():.1f} % of postures have a smallest '
+                f'stiffness eigenvalue >= {REQUIRED_STIFFNESS:g} N·m/rad, {required} '
+                '(a posture that is not held counts as not stiff); softest joint of the held ones, '
+                f'in postures: {where or "none"}',
+                'lengthen the moment arms at these joints on both sides, or raise stiffness',
+            )
+        )
+    return faults

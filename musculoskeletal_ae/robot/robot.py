@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tendon-driven robot as its description gives it: the nominal body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.robot.description import RobotDescription, load_description
+from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.routes import Routes
+
+Array = NDArray[np.float64]
+
+
+class Robot:
+    """Geometric model of D joints and M muscles (paper, section "Initial Training").
+
+    Attributes:
+        description: The checked description.
+        kinematics: Link poses, gravity torque, end-effector Jacobian.
+        routes: Muscle lengths and the muscle Jacobian of the nominal routes.
+        lower: Lower joint limits [rad], shape (D,).
+        upper: Upper joint limits [rad], shape (D,).
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        """Build the nominal body of a description."""
+        self.description = description
+        self.kinematics = Kinematics(
+            description.model, description.joints, description.end_effector
+        )
+        self.routes = Routes(self.kinematics, description.routes)
+        self.series_elastic = description.series_elastic
+        self.tension = description.tension
+        self.stiffness = description.stiffness
+        self.joints = description.joints
+        self.muscles = description.muscles
+        self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
+
+    @classmethod
+    def load(cls, robot: str | Path) -> Robot:
+        """Read a shipped robot's name or a directory; see `load_description` for errors."""
+        return cls(load_description(robot))
+
+    @property
+    def joint_count(self) -> int:
+        """D."""
+        return len(self.joints)
+
+    @property
+    def muscle_count(self) -> int:
+        """M."""
+        return len(self.muscles)
+
+    @property
+    def root_link(self) -> str:
+        """Name of the URDF's root link, in whose frame poses and markers are given."""
+        return self.description.root_link
+
+    def muscle_lengths(self, theta: Array, tension: Array) -> Array:
+        """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""
+        absolute = self.routes.absolute_lengths(theta)
+        relative = absolute - self.routes.length_at_zero
+        lengths: Array = relative - self.series_elastic.elongation(absolute, tension)
+        return lengths
+
+    def random_postures(self, count: int, rng: np.random.Generator) -> Array:
+        """Return θ uniform in the joint limits [rad], shape (count, D)."""
+        return rng.uniform(self.lower, self.upper, (count, self.joint_count))

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Elongation of a muscle under tension: a nonlinear elastic unit plus the stretch of its wire.
+
+    L_e(l_abs, T) = ln(1 + T / force) / rate + wire_stretch · l_abs · T
+
+(paper, section "Initial Training": estimated from a testbed of one muscle). The elastic unit is the
+exponential tendon T = force · (exp(rate · Δ) − 1); the wire is Dyneema, whose stretch grows with
+its length. The constants are chosen to be plausible for Musashi, which are not public.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DEFAULT_FORCE = 100.0  # [N]
+DEFAULT_RATE = 30.0  # [1/m]
+DEFAULT_WIRE_STRETCH = 2.0e-5  # [1/N], metres of stretch per metre of wire and newton
+
+
+@dataclass(frozen=True)
+class SeriesElastic:
+    """Elastic constants of M muscles, one entry each.
+
+    Attributes:
+        force: Tension at which the elastic unit has stretched by ln 2 / rate [N], shape (M,).
+        rate: Stiffening rate of the elastic unit [1/m], shape (M,).
+        wire_stretch: Stretch of the wire per metre and newton [1/N], shape (M,).
+    """
+
+    force: Array
+    rate: Array
+    wire_stretch: Array
+
+    def elongation(self, absolute_length: Array, tension: Array) -> Array:
+        """Return L_e(l_abs, T) [m]; tensions below zero count as zero (a wire cannot push).
+
+        Args:
+            absolute_length: Muscle length [m], shape (..., M).
+            tension: Muscle tension [N], shape (..., M).
+        """
+        pull = np.maximum(tension, 0.0)
+        stretch: Array = self.wire_stretch * absolute_length * pull
+        return np.log1p(pull / self.force) / self.rate + stretch
+
+    def compliance(self, absolute_length: Array, tension: Array) -> Array:
+        """Return ∂L_e/∂T [m/N], shape (..., M)."""
+        pull = np.maximum(tension, 0.0)
+        unit: Array = 1.0 / (self.rate * (self.force + pull))
+        return unit + self.wire_stretch * absolute_length
+
+    def length_slope(self, tension: Array) -> Array:
+        """Return ∂L_e/∂l_abs [m/m], shape (..., M)."""
+        slope: Array = self.wire_stretch * np.maximum(tension, 0.0)
+        return slope
+
+
+def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
+    """Fit L_e to a one-muscle testbed table by least squares.
+
+    Args:
+        tension: Tensions of the table [N], shape (N,).
+        absolute_length: Muscle lengths of the table [m], shape (N,).
+        elongation: Measured elongations [m], shape (N,).
+
+    Returns:
+        Constants of one muscle (arrays of shape (1,)).
+
+    Raises:
+        ValueError: If there are fewer than four rows, or they do not pin down three constants.
+    """
+    from scipy.optimize import least_squares  # a tool's need; the nodes do without scipy
+
+    table = np.column_stack([tension, absolute_length, elongation])
+    if len(table) < 4 or not np.isfinite(table).all():
+        raise ValueError(f'a testbed table needs at least 4 finite rows, got {len(table)} rows')
+    if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
+        raise ValueError('a testbed table needs several tensions at several muscle lengths')
+
+    def model(log_constants: Array) -> SeriesElastic:
+        force, rate, stretch = np.exp(log_constants)[:, None]
+        return SeriesElastic(force, rate, stretch)
+
+    def residual(log_constants: Array) -> Array:
+        return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
+
+    start = np.log([DEFAULT_FORCE, DEFAULT_RATE, DEFAULT_WIRE_STRETCH])
+    return model(least_squares(residual, start, x_scale='jac').x)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`fit_series_elastic`: fits L_e(l_abs, T) to the table of a one-muscle testbed."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.robot.series_elastic import (
+    DEFAULT_FORCE,
+    DEFAULT_RATE,
+    DEFAULT_WIRE_STRETCH,
+    SeriesElastic,
+    fit_series_elastic,
+)
+
+Array = NDArray[np.float64]
+
+COLUMNS = ['tension', 'absolute_length', 'elongation']
+EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
+EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
+EXAMPLE_NOISE = 1e-4  # [m], what a caliper on a testbed resolves
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Fit a table, or write the synthetic example table."""
+    parser = argparse.ArgumentParser(
+        prog='fit_series_elastic',
+        description='Fits the elongation L_e(l_abs, T) of a muscle to a testbed table and prints '
+        'the constants as a line for muscles.yaml.',
+    )
+    parser.add_argument(
+        'table', type=Path, help=f'CSV with the columns {", ".join(COLUMNS)} [N, m, m]'
+    )
+    parser.add_argument('--plot', type=Path, metavar='FILE.png', help='fit_<table>.png')
+    parser.add_argument('--no-plot', action='store_true', help='write no plot')
+    parser.add_argument(
+        '--make-example',
+        action='store_true',
+        help='write a synthetic table to TABLE instead (never over an existing file)',
+    )
+    parser.add_argument('--seed', type=int, default=0, help='seed of the example noise (0)')
+    args = parser.parse_args(argv)
+    try:
+        if args.make_example:
+            write_example(args.table, args.seed)
+            print(f'wrote {args.table}')
+            return 0
+        table = read_table(args.table)
+        try:
+            constants = fit_series_elastic(*table.T)
+        except ValueError as error:
+            raise RobotDescriptionError(f'{args.table}: {error}') from error
+        residual = 1e3 * (table[:, 2] - constants.elongation(table[:, 1], table[:, 0]))
+        print(yaml_line(constants))
+        rms = math.sqrt(float(np.mean(residual**2)))
+        print(
+            f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, '
+            f'{len(table)} rows'
+        )
+        if not args.no_plot:
+            file = args.plot or Path(f'fit_{args.table.stem}.png')
+            plot(table, constants, residual, file)
+            print(f'plot: {file}')
+    except (RobotDescriptionError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    return 0
+
+
+def read_table(file: Path) -> Array:
+    """Read a testbed table: rows (tension [N], absolute length [m], elongation [m]), (N, 3).
+
+    Raises:
+        RobotDescriptionError: Naming the file and the row.
+    """
+    try:
+        lines = file.read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotDescriptionError(f'{file}: cannot be read: {error}') from error
+    kept = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and line[0] != '#']
+    cells = list(csv.reader(line for _, line in kept))
+    if not cells or [cell.strip() for cell in cells[0]] != COLUMNS:
+        found = kept[0][1] if kept else 'nothing'
+        raise RobotDescriptionError(
+            f'{file}: expected the columns {",".join(COLUMNS)}, got {found}'
+        )
+    rows = []
+    for (number, line), row in zip(kept[1:], cells[1:], strict=True):
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError:
+            values = []
+        if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
+            raise RobotDescriptionError(
+                f'{file}: row {number}: expected 3 finite numbers, got {line!r}'
+            )
+        if values[0] < 0.0 or values[1] <= 0.0:
+            raise RobotDescriptionError(
+                f'{file}: row {number}: expected tension >= 0 and absolute_length > 0, got {line!r}'
+            )
+        rows.append(values)
+    return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))
+
+
+def yaml_line(constants: SeriesElastic) -> str:
+    """Return the constants as the line that goes into muscles.yaml."""
+    return (
+        f'series_elastic: {{force: {constants.force[0]:.2f}, rate: {constants.rate[0]:.3f}, '
+        f'wire_stretch: {constants.wire_stretch[0]:.4e}}}'
+    )
+
+
+def write_example(file: Path, seed: int) -> None:
+    """Write a synthetic table: the package's default constants and measurement noise."""
+    true = SeriesElastic(
+        *(np.array([value]) for value in (DEFAULT_FORCE, DEFAULT_RATE, DEFAULT_WIRE_STRETCH))
+    )
+    rng = np.random.default_rng(seed)
+    with file.open('x', encoding='utf-8') as stream:
+        stream.write(
+            '# SYNTHETIC one-muscle testbed table, not a measurement: the default constants '
+            f'(force {DEFAULT_FORCE:g} N,\n# rate {DEFAULT_RATE:g} /m, wire_stretch '
+            f'{DEFAULT_WIRE_STRETCH:g} /N) with {1e3 * EXAMPLE_NOISE:g} mm of noise. Made by\n'
+            f'#   fit_series_elastic --make-example --seed {seed} {file.name}\n'
+            '# Units: N, m, m.\n' + ','.join(COLUMNS) + '\n'
+        )
+        for length in EXAMPLE_LENGTHS:
+            for tension in EXAMPLE_TENSIONS:
+                exact = true.elongation(np.array([length]), np.array([tension]))[0]
+                measured = exact + EXAMPLE_NOISE * rng.standard_normal()
+                stream.write(f'{tension:g},{length:g},{measured:.5f}\n')
+
+
+def plot(table: Array, constants: SeriesElastic, residual: Array, file: Path) -> None:
+    """Draw the fit over tension, one curve a muscle length, and the residual."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 4.2), layout='constrained')
+    FigureCanvasAgg(figure)
+    fit, rest = figure.subplots(1, 2)
+    tension = np.linspace(0.0, table[:, 0].max(), 200)
+    lengths = np.unique(table[:, 1])
+    for i, length in enumerate(lengths):
+        rows = table[:, 1] == length
+        colour = f'C{i % 10}'
+        # A table with a length of its own in every row has no curves worth a legend.
+        label = f'{length:.3g} m' if len(lengths) <= 10 else None
+        curve = 1e3 * constants.elongation(np.full_like(tension, length), tension)
+        fit.plot(tension, curve, color=colour, linewidth=1.0, label=label)
+        fit.plot(table[rows, 0], 1e3 * table[rows, 2], 'o', color=colour, markersize=4)
+        rest.plot(table[rows, 0], residual[rows], 'o', color=colour, markersize=4)
+    fit.set(xlabel='tension [N]', ylabel='elongation [mm]', title='fit (lines) and table (dots)')
+    if len(lengths) <= 10:
+        fit.legend(title='muscle length')
+    rest.axhline(0.0, color='black', linewidth=0.8)
+    rest.set(xlabel='tension [N]', ylabel='table − fit [mm]', title='residual')
+    try:
+        figure.savefig(file, dpi=110)
+    except ValueError as error:
+        raise RobotDescriptionError(f'plot {file} cannot be written: {error}') from error
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Install the package, its robots and its executables (see setup.cfg for where the latter go)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'musculoskeletal_ae'
+NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'render']
+TOOLS = ['calibrate_emulator', 'check_robot', 'fit_series_elastic', 'train']
+
+
+def config_files() -> list[tuple[str, list[str]]]:
+    """List config/** folder by folder, so that robots keep their directories under share/."""
+    folders = defaultdict(list)
+    for file in sorted(Path('config').rglob('*')):
+        if file.is_file():
+            folders[f'share/{NAME}/{file.parent.as_posix()}'].append(file.as_posix())
+    return list(folders.items())
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    packages=find_packages(exclude=['test', 'test.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        *config_files(),
+    ],
+    # What it needs from PyPI is pinned in .ci/requirements.txt. Listing it here too would make
+    # every console script check versions at start, and rosdep does not read it.
+    install_requires=['setuptools'],
+    zip_safe=False,
+    maintainer='musculoskeletal_ae maintainers',
+    maintainer_email='maintainers@musculoskeletal-ae.org',
+    description='Musculoskeletal autoencoder for tendon-driven robot arms',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    entry_points={
+        'console_scripts': [
+            *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
+            *(f'{name} = {NAME}.tools.{name}:main' for name in TOOLS),
+        ],
+    },
+)

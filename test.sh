@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+#
+# Sets up what is missing, then runs the linters and the tests. Arguments go to pytest:
+#
+#     ./test.sh                    everything
+#     ./test.sh -x -k estimator    what pytest understands
+set -u
+repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
+# shellcheck source=.ci/environment.sh
+. "$repository/.ci/environment.sh"
+environment_setup test
+cd "$repository" || exit 1
+
+say 'ruff check'
+"$python" -m ruff check . || exit 1
+say 'ruff format --check'
+"$python" -m ruff format --check . || exit 1
+say 'mypy'
+"$python" -m mypy || exit 1
+
+# A graph of our own: not the network's, and not that of another run on this machine.
+export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+export ROS_DOMAIN_ID=$(($$ % 101 + 1))
+export ROS_LOG_DIR=$repository/log/test
+
+say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"
+exec "$python" -m pytest "$@"

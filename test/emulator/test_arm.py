@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated arm: statics against mechanics, modules against their specification."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.emulator import mechanics
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('arm26')
+
+
+def nominal_arm(robot):
+    return EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
+
+
+def drive(arm, length, seconds):
+    for _ in range(round(seconds / 0.02)):
+        arm.command_length(length)
+        arm.step(0.02)
+
+
+def held_posture(robot):
+    """Return a posture in the middle of the range and a command that reaches about there."""
+    theta = 0.5 * (robot.lower + robot.upper)
+    tension = np.full(robot.muscle_count, 80.0)
+    return theta, robot.muscle_lengths(theta, tension) - 50.0 / robot.stiffness
+
+
+@given(st.floats(0.0, 2000.0), st.floats(20, 300), st.floats(10, 60), st.floats(0, 3e-5))
+def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, stretch):
+    elastic = SeriesElastic(np.array([force]), np.array([rate]), np.array([stretch]))
+    elongation = elastic.elongation(np.array([1.0]), np.array([tension]))[0]
+    if rate * elongation < 6.0:  # the cut-off of the compiled inverse
+        found = mechanics.tension_from_elongation(elongation, force, rate, stretch)
+        assert found == pytest.approx(tension, rel=1e-6, abs=1e-6)
+
+
+def test_at_rest_the_muscles_hold_the_weight(robot):
+    arm = nominal_arm(robot)
+    _, command = held_posture(robot)
+    drive(arm, command, 8.0)
+    assert np.abs(arm.velocity).max() < 1e-6
+    jacobian = robot.routes.muscle_jacobian(arm.theta)
+    np.testing.assert_allclose(
+        -jacobian.T @ arm.tension, robot.kinematics.holding_torque(arm.theta), atol=1e-3
+    )
+
+
+def test_at_rest_the_modules_follow_muscle_stiffness_control(robot):
+    arm = nominal_arm(robot)
+    theta, command = held_posture(robot)
+    drive(arm, command, 8.0)
+    length = robot.muscle_lengths(arm.theta, arm.tension)
+    pull = robot.tension.bias + np.maximum(0.0, robot.stiffness * (length - command))
+    np.testing.assert_allclose(arm.tension, pull, rtol=1e-3)
+
+
+def test_a_force_on_the_hand_and_a_payload_are_carried_by_the_muscles(robot):
+    arm = nominal_arm(robot)
+    _, command = held_posture(robot)
+    force = np.array([5.0, 0.0, -8.0, 0.0, 0.0, 0.0])
+    arm.set_wrench(force)
+    drive(arm, command, 8.0)
+    carried = -robot.routes.muscle_jacobian(arm.theta).T @ arm.tension
+    kin = robot.kinematics
+    push = kin.end_effector_jacobian(arm.theta).T @ force
+    np.testing.assert_allclose(carried, kin.holding_torque(arm.theta) - push, atol=1e-3)
+    arm.set_wrench(np.zeros(6))
+    arm.set_payload(1.0)
+    drive(arm, command, 8.0)
+    carried = -robot.routes.muscle_jacobian(arm.theta).T @ arm.tension
+    weight = kin.end_effector_jacobian(arm.theta).T @ [0.0, 0.0, -9.81, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(carried, kin.holding_torque(arm.theta) - weight, atol=1e-3)
+
+
+def test_friction_leaves_hysteresis(robot):
+    arm = EmulatedArm(robot, 1)
+    theta, command = held_posture(robot)
+    ends = []
+    for detour in (0.02, -0.02):
+        drive(arm, command + detour, 3.0)
+        drive(arm, command, 3.0)
+        ends.append(arm.theta)
+    assert np.linalg.norm(ends[0] - ends[1]) > 1e-3
+    nominal = nominal_arm(robot)
+    ends = []
+    for detour in (0.02, -0.02):
+        drive(nominal, command + detour, 3.0)
+        drive(nominal, command, 8.0)
+        ends.append(nominal.theta)
+    assert np.linalg.norm(ends[0] - ends[1]) < 1e-4
+
+
+def test_without_commands_the_modules_go_safe_and_pay_out_to_the_bias(robot):
+    arm = nominal_arm(robot)
+    _, command = held_posture(robot)
+    drive(arm, command, 2.0)
+    assert not arm.safe
+    assert arm.tension.max() > robot.tension.bias + 10.0
+    arm.step(arm.command_timeout + 5.0)
+    assert arm.safe
+    np.testing.assert_allclose(arm.tension, robot.tension.bias, rtol=0.01)
+
+
+def test_tension_commands_are_followed_up_to_the_highest_tension(robot):
+    arm = nominal_arm(robot)
+    wished = np.array([40.0, 60.0, 50.0, 55.0, 1e6, 45.0])
+    for _ in range(200):
+        arm.command_tension(wished)
+        arm.step(0.02)
+    np.testing.assert_allclose(arm.tension, np.minimum(wished, robot.tension.max), rtol=0.02)
+
+
+def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot):
+    arm = EmulatedArm(robot, 2)
+    _, command = held_posture(robot)
+    drive(arm, command, 2.0)
+    arm.set_ruptured([robot.muscles[1]])
+    before = arm.sense().length
+    drive(arm, command, 0.1)
+    read = arm.sense()
+    assert read.tension[1] == 0.0
+    assert before[1] - read.length[1] == pytest.approx(0.1 * mechanics.SPEED_LIMIT, abs=1e-3)
+    drive(arm, command, 3.0)
+    limit = arm.sense().length[1]
+    drive(arm, command, 0.5)
+    assert arm.sense().length[1] == pytest.approx(limit, abs=1e-3)
+    arm.set_ruptured([])
+    drive(arm, command, 3.0)
+    assert arm.sense().tension[1] > 0.5 * robot.tension.bias
+
+
+def test_a_length_offset_shifts_the_reading_and_with_it_the_arm(robot):
+    arm = nominal_arm(robot)
+    _, command = held_posture(robot)
+    drive(arm, command, 3.0)
+    before = arm.theta
+    arm.set_length_offset(np.array([0.01, 0, 0, 0, 0, 0]))
+    drive(arm, command, 3.0)
+    assert np.abs(arm.theta - before).max() > 0.01
+
+
+def test_heat_settles_where_the_two_resistors_say(robot):
+    arm = nominal_arm(robot)
+    muscle = arm._muscle
+    for _ in range(20):  # the housing's time constant is minutes: start it near its end
+        muscle.housing[:] = mechanics.AMBIENT + mechanics.HOUSING_RESISTANCE * (
+            mechanics.LOSS * muscle.tension**2
+        )
+        arm.command_tension(np.full(robot.muscle_count, 100.0))
+        for _ in range(20):
+            arm.command_tension(np.full(robot.muscle_count, 100.0))
+            arm.step(0.4)
+    heat = mechanics.LOSS * 100.0**2
+    housing = mechanics.AMBIENT + heat * mechanics.HOUSING_RESISTANCE
+    np.testing.assert_allclose(muscle.housing, housing, rtol=0.03)
+    np.testing.assert_allclose(
+        muscle.winding, housing + heat * mechanics.WINDING_RESISTANCE, rtol=0.03
+    )
+
+
+def test_same_seed_same_life(robot):
+    _, command = held_posture(robot)
+    lives = []
+    for _ in range(2):
+        arm = EmulatedArm(robot, 7)
+        drive(arm, command, 1.0)
+        lives.append(np.concatenate(arm.sense()))
+    np.testing.assert_array_equal(lives[0], lives[1])
+
+
+def test_reset_brings_the_arm_back_to_rest(robot):
+    arm = EmulatedArm(robot, 3)
+    start = arm.theta
+    drive(arm, held_posture(robot)[1], 2.0)
+    arm.set_ruptured([robot.muscles[0]])
+    arm.step(0.5)
+    arm.reset()
+    np.testing.assert_array_equal(arm.theta, start)
+    assert arm.sense().tension.min() > 0.5 * robot.tension.bias
+
+
+def test_the_marker_is_seen_where_the_hand_is(robot):
+    arm = EmulatedArm(robot, 0)
+    seen = np.array([arm.marker_pose().translation for _ in range(200)])
+    true = robot.kinematics.end_effector_pose(arm.theta).translation
+    np.testing.assert_allclose(seen.mean(axis=0), true, atol=1e-3)
+    assert 5e-4 < seen.std(axis=0).max() < 1e-2

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from robots import copy_robot, read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.check_robot import main
+
+SHIPPED = ['musashi_left_arm', 'arm26']
+
+
+def change(directory, edit):
+    document = read_muscles(directory)
+    edit(document)
+    return write_muscles(directory, document)
+
+
+def mirror(muscle):
+    """Leads a muscle along the other side of every joint axis about y."""
+
+    def edit(document):
+        (entry,) = (m for m in document['muscles'] if m['name'] == muscle)
+        for point in entry['route']:
+            point['xyz'][0] *= -1.0
+
+    return edit
+
+
+def kinds(directory):
+    return {fault.kind for fault in check_robot(Robot.load(directory)).faults}
+
+
+def verdict(capsys, *arguments):
+    status = main([str(a) for a in arguments] + ['--no-plot'])
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+@pytest.mark.parametrize('name', SHIPPED)
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_the_shipped_arms_are_sound_with_margin(name, seed):
+    result = check_robot(Robot.load(name), seed=seed)
+    assert result.faults == ()
+    assert result.warnings == ()
+    assert result.held.mean() >= 0.99
+    assert result.stiff.mean() >= 0.98
+    singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1]
+    assert np.percentile(singular, 5) >= 0.03
+    assert np.abs(result.moment_arms).max() <= 0.07
+
+
+def test_muscles_2_3_and_7_move_shoulder_pitch_most_and_6_only_the_elbow():
+    robot = Robot.load('musashi_left_arm')
+    arms = np.median(np.abs(check_robot(robot).moment_arms), axis=0)
+    pitch = arms[:, robot.joints.index('shoulder_pitch')]
+    assert set(np.argsort(pitch)[-3:] + 1) == {2, 3, 7}
+    assert arms[5, :3].max() < 1e-9 < 0.02 < arms[5, robot.joints.index('elbow_pitch')]
+
+
+def test_tensions_hold_the_arm_within_limits_and_unheld_postures_lack_torque(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, tension={'limit': 45.0}))
+    result = check_robot(robot)
+    held = result.held
+    assert 0 < held.sum() < len(held)
+    torque = robot.kinematics.holding_torque(result.postures)
+    made = np.einsum('nmd,nm->nd', result.moment_arms, np.nan_to_num(result.tension))
+    np.testing.assert_allclose(made[held], torque[held], atol=1e-8)
+    assert result.tension[held].max() <= 45.0 + 1e-8
+    assert (result.missing_torque[held] == 0.0).all()
+    assert (np.abs(result.missing_torque[~held]).max(axis=1) > 0.0).all()
+    assert not result.stiff[~held].any()
+
+
+def test_the_same_seed_gives_the_same_postures_and_another_seed_others():
+    robot = Robot.load('arm26')
+    one, two, three = (check_robot(robot, 20, seed).postures for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, three)
+
+
+@pytest.mark.parametrize('name', SHIPPED)
+def test_the_tool_says_sound_prints_tables_and_draws(name, tmp_path, capsys):
+    file = tmp_path / 'plot.png'
+    assert main([name, '--plot', str(file)]) == 0
+    printed = capsys.readouterr().out
+    robot = Robot.load(name)
+    for word in [*robot.joints, *robot.muscles, 'held', 'one-sided', f'{name}: sound']:
+        assert word in printed
+    assert file.read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_foreign_arm_without_declared_actions_is_judged_too(tmp_path, capsys):
+    status, printed, _ = verdict(capsys, write_robot(tmp_path, finger=True))
+    assert status == 0
+    assert 'sound' in printed
+
+
+@pytest.mark.parametrize(
+    ('name', 'muscle', 'joint'),
+    [
+        ('arm26', 'brachialis', 'elbow'),
+        ('musashi_left_arm', 'deltoid_posterior', 'shoulder_pitch'),
+        ('musashi_left_arm', 'brachialis', 'elbow_pitch'),
+    ],
+)
+def test_a_moment_arm_of_wrong_sign_is_named(tmp_path, capsys, name, muscle, joint):
+    directory = change(copy_robot(name, tmp_path), mirror(muscle))
+    status, printed, _ = verdict(capsys, directory)
+    assert status == 1
+    (line,) = [row for row in printed.splitlines() if 'wrong sign' in row]
+    for fragment in (f"muscle '{muscle}'", f"joint '{joint}'", 'expected', 'found'):
+        assert fragment in line
+
+
+def test_without_declared_actions_a_joint_pulled_one_way_only_is_named(tmp_path, capsys):
+    def cut_straighteners(document):
+        document['muscles'] = [m for m in document['muscles'] if 'straight' not in m['name']]
+
+    status, printed, _ = verdict(capsys, change(write_robot(tmp_path), cut_straighteners))
+    assert status == 1
+    (line,) = [row for row in printed.splitlines() if 'no muscle that pulls' in row]
+    for fragment in ("joint 'bend'", 'direction + (in 100 %', 'bender (-', 'bender_long (-'):
+        assert fragment in line
+
+
+def test_an_arm_too_heavy_for_its_muscles_is_named_with_the_joint_that_lacks_torque(
+    tmp_path, capsys
+):
+    directory = copy_robot('arm26', tmp_path)
+    file = directory / 'robot.urdf'
+    for mass in ('1.2', '0.8', '0.3'):
+        heavy = f'<mass value="{10 * float(mass):.1f}"/>'
+        file.write_text(file.read_text().replace(f'<mass value="{mass}"/>', heavy))
+    status, printed, _ = verdict(capsys, directory)
+    assert status == 1
+    assert 'fault: the arm is not held' in printed
+    assert 'torque lacks most at shoulder in' in printed
+
+
+def test_muscles_too_weak_to_hold_the_arm_are_a_fault(tmp_path):
+    def weaken(document):
+        document['tension']['limit'] = 35.0
+
+    assert 'not_held' in kinds(change(copy_robot('musashi_left_arm', tmp_path), weaken))
+
+
+def test_soft_muscles_are_a_fault_naming_the_softest_joint(tmp_path, capsys):
+    status, printed, _ = verdict(capsys, write_robot(tmp_path, stiffness=500.0))
+    assert status == 1
+    assert 'fault: the arm is not stiff' in printed
+    assert 'lift (' in printed or 'bend (' in printed or 'swing (' in printed
+
+
+def test_a_muscle_that_crosses_no_joint_never_matters(tmp_path, capsys):
+    def idle(document):
+        route = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]
+        document['muscles'].append({'name': 'idler', 'route': route})
+
+    status, printed, _ = verdict(capsys, change(write_robot(tmp_path), idle))
+    assert status == 1
+    assert "muscle 'idler' never matters" in printed
+
+
+def test_a_main_action_that_changes_sign_is_a_warning_not_a_fault(tmp_path):
+    def cross(document):
+        document['muscles'].append(
+            {
+                'name': 'crosser',
+                'route': [
+                    {'link': 'pillar', 'xyz': [0.02, 0.0, 0.06]},
+                    {'link': 'upper', 'xyz': [0.0, 0.0, -0.1]},
+                ],
+            }
+        )
+
+    result = check_robot(Robot.load(change(write_robot(tmp_path), cross)))
+    assert [warning.kind for warning in result.warnings] == ['flipping_muscle']
+    assert "'crosser'" in result.warnings[0].message
+    assert result.faults == ()
+
+
+def test_a_joint_that_moves_no_mass_is_a_fault(tmp_path):
+    directory = write_robot(tmp_path)
+    file = directory / 'robot.urdf'
+    text = file.read_text()
+    for mass in ('0.25', '0.6'):
+        text = text.replace(f'<mass value="{mass}"/>', '<mass value="0"/>')
+    for entry in ('ixx', 'iyy', 'izz'):
+        for value in ('0.0005', '0.0004', '0.003', '0.001'):
+            text = text.replace(f'{entry}="{value}"', f'{entry}="0"')
+    file.write_text(text)
+    (fault,) = (f for f in check_robot(Robot.load(directory)).faults if f.kind == 'no_inertia')
+    assert "'bend'" in fault.message
+
+
+BROKEN = {
+    'unknown link': (lambda d: d['muscles'][0]['route'][0].update(link='knee'), ['knee', 'torso']),
+    'nan': (lambda d: d['muscles'][0]['route'][0]['xyz'].__setitem__(1, float('nan')), ['finite']),
+    'one-point route': (lambda d: d['muscles'][0]['route'].pop(), ['at least 2 points']),
+    'unknown key': (lambda d: d.update(speed=1.0), ["'speed'", 'legal keys']),
+}
+
+
+@pytest.mark.parametrize('case', BROKEN)
+def test_a_description_error_is_one_line_and_status_1(tmp_path, capsys, case):
+    edit, fragments = BROKEN[case]
+    status, printed, error = verdict(capsys, change(copy_robot('arm26', tmp_path), edit))
+    assert status == 1
+    assert printed == ''
+    assert error.startswith('error: ')
+    assert error.count('\n') == 1
+    for fragment in ['muscles.yaml', *fragments]:
+        assert fragment in error
+
+
+@pytest.mark.parametrize(
+    ('rows', 'fragments'),
+    [
+        ('muscle,joint\n', ['muscle,joint,sign']),
+        ('muscle,joint,sign\nbicep,elbow,+\n', ['line 2', "'bicep'", 'brachialis']),
+        ('muscle,joint,sign\nbrachialis,knee,+\n', ['line 2', "'knee'", 'shoulder, elbow']),
+        ('# x\nmuscle,joint,sign\nbrachialis,elbow,1\n', ['line 3', "'1'", '+, -']),
+        ('muscle,joint,sign\nbrachialis,elbow\n', ['line 2', '3 values']),
+        ('muscle,joint,sign\nbrachialis,elbow,-\nbrachialis,elbow,+\n', ['line 3', 'twice']),
+    ],
+)
+def test_a_bad_declaration_is_refused_naming_the_line(tmp_path, capsys, rows, fragments):
+    directory = copy_robot('arm26', tmp_path)
+    (directory / 'moment_arms.csv').write_text(rows)
+    status, _, error = verdict(capsys, directory)
+    assert status == 1
+    for fragment in ['moment_arms.csv', *fragments]:
+        assert fragment in error
+
+
+def test_as_a_program_it_exits_1_without_a_traceback(tmp_path):
+    command = [sys.executable, '-m', 'musculoskeletal_ae.tools.check_robot', str(tmp_path / 'none')]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert 'none' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, capsys):
+    assert main(['arm26', '--plot', str(tmp_path / 'no' / 'such' / 'plot.png')]) == 1
+    assert 'cannot be written' in capsys.readouterr().err

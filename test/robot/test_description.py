@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import copy_robot, read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.robot.description import load_description, shipped_robots
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def put(path, value):
+    """An edit of muscles.yaml: the entry at `path` becomes `value`."""
+
+    def edit(document):
+        at = document
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = value
+
+    return edit
+
+
+def drop(path):
+    def edit(document):
+        at = document
+        for key in path[:-1]:
+            at = at[key]
+        del at[path[-1]]
+
+    return edit
+
+
+ROUTE = ('muscles', 0, 'route')
+POINT = (*ROUTE, 1)
+NAMED = "muscle 'deltoid_anterior'"
+
+BAD = {
+    'unknown top key': (put(['speed'], 1.0), ["unknown key 'speed'", 'joints, muscles']),
+    'unknown muscle key': (put(['muscles', 0, 'colour'], 1), ["key 'colour'", 'name, route']),
+    'unknown point key': (put([*POINT, 'frame'], 1), [NAMED, 'route[1]', "'frame'", 'link, xyz']),
+    'unknown link': (put([*POINT, 'link'], 'hnad'), [NAMED, "'hnad'", 'torso, upper_arm']),
+    'unknown joint': (put(['joints', 1], 'knee'), ["'knee'", 'shoulder, elbow']),
+    'fixed joint': (put(['joints', 1], 'wrist'), ["'wrist'", 'shoulder, elbow']),
+    'joint twice': (put(['joints', 1], 'shoulder'), ["'shoulder'", 'twice']),
+    'muscle twice': (put(['muscles', 1, 'name'], 'deltoid_anterior'), ['twice', 'unique']),
+    'no joints': (put(['joints'], []), ['joints', 'at least 1']),
+    'joints missing': (drop(['joints']), ["'joints' is missing"]),
+    'muscles missing': (drop(['muscles']), ["'muscles' is missing"]),
+    'no muscles': (put(['muscles'], []), ['muscles', 'at least 1']),
+    'name missing': (drop(['muscles', 0, 'name']), ['muscles[0]', "'name' is missing"]),
+    'name a number': (put(['muscles', 0, 'name'], 7), ['muscles[0].name', '7']),
+    'route missing': (drop(ROUTE), [NAMED, "'route' is missing"]),
+    'one-point route': (drop(POINT), [NAMED, 'at least 2 points', '1 given']),
+    'route a text': (put(ROUTE, 'torso'), [NAMED, "'torso'"]),
+    'nan': (put([*POINT, 'xyz', 2], float('nan')), [NAMED, 'route[1].xyz[2]', 'finite', 'nan']),
+    'infinity': (put([*POINT, 'xyz', 0], float('inf')), ['route[1].xyz[0]', 'finite']),
+    'number as text': (put([*POINT, 'xyz', 0], '1e5'), ['finite', '1.0e+5']),
+    'truth as number': (put([*POINT, 'xyz', 0], True), ['finite', 'True']),
+    'endless integer': (put([*POINT, 'xyz', 0], 10**400), ['finite']),
+    'two coordinates': (put([*POINT, 'xyz'], [0.0, 1.0]), ['at least 3 numbers', '2 given']),
+    'four coordinates': (put([*POINT, 'xyz'], [0.0] * 4), ['expected 3 numbers, got 4']),
+    'elastic key': (put(['series_elastic', 'k'], 1.0), ["'k'", 'force, rate, wire_stretch']),
+    'elastic zero': (put(['series_elastic', 'force'], 0.0), ['series_elastic.force', '> 0']),
+    'negative stretch': (put(['series_elastic', 'wire_stretch'], -1e-5), ['wire_stretch', '>= 0']),
+    'stiffness zero': (put(['stiffness'], 0.0), ['stiffness', '> 0']),
+    'stiffness empty': (put(['stiffness'], None), ['stiffness', 'None']),
+    'tension key': (put(['tension', 'min'], 1.0), ["'min'", 'bias, limit, max']),
+    'tension order': (put(['tension', 'limit'], 20.0), ['bias < limit <= max', '20']),
+    'tension above max': (put(['tension', 'limit'], 600.0), ['bias < limit <= max', '600']),
+    'end effector': (put(['end_effector'], 'claw'), ["'claw'", 'torso, upper_arm, forearm, hand']),
+}
+
+
+@pytest.mark.parametrize('case', BAD)
+def test_a_bad_entry_is_refused_naming_file_entry_and_what_is_legal(tmp_path, case):
+    edit, fragments = BAD[case]
+    directory = copy_robot('arm26', tmp_path)
+    document = read_muscles(directory)
+    edit(document)
+    write_muscles(directory, document)
+    with pytest.raises(RobotDescriptionError) as error:
+        load_description(directory)
+    for fragment in ['muscles.yaml', *fragments]:
+        assert fragment in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ('text', 'fragments'),
+    [
+        ('', ['top level', 'expected a mapping']),
+        ('- 1', ['expected a mapping']),
+        ('joints: [shoulder', ['not valid YAML']),
+        ('joints: [a]\njoints: [b]', ["'joints' is written twice"]),
+        ('joints: 2020-13-45', ['not valid YAML']),
+        ('!!python/object/apply:os.system [echo]', ['not valid YAML']),
+        ('[' * 3000, ['not valid YAML']),
+    ],
+)
+def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, fragments):
+    directory = copy_robot('arm26', tmp_path)
+    (directory / 'muscles.yaml').write_text(text)
+    with pytest.raises(RobotDescriptionError) as error:
+        load_description(directory)
+    for fragment in ['muscles.yaml', *fragments]:
+        assert fragment in str(error.value)
+
+
+BAD_URDF = {
+    'not XML': ('<robot', '<<robot', ['not valid XML']),
+    'mass nan': ('<mass value="0.8"/>', '<mass value="nan"/>', ["'forearm'", 'mass value', 'nan']),
+    'mass a word': ('<mass value="0.8"/>', '<mass value="heavy"/>', ["'forearm'", 'heavy']),
+    'mass negative': ('<mass value="0.8"/>', '<mass value="-1"/>', ["'forearm'", '>= 0']),
+    'inertia inf': ('ixx="0.0050"', 'ixx="inf"', ["link 'forearm'", 'inertia ixx', 'inf']),
+    'origin nan': ('xyz="0 0 -0.28"', 'xyz="0 0 nan"', ["joint 'elbow'", 'origin xyz']),
+    'two numbers': ('xyz="0 0 -0.28"', 'xyz="0 -0.28"', ["joint 'elbow'", '3 finite numbers']),
+    'limit nan': ('lower="-1.9199"', 'lower="nan"', ["joint 'elbow'", 'limit lower']),
+    'limits crossed': ('lower="-1.9199"', 'lower="1.0"', ["'elbow'", 'lower < upper']),
+    'continuous': ('type="revolute"', 'type="continuous"', ['revolute or prismatic', 'limits']),
+    'no such parent': ('parent link="upper_arm"', 'parent link="x"', ['not a valid URDF']),
+}
+
+
+@pytest.mark.parametrize('case', BAD_URDF)
+def test_a_bad_urdf_is_refused_naming_the_part(tmp_path, case):
+    old, new, fragments = BAD_URDF[case]
+    directory = copy_robot('arm26', tmp_path)
+    file = directory / 'robot.urdf'
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    with pytest.raises(RobotDescriptionError) as error:
+        load_description(directory)
+    for fragment in [str(directory), *fragments]:
+        assert fragment in str(error.value)
+
+
+@pytest.mark.parametrize('missing', ['robot.urdf', 'muscles.yaml'])
+def test_a_missing_file_is_named(tmp_path, missing):
+    directory = copy_robot('arm26', tmp_path)
+    (directory / missing).unlink()
+    with pytest.raises(RobotDescriptionError, match=missing):
+        load_description(directory)
+
+
+@pytest.mark.parametrize('robot', ['', 'musashi_right_leg', '/nowhere', '~nobody_here/x', 'a\0b'])
+def test_a_robot_that_is_not_there_is_refused_naming_the_shipped_ones(robot):
+    with pytest.raises(RobotDescriptionError, match='arm26, musashi_left_arm'):
+        load_description(robot)
+
+
+def test_the_same_description_is_read_from_a_name_and_from_a_directory():
+    by_name = load_description('arm26')
+    assert by_name.directory == shipped_robots()['arm26']
+    by_directory = load_description(str(by_name.directory))
+    assert by_directory.muscles == by_name.muscles
+
+
+def test_defaults_apply_where_the_optional_keys_are_left_out(tmp_path):
+    directory = write_robot(tmp_path)
+    document = read_muscles(directory)
+    assert not {'tension', 'stiffness', 'series_elastic'} & set(document)
+    del document['end_effector']
+    description = load_description(write_muscles(directory, document))
+    tension = description.tension
+    assert (tension.bias, tension.limit, tension.max) == (30.0, 200.0, 500.0)
+    assert description.stiffness == 10000.0
+    assert description.end_effector == 'tool'  # the last link of the chain
+    assert (description.series_elastic.force > 0.0).all()
+
+
+def test_elastic_constants_of_one_muscle_override_those_of_all(tmp_path):
+    directory = write_robot(tmp_path, series_elastic={'force': 80.0, 'rate': 25.0})
+    document = read_muscles(directory)
+    document['muscles'][2]['series_elastic'] = {'force': 60.0}
+    elastic = load_description(write_muscles(directory, document)).series_elastic
+    expected = np.full(8, 80.0)
+    expected[2] = 60.0
+    np.testing.assert_array_equal(elastic.force, expected)
+    np.testing.assert_array_equal(elastic.rate, np.full(8, 25.0))
+
+
+def test_shipped_arms_have_the_sizes_and_names_the_paper_gives_them():
+    musashi = Robot.load('musashi_left_arm')
+    assert musashi.joints == (
+        'shoulder_roll',
+        'shoulder_pitch',
+        'shoulder_yaw',
+        'elbow_pitch',
+        'elbow_yaw',
+    )
+    assert musashi.muscle_count == 10
+    arm = Robot.load('arm26')
+    assert (arm.joint_count, arm.muscle_count) == (2, 6)
+    arms = np.abs(arm.routes.muscle_jacobian(arm.random_postures(50, np.random.default_rng(0))))
+    assert (np.median(arms, axis=0) > 0.003).all(axis=1).sum() == 2  # biarticular

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.robot import routes
+from musculoskeletal_ae.robot.robot import Robot
+
+MUSASHI = Robot.load('musashi_left_arm')
+
+
+def differences(function, theta, step):
+    return np.stack(
+        [
+            (function(theta + d) - function(theta - d)) / (2 * step)
+            for d in step * np.eye(len(theta))
+        ],
+        axis=-1,
+    )
+
+
+def test_muscle_jacobian_is_the_derivative_of_length(robot):
+    for theta in robot.random_postures(10, np.random.default_rng(0)):
+        expected = differences(robot.routes.absolute_lengths, theta, 1e-6)
+        np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), expected, atol=1e-8)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-3.0, 3.0), min_size=5, max_size=5))
+def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angles):
+    theta = np.array(angles)
+    expected = differences(MUSASHI.routes.absolute_lengths, theta, 1e-6)
+    # A line that runs through a joint's centre bends sharply: hence the relative part.
+    np.testing.assert_allclose(
+        MUSASHI.routes.muscle_jacobian(theta), expected, atol=1e-6, rtol=1e-3
+    )
+
+
+def test_muscle_hessian_is_symmetric_and_the_second_derivative_of_length(robot):
+    for theta in robot.random_postures(3, np.random.default_rng(1)):
+        hessian = robot.routes.muscle_hessian(theta)
+        np.testing.assert_array_equal(hessian, hessian.transpose(0, 2, 1))
+        curvature = [
+            (
+                robot.routes.absolute_lengths(theta + d)
+                - 2 * robot.routes.absolute_lengths(theta)
+                + robot.routes.absolute_lengths(theta - d)
+            )
+            / 1e-8
+            for d in 1e-4 * np.eye(robot.joint_count)
+        ]
+        diagonal = np.einsum('mii->im', hessian)
+        np.testing.assert_allclose(diagonal, curvature, atol=1e-4)
+
+
+def test_relative_length_is_zero_at_theta_zero(robot):
+    zero = np.zeros(robot.joint_count)
+    np.testing.assert_array_equal(robot.routes.relative_lengths(zero), np.zeros(robot.muscle_count))
+    no_tension = robot.muscle_lengths(zero, np.zeros(robot.muscle_count))
+    np.testing.assert_array_equal(no_tension, np.zeros(robot.muscle_count))
+
+
+def test_a_tensed_muscle_is_shorter_at_the_motor(robot):
+    theta = robot.random_postures(5, np.random.default_rng(2))
+    tension = np.full((5, robot.muscle_count), 100.0)
+    loose = robot.muscle_lengths(theta, 0.0 * tension)
+    assert (robot.muscle_lengths(theta, tension) < loose).all()
+
+
+def test_a_batch_gives_what_single_postures_give_whatever_its_size(robot, monkeypatch):
+    theta = robot.random_postures(7, np.random.default_rng(3))
+    single = [robot.routes.muscle_jacobian(row) for row in theta]
+    lengths = [robot.routes.absolute_lengths(row) for row in theta]
+    monkeypatch.setattr(routes, 'CHUNK', 3)
+    np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), single, atol=1e-15)
+    np.testing.assert_allclose(robot.routes.absolute_lengths(theta), lengths, atol=1e-15)
+
+
+def test_leading_axes_of_theta_are_kept(robot):
+    theta = robot.random_postures(6, np.random.default_rng(4))
+    folded = theta.reshape(2, 3, -1)
+    for function in (
+        robot.routes.absolute_lengths,
+        robot.routes.muscle_jacobian,
+        robot.kinematics.holding_torque,
+    ):
+        rows = function(theta)
+        np.testing.assert_array_equal(function(folded), rows.reshape(2, 3, *rows.shape[1:]))
+
+
+def test_an_empty_batch_gives_empty_arrays(robot):
+    theta = np.zeros((0, robot.joint_count))
+    shape = (0, robot.muscle_count, robot.joint_count)
+    assert robot.routes.absolute_lengths(theta).shape == shape[:2]
+    assert robot.routes.muscle_jacobian(theta).shape == shape
+
+
+def test_a_flexor_shortens_when_its_joint_flexes():
+    robot = Robot.load('arm26')
+    jacobian = robot.routes.muscle_jacobian(np.array([0.0, -0.8]))
+    flexor, elbow = robot.muscles.index('brachialis'), robot.joints.index('elbow')
+    # Flexion is negative: l falls as the angle falls, and tension's torque −G is negative.
+    assert jacobian[flexor, elbow] > 0.0

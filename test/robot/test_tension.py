@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.robot.tension import holding_tension
+
+LOW, HIGH = 30.0, 200.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 60.0]))
+def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_nearer(seed, wish):
+    rng = np.random.default_rng(seed)
+    jacobian = rng.uniform(-0.06, 0.06, (8, 3))
+    inside = rng.uniform(LOW, HIGH, 8)  # so that a solution exists
+    torque = -jacobian.T @ inside
+    tension = holding_tension(jacobian, torque, LOW, HIGH, wish)
+    np.testing.assert_allclose(-jacobian.T @ tension, torque, atol=1e-8)
+    assert (tension >= LOW - 1e-8).all()
+    assert (tension <= HIGH + 1e-8).all()
+    # Optimality of a convex problem: the gradient points away from every feasible point.
+    for other in [inside, *(holding_tension(jacobian, torque, LOW, HIGH, w) for w in (0.0, 150.0))]:
+        assert (tension - wish) @ (other - tension) >= -1e-6
+
+
+def test_a_torque_out_of_reach_is_refused():
+    jacobian = np.array([[0.05], [-0.05]])
+    with pytest.raises(InfeasibleError, match='within its limits'):
+        holding_tension(jacobian, np.array([0.05 * 171.0]), LOW, HIGH, 60.0)
+
+
+def test_a_joint_without_muscles_and_without_load_is_held():
+    jacobian = np.array([[0.05, 0.0], [-0.05, 0.0]])
+    tension = holding_tension(jacobian, np.zeros(2), LOW, HIGH, 60.0)
+    np.testing.assert_allclose(tension, [60.0, 60.0])
+
+
+def test_limits_may_differ_between_muscles():
+    jacobian = np.array([[0.05], [-0.05], [0.05]])
+    high = np.array([200.0, 200.0, 0.0])  # the third is ruptured
+    tension = holding_tension(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high, 60.0)
+    np.testing.assert_allclose(tension, [70.0, 50.0, 0.0], atol=1e-9)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robot directories for tests: an arm that shares no name, size or order with the shipped ones."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from musculoskeletal_ae.robot.description import find_robot
+
+# Written from the hand inwards, and with a fixed link and a turned frame on the way, so that
+# nothing works by the accident of order or of identity rotations.
+URDF = """<?xml version="1.0"?>
+<robot name="other">
+  <link name="base"/>
+  <joint name="mount" type="fixed">
+    <parent link="base"/><child link="pillar"/><origin xyz="0.05 0.1 0.4" rpy="0 0 0.3"/>
+  </joint>
+  <joint name="bend" type="revolute">
+    <parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-1.6" upper="-0.2" effort="20" velocity="5"/>
+  </joint>
+  <joint name="swing" type="revolute">
+    <parent link="shoulder"/><child link="upper"/><origin xyz="0 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-0.7" upper="0.4" effort="20" velocity="5"/>
+  </joint>
+  <joint name="lift" type="revolute">
+    <parent link="pillar"/><child link="shoulder"/><origin xyz="0 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="-0.3" upper="0.6" effort="20" velocity="5"/>
+  </joint>
+  <joint name="wrist" type="{wrist}">
+    <parent link="lower"/><child link="tool"/><origin xyz="0.01 0 -0.22" rpy="0.1 0.2 0"/>
+    <axis xyz="0.6 0 -0.8"/><limit lower="0.0" upper="0.05" effort="200" velocity="1"/>
+  </joint>{finger}
+  <link name="pillar"/>
+  <link name="tool">
+    <inertial><origin xyz="0 0.01 -0.03"/><mass value="0.25"/>
+      <inertia ixx="0.0005" ixy="0" ixz="0" iyy="0.0005" iyz="0" izz="0.0004"/></inertial>
+  </link>
+  <link name="lower">
+    <inertial><origin xyz="0 0 -0.1"/><mass value="0.6"/>
+      <inertia ixx="0.003" ixy="0" ixz="0" iyy="0.003" iyz="0" izz="0.001"/></inertial>
+  </link>
+  <link name="upper">
+    <inertial><origin xyz="0 0 -0.14"/><mass value="1.0"/>
+      <inertia ixx="0.008" ixy="0" ixz="0" iyy="0.008" iyz="0" izz="0.0015"/></inertial>
+  </link>
+  <link name="shoulder">
+    <inertial><origin xyz="0 0 0"/><mass value="0.3"/>
+      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>
+  </link>
+</robot>
+"""
+FINGER = """
+  <joint name="finger" type="revolute">
+    <parent link="tool"/><child link="fingertip"/><origin xyz="0.02 0 -0.05"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="2" velocity="5"/>
+  </joint>
+  <link name="fingertip">
+    <inertial><origin xyz="0.02 0 0"/><mass value="0.1"/>
+      <inertia ixx="0.0001" ixy="0" ixz="0" iyy="0.0001" iyz="0" izz="0.0001"/></inertial>
+  </link>"""
+JOINTS = ('bend', 'lift', 'swing')  # the chain is lift, swing, bend
+Route = Sequence[tuple[str, Sequence[float]]]
+MUSCLES: dict[str, Route] = {
+    'pull_front_out': [('pillar', (0.06, 0.05, 0.02)), ('upper', (0.04, 0.03, -0.12))],
+    'pull_front_in': [('pillar', (0.06, -0.05, 0.02)), ('upper', (0.04, -0.03, -0.12))],
+    'pull_back_out': [('pillar', (-0.06, 0.05, 0.0)), ('upper', (-0.04, 0.03, -0.12))],
+    'pull_back_in': [('pillar', (-0.06, -0.05, 0.0)), ('upper', (-0.04, -0.03, -0.12))],
+    'bender': [('upper', (0.03, 0.0, -0.15)), ('lower', (0.04, 0.0, -0.05))],
+    'bender_long': [
+        ('pillar', (0.05, 0.0, 0.01)),
+        ('upper', (0.04, 0.0, -0.1)),
+        ('upper', (0.04, 0.0, -0.22)),
+        ('lower', (0.035, 0.0, -0.05)),
+    ],
+    'straightener': [
+        ('upper', (-0.035, 0.01, -0.15)),
+        ('upper', (-0.042, 0.01, -0.27)),
+        ('lower', (-0.038, 0.01, 0.01)),
+    ],
+    'straightener_low': [
+        ('upper', (-0.035, -0.01, -0.12)),
+        ('upper', (-0.042, -0.01, -0.27)),
+        ('lower', (-0.036, -0.01, 0.005)),
+    ],
+}
+
+
+def write_robot(
+    directory: Path,
+    *,
+    joints: Sequence[str] = JOINTS,
+    finger: bool = False,
+    slider: bool = False,
+    **top: Any,
+) -> Path:
+    """Write a sound arm of 3 joints and 8 muscles with foreign names.
+
+    Args:
+        directory: Made if missing.
+        joints: Order of θ in muscles.yaml; the chain itself is lift, swing, bend.
+        finger: Adds a joint to the URDF that muscles.yaml does not list.
+        slider: Makes the wrist a prismatic joint, the last of θ, with a muscle on either side.
+        top: Further or other top-level keys of muscles.yaml.
+
+    Returns:
+        The directory.
+    """
+    muscles = dict(MUSCLES)
+    if slider:
+        joints = [*joints, 'wrist']
+        muscles['slider_in'] = [('lower', (0.0, 0.02, -0.1)), ('tool', (0.0, 0.02, 0.0))]
+        muscles['slider_out'] = [('lower', (0.03, 0.0, -0.3)), ('tool', (0.01, 0.0, 0.0))]
+    directory.mkdir(parents=True, exist_ok=True)
+    wrist = 'prismatic' if slider else 'fixed'
+    text = URDF.format(wrist=wrist, finger=FINGER if finger else '')
+    (directory / 'robot.urdf').write_text(text, encoding='utf-8')
+    document = {
+        'joints': list(joints),
+        'muscles': [
+            {
+                'name': name,
+                'route': [{'link': link, 'xyz': [float(v) for v in xyz]} for link, xyz in route],
+            }
+            for name, route in muscles.items()
+        ],
+        'end_effector': 'tool',
+        **top,
+    }
+    return write_muscles(directory, document)
+
+
+def copy_robot(name: str, directory: Path) -> Path:
+    """Copy a shipped robot to a directory that a test may change."""
+    return shutil.copytree(find_robot(name), directory, dirs_exist_ok=True)
+
+
+def read_muscles(directory: Path) -> dict[str, Any]:
+    """Return muscles.yaml as data to change."""
+    document: dict[str, Any] = yaml.safe_load((directory / 'muscles.yaml').read_text('utf-8'))
+    return document
+
+
+def write_muscles(directory: Path, document: object) -> Path:
+    """Write muscles.yaml; returns the directory."""
+    text = yaml.safe_dump(copy.deepcopy(document), sort_keys=False, allow_unicode=True)
+    (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
+    return directory
