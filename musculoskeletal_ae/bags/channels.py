@@ -88,6 +88,4 @@ class Channels:
                 raise ValueError(f'the definition of {schema.name}, type of topic {topic}, {lie}')
         self._channels[channel.id] = channel
         qos = channel.metadata.get('offered_qos_profiles', '')
-        self.by_id[channel.id] = Channel(
-            f'/{topic.lstrip("/")}', schema.name, qos, refused, schema
-        )
+        self.by_id[channel.id] = Channel(f'/{topic.lstrip("/")}', schema.name, qos, refused, schema)

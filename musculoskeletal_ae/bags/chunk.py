@@ -8,7 +8,7 @@ import zlib
 from io import BytesIO
 from typing import NamedTuple
 
-import lz4.frame
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from musculoskeletal_ae.bags.records import LARGEST

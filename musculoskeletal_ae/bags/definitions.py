@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
@@ -17,6 +18,8 @@ _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 _TYPESTORE.max_sequence_length = 1 << 26
 
 ENCODING = 'ros2msg'
+# Kinds of field types: a number or string, a message, and arrays of these.
+BASE, NAME, ARRAY = int(Nodetype.BASE), int(Nodetype.NAME), int(Nodetype.ARRAY)
 
 # Fields (type, name) of each type by its name.
 Fields = dict[str, list[tuple[str, str]]]
@@ -49,7 +52,7 @@ def decode(data: bytes, type_name: str) -> Any:
         return _TYPESTORE.deserialize_cdr(data, type_name)
     # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes
     # that are not a message; all of them mean the same.
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         raise ValueError(f'not a {type_name}: {error}') from error
 
 
@@ -61,6 +64,11 @@ def encode(message: object, type_name: str) -> bytes:
 def message_class(type_name: str) -> Any:
     """Return the class of a type's messages, without ROS."""
     return _TYPESTORE.types[type_name]
+
+
+def fields(type_name: str) -> Any:
+    """Return name and type of a type's fields as rosbags describes them."""
+    return _TYPESTORE.fielddefs[type_name][1]
 
 
 def contradiction(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:

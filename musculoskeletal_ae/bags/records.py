@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from musculoskeletal_ae.exceptions import BagError
 
 MAGIC = b'\x89MCAP0\r\n'
-# No record, and no chunk once decompressed, is larger; bounds the memory a damaged file can ask for.
+# No record, and no chunk once decompressed, is larger: what a damaged file can ask for is bounded.
 LARGEST = 64 << 20  # [bytes]
 DAMAGED = 'the file is damaged: use a copy or another recording'
 

@@ -7,72 +7,45 @@ summary are compared with the messages that are really there.
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from musculoskeletal_ae.bags.blocks import Block, Blocks
 from musculoskeletal_ae.bags.channels import Channels
 from musculoskeletal_ae.bags.chunk import read_chunk
-from musculoskeletal_ae.bags.records import DAMAGED, MAGIC, Cut, Record, Records, parse, split
+from musculoskeletal_ae.bags.records import DAMAGED, MAGIC, Cut, Record, Records, parse
 from musculoskeletal_ae.bags.summary import Summary
 from musculoskeletal_ae.exceptions import BagError
 
-MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
-_INDEX_HEAD = struct.Struct('<HI')
-_INDEX_ENTRY = struct.Struct('<QQ')
-_LATEST = (1 << 63) - 1  # ROS time is signed
-_CDR = (b'\x00\x01', b'\x00\x00')
-_LONGEST_RUN = 1 << 20
 
-
-class Block(NamedTuple):
-    """A piece of the file that is read at once: a chunk, or a run of messages outside of chunks.
-
-    Attributes:
-        offset: Where its first record begins.
-        length: From there to the end of the last one.
-        start: Earliest log time [ns].
-        end: Latest log time [ns].
-        channels: Those it has messages of.
-        chunk: Whether it is a chunk.
-    """
-
-    offset: int
-    length: int
-    start: int
-    end: int
-    channels: frozenset[int]
-    chunk: bool
-
-
-@dataclass
+@dataclass(frozen=True)
 class Scan:
     """What was found in one file.
 
     Attributes:
         path: The file.
+        size: Its length [bytes].
         channels: Its topics.
         counts: Messages by channel.
         blocks: Where the messages are.
-        cut: Where the last, incomplete record begins; None in a file that was ended properly.
+        backward: How many messages have an earlier log time than the one before them.
+        cut: Where the incomplete last record begins; None in a file that was ended properly.
         summarised: Whether the counts were compared with the file's own statistics.
     """
 
     path: Path
-    channels: Channels = field(default_factory=Channels)
-    counts: Counter[int] = field(default_factory=Counter)
-    blocks: list[Block] = field(default_factory=list)
-    cut: int | None = None
-    summarised: bool = False
-
-
-# (log time, offset) of each channel's messages in one chunk.
-_Index = dict[int, list[tuple[int, int]]]
+    size: int
+    channels: Channels
+    counts: Counter[int]
+    blocks: list[Block]
+    backward: int
+    cut: int | None
+    summarised: bool
 
 
 def scan(path: Path) -> Scan:
@@ -92,29 +65,42 @@ def scan(path: Path) -> Scan:
 class _Scanner:
     def __init__(self, records: Records) -> None:
         self._records = records
-        self._found = Scan(records.path)
-        self._summary = Summary(records.path, self._found.channels, self._found.counts)
-        self._index: _Index = {}
-        self._run: list[int] = []  # offset and length of the run of messages that is being read
+        self._channels = Channels()
+        self._blocks = Blocks(self._channels)
+        self._summary = Summary(records.path, self._channels, self._blocks.counts)
 
     def run(self) -> Scan:
         records, path = self._records, self._records.path
         if records.size == 0:
             raise BagError(path, 0, 'the file is empty', 'nothing was recorded: record again')
+        if records.size < len(MAGIC) or records.take(len(MAGIC), 0) != MAGIC:
+            raise BagError(path, 0, 'this is no mcap file', 'name a bag directory or a .mcap')
+        cut, summarised = None, False
         try:
-            if records.take(len(MAGIC), 0) != MAGIC:
-                raise BagError(path, 0, 'this is no mcap file', 'name a bag directory or a .mcap')
             self._data()
-            self._end()
-        except Cut as cut:
-            self._close_run()
-            with path.open('rb') as file:
-                file.seek(max(0, records.size - len(MAGIC)))
-                if file.read() == MAGIC and records.size > len(MAGIC):
-                    problem = 'a record reaches beyond the end of the file'
-                    raise BagError(path, cut.offset, problem, DAMAGED) from None
-            self._found.cut = cut.offset
-        return self._found
+            summarised = self._summary.read(records)
+        except Cut as early:
+            cut = early.offset
+            if self._ends_properly():
+                problem = 'a record reaches beyond the end of the file'
+                raise BagError(path, cut, problem, DAMAGED) from early
+        self._blocks.close_run()
+        return Scan(
+            path,
+            records.size,
+            self._channels,
+            self._blocks.counts,
+            self._blocks.found,
+            self._blocks.backward,
+            cut,
+            summarised,
+        )
+
+    def _ends_properly(self) -> bool:
+        """Say whether the file has the end of a complete one, so that a cut means damage."""
+        with self._records.path.open('rb') as file:
+            file.seek(self._records.size - len(MAGIC))
+            return file.read() == MAGIC and self._records.size > len(MAGIC)
 
     def _data(self) -> None:
         header = self._records.head()
@@ -125,109 +111,43 @@ class _Scanner:
             raise self._damaged(header, f'profile {profile[:40]!r} is not ros2')
         while True:
             record = self._records.head()
-            if record.opcode != Opcode.MESSAGE:
-                self._close_run()
             if record.opcode == Opcode.DATA_END:
                 crc = self._records.crc_before
                 claimed = self._parse(mcap.DataEnd, record).data_section_crc
+                # A checksum of 0 says that the recorder computed none.
                 if claimed not in (0, crc):
                     raise self._damaged(record, 'the checksum of all data before does not fit')
                 return
-            self._take(record)
+            if record.opcode == Opcode.ATTACHMENT:
+                self._summary.attachments += 1
+                self._records.skip(record)
+                continue
+            content = self._records.content(record)
+            try:
+                self._take(record, content)
+            except ValueError as error:
+                raise self._damaged(record, str(error)) from error
 
-    def _take(self, record: Record) -> None:
-        if record.opcode == Opcode.ATTACHMENT:
-            self._summary.attachments += 1
-            self._records.skip(record)
-            return
-        content = self._records.content(record)
-        try:
-            if record.opcode == Opcode.CHUNK:
-                self._chunk(record, content)
-            elif record.opcode == Opcode.MESSAGE:
-                self._message_outside(record, content)
-            elif record.opcode == Opcode.MESSAGE_INDEX:
-                self._message_index(content)
-            elif record.opcode == Opcode.SCHEMA:
-                self._found.channels.add_schema(content)
-            elif record.opcode == Opcode.CHANNEL:
-                self._found.channels.add_channel(content)
-            elif record.opcode == Opcode.METADATA:
-                parse(mcap.Metadata, content)
-                self._summary.metadata += 1
-            else:
-                raise ValueError(f'record {record.opcode:#04x} does not belong here')
-        except ValueError as error:
-            raise self._damaged(record, str(error)) from error
+    def _take(self, record: Record, content: bytes) -> None:
+        if record.opcode == Opcode.CHUNK:
+            chunk, length = read_chunk(content), self._records.offset - record.offset
+            self._blocks.add_chunk(record.offset, length, chunk)
+            self._summary.add_chunk(record.offset, length, chunk)
+        elif record.opcode == Opcode.MESSAGE:
+            self._blocks.add_message(record, content, self._records.offset)
+        elif record.opcode == Opcode.MESSAGE_INDEX:
+            self._blocks.compare_index(content)
+        elif record.opcode == Opcode.SCHEMA:
+            self._channels.add_schema(content)
+        elif record.opcode == Opcode.CHANNEL:
+            self._channels.add_channel(content)
+        elif record.opcode == Opcode.METADATA:
+            parse(mcap.Metadata, content)
+            self._summary.metadata += 1
+        else:
+            raise ValueError(f'record {record.opcode:#04x} does not belong here')
 
-    def _chunk(self, record: Record, content: bytes) -> None:
-        chunk = read_chunk(content)
-        self._index = {}
-        for opcode, position, begin, end in split(chunk.content):
-            if opcode == Opcode.MESSAGE:
-                channel, time = self._message(chunk.content, begin, end)
-                self._index.setdefault(channel, []).append((time, position))
-            elif opcode == Opcode.SCHEMA:
-                self._found.channels.add_schema(chunk.content[begin:end])
-            elif opcode == Opcode.CHANNEL:
-                self._found.channels.add_channel(chunk.content[begin:end])
-            else:
-                raise ValueError(f'record {opcode:#04x} does not belong in a chunk')
-        times = [time for entries in self._index.values() for time, _ in entries]
-        if times and (min(times), max(times)) != (chunk.start, chunk.end):
-            raise ValueError('the times of the chunk are not those of its messages')
-        length = self._records.offset - record.offset
-        self._summary.add_chunk(record.offset, length, chunk)
-        if times:
-            self._found.blocks.append(
-                Block(
-                    record.offset, length, chunk.start, chunk.end, frozenset(self._index), True
-                )
-            )
-
-    def _message(self, data: bytes, begin: int, end: int) -> tuple[int, int]:
-        payload = begin + MESSAGE_HEAD.size
-        if end < payload:
-            raise ValueError('a message is shorter than its head')
-        channel, _, time, published = MESSAGE_HEAD.unpack_from(data, begin)
-        if channel not in self._found.channels.by_id:
-            raise ValueError(f'a message of channel {channel}, which is not there')
-        if time > _LATEST or published > _LATEST:
-            raise ValueError('a message has a time beyond all ROS times')
-        if data[payload : payload + 2] not in _CDR and not self._found.channels.by_id[channel].refused:
-            raise ValueError('a message is not in CDR')
-        self._found.counts[channel] += 1
-        return channel, time
-
-    def _message_outside(self, record: Record, content: bytes) -> None:
-        channel, time = self._message(content, 0, len(content))
-        if self._run and record.offset - self._run[0] > _LONGEST_RUN:
-            self._close_run()
-        if not self._run:
-            self._run, self._index = [record.offset, 0], {}
-        self._run[1] = self._records.offset - self._run[0]
-        self._index.setdefault(channel, []).append((time, record.offset))
-
-    def _close_run(self) -> None:
-        if self._run:
-            times = [time for entries in self._index.values() for time, _ in entries]
-            self._found.blocks.append(
-                Block(*self._run, min(times), max(times), frozenset(self._index), False)
-            )
-            self._run, self._index = [], {}
-
-    def _message_index(self, content: bytes) -> None:
-        channel, length = _INDEX_HEAD.unpack_from(content) if len(content) >= 6 else (0, -1)
-        if length != len(content) - _INDEX_HEAD.size or length % _INDEX_ENTRY.size:
-            raise ValueError('a message index has a wrong length')
-        entries = sorted(_INDEX_ENTRY.iter_unpack(content[_INDEX_HEAD.size :]))
-        if entries != sorted(self._index.get(channel, [])):
-            raise ValueError('a message index does not fit the chunk before it')
-
-    def _end(self) -> None:
-        self._found.summarised = self._summary.read(self._records)
-
-    def _parse(self, kind: type, record: Record) -> mcap.McapRecord:
+    def _parse(self, kind: type, record: Record) -> Any:
         try:
             return parse(kind, self._records.content(record))
         except ValueError as error:

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from musculoskeletal_ae.bags.channels import Channels
 from musculoskeletal_ae.bags.chunk import Chunk
-from musculoskeletal_ae.bags.records import DAMAGED, MAGIC, Record, Records, parse
+from musculoskeletal_ae.bags.records import DAMAGED, MAGIC, Records, parse
 from musculoskeletal_ae.exceptions import BagError
 
 _FOOTER = struct.Struct('<QQI')
@@ -34,8 +34,6 @@ class Summary:
         """Compare the summary of `path` with topics and counts that are still being read."""
         self._path, self._channels, self._counts = path, channels, counts
         self._chunks: list[_Place] = []
-        self._chunk_count = 0
-        self._span: tuple[int, int] | None = None
         self.attachments = self.metadata = 0
 
     def add_chunk(self, offset: int, length: int, chunk: Chunk) -> None:
@@ -97,15 +95,15 @@ class Summary:
             except ValueError as error:
                 raise self._damaged(record.offset, str(error)) from error
         if records.take(len(MAGIC), record.offset) != MAGIC:
-            raise self._damaged(records.offset - len(MAGIC), 'the file does not end as mcap files do')
+            raise self._damaged(
+                records.offset - len(MAGIC), 'the file does not end as mcap files do'
+            )
         if records.offset != records.size:
             problem = f'{records.size - records.offset} bytes after the end'
             raise self._damaged(records.offset, problem)
         return statistics is not None
 
-    def _footer(
-        self, content: bytes, begin: int, end: int, first_offset: int, crc: int
-    ) -> None:
+    def _footer(self, content: bytes, begin: int, end: int, first_offset: int, crc: int) -> None:
         if len(content) != _FOOTER.size:
             raise ValueError('the footer has a wrong length')
         summary_start, offset_start, claimed = _FOOTER.unpack(content)

@@ -40,10 +40,10 @@ class Spread:
         tension_gain: Standard deviation of each tension sensor's relative gain error.
     """
 
-    attachment: float = 0.006
+    attachment: float = 0.0085
     wrap: float = 0.4
     elastic: float = 0.15
-    cable_friction: float = 0.05
+    cable_friction: float = 0.095
     joint_friction: float = 0.02
     length_bias: float = 0.0005
     tension_bias: float = 1.0

@@ -106,10 +106,10 @@ def save(mae: Mae, path: str | Path) -> None:
             file.flush()
             os.fchmod(file.fileno(), 0o644)  # mkstemp makes it private
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except BaseException:
         with suppress(OSError):
-            os.unlink(temporary)
+            Path(temporary).unlink()
         raise
     # The new name survives a power cut only once the directory is on disk too.
     directory = os.open(path.parent, os.O_RDONLY)
@@ -126,7 +126,7 @@ def load(path: str | Path, robot: Robot | None = None) -> Mae:
         CheckpointError: If it cannot be read, is damaged or does not fit the robot.
     """
     try:
-        with open(path, 'rb') as file:
+        with Path(path).open('rb') as file:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
         raise CheckpointError(f'{path}: cannot be read ({error}); {REMEDY}') from error
@@ -182,7 +182,8 @@ def _tensors(data: bytes, header: dict[str, object], meta: Metadata) -> dict[str
             )
     if tensors['std'].min() < metadata.SMALLEST_STD:
         raise CheckpointError(
-            f'tensor std holds {tensors["std"].min():g}; at least {metadata.SMALLEST_STD:g} is legal'
+            f'tensor std holds {tensors["std"].min():g}; '
+            f'at least {metadata.SMALLEST_STD:g} is legal'
         )
     if 'anomaly.covariance' in tensors:
         _check_covariance(tensors['anomaly.covariance'])

@@ -16,7 +16,7 @@ Layer = tuple[Array, Array]
 
 
 class Activation(NamedTuple):
-    """An activation h(x), and (h, h') together."""
+    """An activation h(x), which may overwrite x, and (h, h') together, which does not."""
 
     value: Callable[[Array], Array]
     with_slope: Callable[[Array], tuple[Array, Array]]
@@ -33,7 +33,11 @@ def _tanh_slope(x: Array) -> tuple[Array, Array]:
 
 
 def _silu(x: Array) -> Array:
-    result: Array = 0.5 * x * (1.0 + np.tanh(0.5 * x))  # this form does not overflow
+    # u (1 + tanh u) with u = x/2: does not overflow, and needs one temporary array.
+    x *= 0.5
+    result: Array = np.tanh(x)
+    result += 1.0
+    result *= x
     return result
 
 
@@ -112,5 +116,5 @@ def run_with_jacobian(
         if i < len(layers) - 1:
             x, slope = activation.with_slope(x)
             tangent = tangent * slope[..., None, :]
-    assert tangent is not None  # noqa: S101 (there is at least one layer)
+    assert tangent is not None  # there is at least one layer
     return x, tangent

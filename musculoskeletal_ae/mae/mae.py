@@ -69,9 +69,10 @@ class Mae:
 
     def __post_init__(self) -> None:
         """Freeze the arrays and fold units, standardisation and masks into the layers."""
-        for weight, bias in (*self.encoder, *self.decoder, (self.mean, self.std)):
-            weight.setflags(write=False)
-            bias.setflags(write=False)
+        for name in ('encoder', 'decoder'):
+            object.__setattr__(self, name, tuple(map(_frozen, getattr(self, name))))
+        for name, value in zip(('mean', 'std'), _frozen((self.mean, self.std)), strict=True):
+            object.__setattr__(self, name, value)
         joints, muscles = len(self.joints), len(self.muscles)
         scale = scale_vector(joints, muscles)
         (first, first_bias), (last, last_bias) = self.encoder[0], self.decoder[-1]
@@ -164,6 +165,22 @@ class Mae:
         """Return l [m] of shape (..., M) at (θ, T): decode(encode ①)."""
         return self.decode(self.encode(Mask.THETA_TENSION, theta, tension)).length
 
+    def lengths_with_pullback(
+        self, theta: Array, tension: Array
+    ) -> tuple[Array, Callable[[Array], Array]]:
+        """Return l [m] (..., M) at (θ, T) through ①, and the function that maps dL/dl to dL/dθ.
+
+        The pullback of T is Gᵀ T, at the price of one more evaluation instead of D.
+        """
+        joints, muscles = len(self.joints), len(self.muscles)
+        x = np.concatenate((theta, tension), axis=-1)
+        enter = self._enter[Mask.THETA_TENSION]
+        z, to_input = layers.run_with_pullback(enter, self._act, x)
+        weight, bias = self._leave[-1]
+        leave = (*self._leave[:-1], (weight[:, -muscles:], bias[-muscles:]))
+        length, to_latent = layers.run_with_pullback(leave, self._act, z)
+        return length, lambda gradient: to_input(to_latent(gradient))[..., :joints]
+
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
         joints, muscles = len(self.joints), len(self.muscles)
@@ -175,9 +192,7 @@ class Mae:
         tangent = layers.run_with_jacobian(leave, self._act, z, tangent=tangent)[1]
         return tangent.swapaxes(-1, -2)
 
-    def muscle_jacobian_difference(
-        self, theta: Array, tension: Array, step: float = 0.01
-    ) -> Array:
+    def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ①, shape (..., M, D).
 
         Args:
@@ -201,3 +216,10 @@ class Mae:
             values[..., joints : joints + muscles],
             values[..., joints + muscles :],
         )
+
+
+def _frozen(arrays: Layer) -> Layer:
+    first, second = (np.array(value, dtype=np.float64) for value in arrays)
+    first.setflags(write=False)
+    second.setflags(write=False)
+    return first, second

@@ -44,11 +44,11 @@ class NetworkSettings:
     standardise: bool
 
 
-# The paper prints the layers but not the activation. tanh is ours: smooth, as descent through the
-# decoder wants it, and the latent layer stays linear so that z is not confined to a cube.
+# The paper prints the layers but not the activation. tanh is our choice for it: smooth, as descent
+# through the decoder wants it. The latent layer is linear, so that z is not confined to a cube.
 PRESETS = {
     'paper': NetworkSettings(hidden=(200, 30), activation='tanh', standardise=False),
-    'default': NetworkSettings(hidden=(200, 100), activation='tanh', standardise=True),
+    'default': NetworkSettings(hidden=(200, 100), activation='silu', standardise=True),
 }
 
 
@@ -79,8 +79,8 @@ class Network(nn.Module):
         self.encoder = nn.ModuleList(map(nn.Linear, encoder[:-1], encoder[1:]))
         self.decoder = nn.ModuleList(map(nn.Linear, decoder[:-1], decoder[1:]))
         self.activation = ACTIVATIONS[settings.activation]
-        self.register_buffer('mean', torch.as_tensor(mean, dtype=torch.float32))
-        self.register_buffer('std', torch.as_tensor(std, dtype=torch.float32))
+        self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
+        self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
         entries = np.stack([visible(mask, joints, muscles) for mask in Mask])
         flags = np.array([mask.value for mask in Mask])
         # One row per mask: which entries pass, then the three mask inputs themselves.
@@ -128,7 +128,7 @@ def to_mae(
         return tensor.detach().cpu().numpy().astype(np.float64)
 
     def stack(layers: nn.ModuleList) -> tuple[tuple[Array, Array], ...]:
-        return tuple((array(layer.weight), array(layer.bias)) for layer in layers)
+        return tuple((array(layer.weight), array(layer.bias)) for layer in _linear(layers))
 
     return Mae(
         joints=joints,
@@ -154,7 +154,11 @@ def from_mae(mae: Mae) -> Network:
     network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
-            for layer, (weight, bias) in zip(layers, arrays, strict=True):
-                layer.weight.copy_(torch.from_numpy(weight.copy()))  # type: ignore[operator, union-attr]
-                layer.bias.copy_(torch.from_numpy(bias.copy()))  # type: ignore[operator, union-attr]
+            for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):
+                layer.weight.copy_(torch.tensor(weight))
+                layer.bias.copy_(torch.tensor(bias))
     return network
+
+
+def _linear(layers: nn.ModuleList) -> list[nn.Linear]:
+    return [layer for layer in layers if isinstance(layer, nn.Linear)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic bodies' data: what the geometric model says of random postures and tensions.
+"""Synthetic data: what the geometric model says of random postures and tensions.
 
     (θ, T, l) = (θ_r, T_r, f_geo(θ_r) − L_e(f_geo,abs(θ_r), T_r))
 
@@ -18,8 +18,6 @@ from musculoskeletal_ae.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-# Samples drawn at once: large enough that numpy's overhead vanishes, small enough to stay in cache.
-CHUNK = 16384
 # Share of samples, in preset default, with tensions beyond what is planned.
 OVERLOAD_SHARE = 0.2
 
@@ -55,25 +53,9 @@ def overload_samples(robot: Robot, count: int, rng: np.random.Generator) -> Arra
     return geometric_samples(robot, count, rng, highest)
 
 
-class GeometricSampler:
-    """Endless fresh batches of scaled (θ, T, l) from the geometric model."""
-
-    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        """Draw batches of `robot` from `rng`."""
-        self._robot, self._rng = robot, rng
-        self._stock: Array = np.empty((0, robot.joint_count + 2 * robot.muscle_count))
-
-    def __call__(self, count: int) -> Array:
-        """Return the next batch, shape (count, D+2M)."""
-        if len(self._stock) < count:
-            self._stock = overload_samples(self._robot, max(CHUNK, count), self._rng)
-        batch, self._stock = self._stock[:count], self._stock[count:]
-        return batch
-
-
-def epochs(samples: Array, rng: np.random.Generator, batch: int) -> Iterator[Array]:
-    """Yield the mini-batches of shuffled samples, epoch after epoch, without end."""
+def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield mini-batches of shuffled samples, epoch after epoch, without end."""
     while True:
         order = rng.permutation(len(samples))
-        for i in range(0, len(order) - batch + 1, batch):
+        for i in range(0, max(len(order) - batch, 0) + 1, batch):
             yield samples[order[i : i + batch]]

@@ -9,7 +9,9 @@ training and online learning share it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,12 +21,17 @@ from torch import Tensor
 
 from musculoskeletal_ae.mae import samples
 from musculoskeletal_ae.mae.network import PRESETS, Network
+from musculoskeletal_ae.mae.optimisers import Adam, Muon
 from musculoskeletal_ae.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
 # Keeps the gradient of a norm finite at zero.
 TINY = 1e-12
+# A joint or muscle that hardly varies is not blown up beyond this, in scaled units.
+LEAST_SPREAD = 1e-4
+#: step size of Muon's matrices for a step size of 1 of the biases
+MUON_MATRIX_RATIO = 12.5
 
 
 @dataclass(frozen=True)
@@ -34,56 +41,59 @@ class TrainingSettings:
     Attributes:
         steps: Mini-batches in all.
         batch: Samples in a mini-batch.
+        samples: Samples drawn from the geometric model, then shuffled epoch by epoch.
+        optimiser: 'adam' or 'muon'.
+        step_size: Adam's; with Muon that of the biases.
+        annealed: Raise the step size over the first twentieth, then lower it to zero by a cosine.
         every_mask: Enter each sample by all three masks instead of one at random.
-        step_size: Adam's.
-        schedule: 'constant', or 'one-cycle': up for a twentieth, then down to zero by a cosine.
         weights: w_θ, w_T, w_l.
         standard_norms: Take each norm in units of the spread of the data.
-        epoch_samples: Draw so many samples once and shuffle them; 0 draws afresh for every batch.
     """
 
     steps: int
     batch: int
-    every_mask: bool
+    samples: int
+    optimiser: str
     step_size: float
-    schedule: str
+    annealed: bool
+    every_mask: bool
     weights: tuple[float, float, float]
     standard_norms: bool
-    epoch_samples: int = 0
 
 
 # The paper prints 30 epochs and w = (1, 10, 10). Its "number of batches 100" is read as the size
 # of a mini-batch of 10 000 samples; the step size is Adam's own default.
 TRAINING_PRESETS = {
     'paper': TrainingSettings(
-        steps=3000,
+        steps=30 * 100,
         batch=100,
-        every_mask=False,
+        samples=10_000,
+        optimiser='adam',
         step_size=1e-3,
-        schedule='constant',
+        annealed=False,
+        every_mask=False,
         weights=(1.0, 10.0, 10.0),
         standard_norms=False,
-        epoch_samples=10_000,
     ),
     'default': TrainingSettings(
-        steps=6000,
-        batch=256,
-        every_mask=True,
+        steps=3000,
+        batch=128,
+        samples=200_000,
+        optimiser='muon',
         step_size=4e-3,
-        schedule='one-cycle',
+        annealed=True,
+        every_mask=True,
         weights=(1.0, 1.0, 1.0),
         standard_norms=True,
     ),
 }
 
-#: gives the next mini-batch of scaled (θ, T, l), shape (count, D+2M)
-Sampler = Callable[[int], Array]
 #: told (step, loss) after every mini-batch
 Progress = Callable[[int, float], None]
 
 
 def loss(network: Network, values: Tensor, mask: Tensor, settings: TrainingSettings) -> Tensor:
-    """Return the mean of L_initial over a mini-batch of (values, mask)."""
+    """Return the mean of L_initial over a mini-batch of scaled (θ, T, l) and mask indices."""
     joints, muscles = network.joints, network.muscles
     error = network.decode_standard(network.encode(values, mask))
     error = error - (values - network.mean) / network.std  # (N, D+2M)
@@ -96,47 +106,53 @@ def loss(network: Network, values: Tensor, mask: Tensor, settings: TrainingSetti
 
 def fit(
     network: Network,
-    sampler: Sampler,
+    batches: Iterator[Array],
     settings: TrainingSettings,
-    generator: torch.Generator,
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> list[float]:
     """Train a network in place, from whatever weights it has.
 
     Args:
         network: The network.
-        sampler: Gives mini-batches of scaled (θ, T, l).
+        batches: Gives mini-batches of scaled (θ, T, l), shape (N, D+2M), at least
+            `settings.steps` of them.
         settings: How to train.
-        generator: Draws the masks.
+        seed: Draws the masks where a sample is entered by one only.
         progress: Told (step, loss) after every mini-batch.
 
     Returns:
         The loss of every mini-batch.
     """
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.step_size, fused=True)
-    schedule = None
-    if settings.schedule == 'one-cycle':
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, settings.step_size, settings.steps, pct_start=0.05, cycle_momentum=False
-        )
+    generator = torch.Generator().manual_seed(seed)
+    optimiser: Adam | Muon
+    if settings.optimiser == 'muon':
+        optimiser = Muon(network, MUON_MATRIX_RATIO * settings.step_size, settings.step_size)
+    else:
+        optimiser = Adam(network, settings.step_size)
     losses = []
-    for step in range(settings.steps):
-        values = torch.as_tensor(sampler(settings.batch), dtype=torch.float32)  # (N, D+2M)
-        if settings.every_mask:
-            mask = torch.arange(3).repeat_interleave(len(values))
-            values = values.repeat(3, 1)  # (3N, D+2M)
-        else:
-            mask = torch.randint(3, (len(values),), generator=generator)
-        optimiser.zero_grad()
-        value = loss(network, values, mask, settings)
-        value.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        if schedule is not None:
-            schedule.step()
-        losses.append(value.item())
-        if progress is not None:
-            progress(step, losses[-1])
+    with _one_thread():
+        for step in range(settings.steps):
+            values = torch.as_tensor(next(batches), dtype=torch.float32)  # (N, D+2M)
+            if settings.every_mask:
+                mask = torch.arange(3).repeat_interleave(len(values))
+                values = values.repeat(3, 1)  # (3N, D+2M)
+            else:
+                mask = torch.randint(3, (len(values),), generator=generator)
+            value = loss(network, values, mask, settings)
+            value.backward()
+            optimiser.step(annealing(step / settings.steps) if settings.annealed else 1.0)
+            losses.append(value.item())
+            if progress is not None:
+                progress(step, losses[-1])
     return losses
+
+
+def annealing(progress: float, rise: float = 0.05) -> float:
+    """Return the factor of the step size at a share of the training in [0, 1)."""
+    if progress < rise:
+        return progress / rise
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - rise) / (1.0 - rise)))
 
 
 def initial_training(
@@ -162,21 +178,26 @@ def initial_training(
     if steps is not None:
         settings = replace(settings, steps=steps)
     rng = np.random.default_rng(seed)
-    sampler: Sampler
-    if settings.epoch_samples:
-        drawn = samples.geometric_samples(robot, settings.epoch_samples, rng, robot.tension.max)
-        batches = samples.epochs(drawn, rng, settings.batch)
-        sampler = lambda _: next(batches)  # noqa: E731
-    else:
-        sampler = samples.GeometricSampler(robot, rng)
     width = robot.joint_count + 2 * robot.muscle_count
     mean, std = np.zeros(width), np.ones(width)
     if PRESETS[preset].standardise:
-        drawn = samples.overload_samples(robot, 20_000, rng)
-        # A muscle that crosses no joint of this arm still has a length; its spread may be tiny.
-        mean, std = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), 1e-6)
-    generator = torch.Generator().manual_seed(seed)
+        drawn = samples.overload_samples(robot, settings.samples, rng)
+        mean, std = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), LEAST_SPREAD)
+    else:
+        drawn = samples.geometric_samples(robot, settings.samples, rng, robot.tension.max)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = Network(robot.joint_count, robot.muscle_count, PRESETS[preset], mean, std)
-    return network, fit(network, sampler, settings, generator, progress)
+    batches = samples.shuffled(drawn, settings.batch, rng)
+    return network, fit(network, batches, settings, seed, progress)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Use one core: matrices this small gain little from two, and lose much if one is busy."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -15,7 +15,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -227,7 +229,7 @@ def run(make: Callable[[], Node]) -> None:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except MusculoskeletalError as error:
+    except (MusculoskeletalError, *PARAMETER_ERRORS) as error:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(1)
     finally:
@@ -235,6 +237,14 @@ def run(make: Callable[[], Node]) -> None:
             node.destroy_node()
         rclpy.try_shutdown()
 
+
+# What rclpy raises for a value of the wrong type or beyond its range, given at the start.
+PARAMETER_ERRORS = (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    rclpy_implementation.UnknownROSArgsError,
+    rclpy_implementation.RCLInvalidROSArgsError,
+)
 
 USAGE = """
 This is a ROS 2 node. Parameters:  --ros-args -p NAME:=VALUE  or  --params-file FILE;

@@ -23,13 +23,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension, nearest_tension
+from musculoskeletal_ae.robot.tension import Exertion, least_tension
 from musculoskeletal_ae.tasks.descent import StepSearch, Term, descend
-from musculoskeletal_ae.tasks.length_command import msc_compensation
+from musculoskeletal_ae.tasks.length_command import first_command, msc_compensation
 
 Array = NDArray[np.float64]
 
@@ -68,23 +67,18 @@ def proposed(
         limit: Highest tension planned [N], scalar or shape (M,).
     """
     bias = robot.tension.bias
-    tension = np.clip(tension, bias, limit)
-    missing = np.zeros(robot.joint_count)
+    found = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))
     for _ in range(SOLVES):
-        jacobian = mae.muscle_jacobian(theta, tension)
-        try:
-            tension = holding_tension(jacobian, torque, bias, limit, wish=0.0)
-        except InfeasibleError:
-            tension = nearest_tension(jacobian, torque, bias, limit)
-            missing = torque + jacobian.T @ tension
-    length = mae.lengths(theta, tension) + msc_compensation(robot, tension)
-    return Solution(length, tension, missing)
+        found = least_tension(mae.muscle_jacobian(theta, found.tension), torque, bias, limit)
+    length = first_command(robot, mae, theta, found.tension)
+    return Solution(length, found.tension, found.missing_torque)
 
 
-def proposed_paper(
-    robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
-) -> Solution:
-    """Return the command of preset `paper`; arguments as for `proposed`."""
+def proposed_paper(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
+    """Return the command of preset `paper`; arguments as for `proposed`.
+
+    It knows no limits; what it leaves of the torque is its own choice and not reported as missing.
+    """
     joints, muscles = robot.joint_count, robot.muscle_count
     jacobian = mae.muscle_jacobian_difference(theta, tension)
     rows = np.eye(joints + 2 * muscles)
@@ -97,4 +91,4 @@ def proposed_paper(
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
     state = mae.decode(z)
     length = state.length + msc_compensation(robot, state.tension)
-    return Solution(length, state.tension, torque + jacobian.T @ state.tension)
+    return Solution(length, state.tension, np.zeros(joints))

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a target posture to a smooth stream of muscle lengths: targets, methods, exploration.
+"""From a target posture to a smooth stream of muscle lengths.
 
 A target becomes one or two goals (`second` runs `first` before it, as in the paper); a goal is
-approached by a straight ramp in muscle length, never faster than the rate limit, and then held. A
-new target or a new network starts a new ramp from the command of the moment, so that nothing jumps.
+ramped to and then held. A new target, method or network starts a new ramp from the command of the
+moment, so that nothing jumps. T_current is read once, when a method starts: read again and again,
+`second` would raise the tension without end.
+
+While the arm rests, a slow integral may correct what is left (LINEAGE, hysteresis feedback):
+
+    dc/dt = gain (θ_target − θ_estimated),  |c| ≤ CORRECTION,   l_target = ①(θ_target + c, T) + l_comp(T)
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,33 +19,18 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks import control
+from musculoskeletal_ae.tasks.control import Solution
 from musculoskeletal_ae.tasks.exploration import RAMP_SHARE, Exploration
 from musculoskeletal_ae.tasks.length_command import first_command, geometric_command
+from musculoskeletal_ae.tasks.ramp import Ramp
+from musculoskeletal_ae.tasks.settings import Settings
+from musculoskeletal_ae.tasks.stiffness_control import StiffnessSolution, stiffness_command
 
 Array = NDArray[np.float64]
 
-METHODS = ('geometric', 'first', 'second', 'proposed')
-
-
-@dataclass
-class Settings:
-    """What a user may choose.
-
-    Attributes:
-        method: One of METHODS.
-        preset: 'paper' or 'default', for `proposed`.
-        first_duration: How long a goal of `first` (and of the other methods) takes [s].
-        second_duration: How long one of `second` takes [s].
-        rate_limit: Fastest change of a commanded length [m/s].
-        constant_tension: T_const of `first` [N]; 0 stands for T_bias.
-    """
-
-    method: str = 'proposed'
-    preset: str = 'default'
-    first_duration: float = 5.0
-    second_duration: float = 2.0
-    rate_limit: float = 0.1
-    constant_tension: float = 0.0
+CORRECTION = 0.3  # [rad] at most, by feedback
+SETTLING = 0.5  # [s] after a ramp until feedback takes the arm for resting
+REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
 
 
 class PostureControl:
@@ -52,116 +40,141 @@ class PostureControl:
         theta: θ_target [rad], shape (D,), or None before the first target.
         effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
         missing_torque: What the last goal cannot deliver [N·m], shape (D,).
+        stiffness: What the last goal of `stiffness` expects, or None.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Control `robot`; `settings` may be changed by the owner at any time."""
-        self._robot = robot
-        self.settings = settings
+        """Control `robot`; the owner may change `settings` at any time."""
+        self._robot, self._settings = robot, settings
         self._mae: Mae | None = None
         self.theta: Array | None = None
         self.effort: Array = np.zeros(robot.joint_count)
         self.missing_torque: Array = np.zeros(robot.joint_count)
-        self._pending: list[tuple[str, float]] = []
-        self._tension: Array = np.full(robot.muscle_count, robot.tension.bias)
+        self.stiffness: StiffnessSolution | None = None
         self._exploration: Exploration | None = None
-        self._command: Array | None = None
-        self._goal: Array | None = None
-        self._speed = 0.0
+        self._goals: list[tuple[str, float]] = []
+        self._method = ''
         self._remaining = 0.0
-        self._last_method = ''
-
-    def use(self, mae: Mae) -> None:
-        """Take a new network; a goal that is being held is computed anew and ramped to."""
-        self._mae = mae
-        if self.theta is not None and self._exploration is None and not self._pending:
-            self._pending = [(self._last_method, self.settings.second_duration)]
-            self._remaining = 0.0
+        self._constant: Array = np.full(robot.muscle_count, robot.tension.bias)
+        self._current: Array | None = None
+        self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
+        self._command: Array = np.zeros(robot.muscle_count)
+        self._ramp: Ramp | None = None
+        self._solution: Solution | None = None
+        self._correction: Array = np.zeros(robot.joint_count)
 
     @property
     def exploring(self) -> bool:
         """Whether random targets are being generated."""
         return self._exploration is not None
 
-    def explore(self, seed: int | None) -> None:
-        """Start exploring with a stream of random targets, or stop (None) and hold."""
-        self._exploration = None if seed is None else Exploration(self._robot, seed)
-        self._pending, self._remaining = [], 0.0
+    def use(self, mae: Mae) -> None:
+        """Take a new network; a goal that is being held is solved anew and ramped to."""
+        self._mae = mae
+        self._solve_again()
+
+    def explore(self, exploration: Exploration | None) -> None:
+        """Follow a stream of random targets, or end that (None) and hold."""
+        self._exploration = exploration
+        self._goals, self._remaining = [], 0.0
 
     def set_target(self, theta: Array, effort: Array) -> None:
         """Go to a posture [rad] (D,) and exert a torque there [N·m] (D,); ends exploration."""
         self.explore(None)
         self.theta, self.effort = theta, effort
-        self._tension = np.full(self._robot.muscle_count, self._constant_tension())
-        chosen = self.settings
-        if chosen.method == 'second':
-            self._pending = [('first', chosen.first_duration), ('second', chosen.second_duration)]
-        else:
-            self._pending = [(chosen.method, chosen.first_duration)]
+        self.start()
 
-    def hold(self) -> None:
-        """Stay at the command of the moment, without a target, as after a stop."""
-        self.explore(None)
-        self.theta = self._goal = None
+    def start(self) -> None:
+        """Go to the target by the method that is set now, from the command of the moment."""
+        if self.theta is None or self._exploration is not None:
+            return
+        chosen = self._settings
+        constant = max(chosen.constant_tension, self._robot.tension.bias)
+        self._constant = np.full(self._robot.muscle_count, constant)
+        self._current, self._remaining = None, 0.0
+        self._correction = np.zeros(self._robot.joint_count)
+        self._goals = [(chosen.method, chosen.first_duration)]
+        if chosen.method == 'second':
+            self._goals = [('first', chosen.first_duration), ('second', chosen.second_duration)]
 
     def start_from(self, command: Array) -> None:
-        """Continue from a command [m] (M,), after a stop or at the start."""
-        self._command, self._goal = command.copy(), None
-        self._remaining = 0.0
+        """Continue from a command [m] (M,): at the start, after a stop or another method."""
+        self._command, self._ramp = command.copy(), None
+        self.start()
 
-    def step(self, tension: Array, limit: Array, dt: float) -> Array | None:
+    def step(self, tension: Array, theta: Array, limit: Array, dt: float) -> Array | None:
         """Return the command [m] (M,) of this moment, or None while there is no target.
 
         Args:
             tension: Measured [N], shape (M,).
+            theta: Estimated [rad], shape (D,).
             limit: Highest tension planned for each muscle [N], shape (M,).
             dt: Time since the step before [s].
         """
         self._remaining -= dt
+        if np.abs(limit - self._limit).max() > REPLAN and self._remaining <= 0.0:
+            self._limit = limit
+            self._solve_again()
         if self._remaining <= 0.0:
             self._next_goal(tension, limit)
-        if self._command is None or self._goal is None:
+        if self._ramp is None:
             return None
-        left = self._goal - self._command
-        fastest = np.abs(left).max()
-        if fastest > 0.0:
-            # All muscles arrive together; none is faster than the limit.
-            self._command = self._command + left * min(1.0, self._speed * dt / fastest)
+        if not self._ramp.done:
+            self._command = self._ramp.step(dt)
+        elif self._settings.feedback_gain > 0.0 and self._remaining < -SETTLING:
+            self._correct(theta, dt)
         return self._command.copy()
 
-    def _constant_tension(self) -> float:
-        return self.settings.constant_tension or self._robot.tension.bias
+    def _solve_again(self) -> None:
+        if self._ramp is not None and not self._goals and self._exploration is None:
+            self._goals = [(self._method, self._settings.second_duration)]
 
     def _next_goal(self, tension: Array, limit: Array) -> None:
-        if self._exploration is not None and not self._pending:
+        if self._exploration is not None and not self._goals:
             planned = self._exploration.next_step()
-            self.theta, self._tension = planned.theta, planned.tension
-            self._pending = [(planned.method, planned.duration)]
-        if not self._pending or self._mae is None or self.theta is None:
+            self.theta, self._constant = planned.theta, planned.tension
+            self._goals, self._current = [(planned.method, planned.duration)], None
+        if not self._goals or self._mae is None or self.theta is None:
             return
-        method, duration = self._pending.pop(0)
-        self._last_method, self._remaining = method, duration
-        self._goal = self._solve(method, self.theta, tension, limit)
-        assert self._command is not None  # noqa: S101 (start_from came first)
-        farthest = float(np.abs(self._goal - self._command).max())
-        self._speed = min(self.settings.rate_limit, farthest / (RAMP_SHARE * duration))
+        self._method, duration = self._goals.pop(0)
+        if self._current is None or self._method == 'second':
+            self._current = tension
+        self._limit = limit
+        goal = self._solve(self._mae, self.theta, self._current, limit)
+        self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self._settings.rate_limit)
+        self._remaining = max(duration, self._ramp.duration)
 
-    def _solve(self, method: str, theta: Array, tension: Array, limit: Array) -> Array:
-        robot, mae = self._robot, self._mae
-        assert mae is not None  # noqa: S101 (asked by the caller)
+    def _solve(self, mae: Mae, theta: Array, current: Array, limit: Array) -> Array:
+        robot, method = self._robot, self._method
         self.missing_torque = np.zeros(robot.joint_count)
+        self._solution = self.stiffness = None
         if method == 'geometric':
             return geometric_command(robot, theta)
-        if method == 'first':
-            return first_command(robot, mae, theta, self._tension)
-        if method == 'second':
-            return first_command(robot, mae, theta, tension)
+        if method in ('first', 'second'):
+            return first_command(
+                robot, mae, theta, self._constant if method == 'first' else current
+            )
         torque = robot.kinematics.holding_torque(theta) + self.effort
-        if self.settings.preset == 'paper':
-            solution = control.proposed_paper(robot, mae, theta, torque, tension)
+        if method == 'stiffness':
+            wish = np.zeros(robot.joint_count)
+            wish[: len(self._settings.joint_stiffness)] = self._settings.joint_stiffness
+            self.stiffness = stiffness_command(robot, mae, theta, torque, wish, limit)
+            self._solution = self.stiffness.command
+        elif self._settings.preset == 'paper':
+            self._solution = control.proposed_paper(robot, mae, theta, torque, current)
         else:
-            solution = control.proposed(robot, mae, theta, torque, tension, limit)
-        self.missing_torque = solution.missing_torque
-        return solution.length
+            self._solution = control.proposed(robot, mae, theta, torque, current, limit)
+        self.missing_torque = self._solution.missing_torque
+        return self._solution.length
 
-
+    def _correct(self, theta: Array, dt: float) -> None:
+        """Shift the commanded lengths so that the estimate comes nearer to the target."""
+        if self._solution is None or self._mae is None or self.theta is None:
+            return
+        gain = self._settings.feedback_gain
+        correction = self._correction + gain * dt * (self.theta - theta)
+        self._correction = np.clip(correction, -CORRECTION, CORRECTION)
+        tension, robot = self._solution.tension, self._robot
+        shifted = first_command(robot, self._mae, self.theta + self._correction, tension)
+        centred = first_command(robot, self._mae, self.theta, tension)
+        self._command = self._solution.length + shifted - centred

@@ -1,27 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every length command passes before it leaves: safe stop, rate limit, saturation, check.
+"""What every command passes before it leaves: rate limit, saturation, finite check, safe stop.
 
-Order: model → rate limit → saturate → finite check last. A stop latches: the last command is held
-for `hold_time`, then the muscles are paid out at the rate limit until MSC holds only T_bias.
+Order: model → rate limit → saturate → finite check last. MSC pulls with T_bias + K (l − l_target),
+so the tension limit of a muscle is a length limit,
 
-A tension limit is a length limit, since MSC pulls with T_bias + K (l − l_target):
+    l_target ≥ l − (T_limit − T_bias)/K_stiff,
 
-    l_target ≥ l − (T_limit − T_bias)/K_stiff
+which may pay a muscle out faster than the rate limit, never wind it in. The limit of a muscle whose
+module runs hot falls smoothly from tension.max to T_bias.
 
-and the limit of a muscle whose module runs hot falls smoothly from tension.max to T_bias.
+A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
+limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tasks.settings import Settings
 
 Array = NDArray[np.float64]
 
+LENGTH, TENSION = 'length', 'tension'
+
 # Width of the band below the highest temperature in which a muscle's tension limit falls.
 COOLING_BAND = 15.0  # [°C]
+
+
+class Command(NamedTuple):
+    """What the modules are to follow: LENGTH [m] or TENSION [N], values of shape (M,)."""
+
+    kind: str
+    value: Array
+
+
+class Muscles(NamedTuple):
+    """The last muscle_states: l [m], T [N], temperature [°C], each of shape (M,)."""
+
+    length: Array
+    tension: Array
+    temperature: Array
 
 
 def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
@@ -35,27 +57,30 @@ def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
     return limit
 
 
+def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:
+    """Return the command of a kind under which the muscles pull as they do now."""
+    tension = np.maximum(muscles.tension, robot.tension.bias)
+    if kind == TENSION:
+        return Command(TENSION, tension)
+    return Command(LENGTH, muscles.length - (tension - robot.tension.bias) / robot.stiffness)
+
+
 class SafetyFilter:
-    """Latched stop and limits of the commanded lengths.
+    """Latched stop and limits of the commands.
 
     Attributes:
         cause: Why the arm was stopped, or ''.
-        command: Last command that left [m], shape (M,), or None.
+        command: Last command that left, or None.
     """
 
-    def __init__(self, robot: Robot, rate_limit: float = 0.1, hold_time: float = 0.5) -> None:
-        """Guard `robot`.
-
-        Args:
-            robot: For the tension range and K_stiff.
-            rate_limit: Fastest change of a commanded length [m/s].
-            hold_time: How long a stop holds the last command before paying out [s].
-        """
-        self._robot = robot
-        self.rate_limit, self.hold_time = rate_limit, hold_time
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        """Guard `robot`; the owner may change `settings` at any time."""
+        self._robot, self._settings = robot, settings
         self.cause = ''
-        self.command: Array | None = None
+        self.command: Command | None = None
         self._held = 0.0
+        postures = robot.random_postures(200, np.random.default_rng(0))
+        self._longest: Array = robot.routes.relative_lengths(postures).max(axis=0)
 
     def stop(self, cause: str) -> None:
         """Latch a stop; the first cause is kept."""
@@ -66,39 +91,57 @@ class SafetyFilter:
         """Clear the stop."""
         self.cause = ''
 
-    def step(self, wished: Array | None, length: Array, limit: Array, dt: float) -> Array | None:
-        """Return the command that may leave [m] (M,), or None if nothing was ever commanded.
+    def step(
+        self, wished: Command | None, muscles: Muscles, limit: Array, dt: float, fresh: bool = True
+    ) -> Command | None:
+        """Return the command that may leave, or None if nothing was ever commanded.
 
         Args:
-            wished: What control wants [m], shape (M,); None to keep the last command.
-            length: Measured lengths [m], shape (M,), the last ones that came.
+            wished: What control wants; None to keep the last command.
+            muscles: The last muscle_states that came.
             limit: Tension limit of each muscle [N], shape (M,).
             dt: Time since the step before [s].
+            fresh: Whether `muscles` still says where the muscles are.
         """
-        if self.cause:
-            return self._pay_out(length, dt)
-        before = self.command
-        if wished is None:
-            wished = before
-        if wished is None:
-            return None
-        if before is not None:
-            change = self.rate_limit * dt
-            wished = before + np.clip(wished - before, -change, change)
-        shortest = length - (limit - self._robot.tension.bias) / self._robot.stiffness
-        wished = np.maximum(wished, shortest)
-        if not np.isfinite(wished).all():
+        if not self.cause:
+            wished = wished or self.command
+            if wished is None:
+                return None
+            limited = self._limited(wished, muscles, limit, dt)
+            if np.isfinite(limited.value).all():
+                self.command = limited
+                return limited
             self.stop('the computed command is not finite')
-            return self.command
-        self.command = wished
-        return wished.copy()
+        if self.command is not None:
+            self.command = self._released(self.command, muscles, dt, fresh)
+        return self.command
 
-    def _pay_out(self, length: Array, dt: float) -> Array | None:
-        if self.command is None:
-            return None
+    def _rate(self, kind: str) -> float:
+        rate = self._settings.rate_limit
+        return rate if kind == LENGTH else rate * self._robot.stiffness
+
+    def _limited(self, wished: Command, muscles: Muscles, limit: Array, dt: float) -> Command:
+        kind, robot = wished.kind, self._robot
+        before = self.command
+        if before is None or before.kind != kind:
+            before = unchanging(robot, kind, muscles)
+        change = self._rate(kind) * dt
+        value = before.value + np.clip(wished.value - before.value, -change, change)
+        if kind == TENSION:
+            return Command(kind, np.clip(value, robot.tension.bias, limit))
+        shortest = muscles.length - (limit - robot.tension.bias) / robot.stiffness
+        return Command(kind, np.maximum(value, shortest))
+
+    def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
         self._held += dt
-        if self._held > self.hold_time:
-            # Beyond the measured length MSC pulls with T_bias only; further out changes nothing.
-            out = np.minimum(self.command + self.rate_limit * dt, np.maximum(length, self.command))
-            self.command = out
-        return self.command.copy()
+        if self._held <= self._settings.hold_time:
+            return command
+        kind, value = command
+        change = self._rate(kind) * dt
+        if kind == TENSION:
+            bias = self._robot.tension.bias
+            return Command(kind, np.maximum(bias, value - change))
+        # At the measured length MSC pulls with T_bias only; where that is not known, out to the
+        # longest the muscle can be.
+        end = muscles.length if fresh else np.maximum(muscles.length, self._longest)
+        return Command(kind, np.minimum(value + change, np.maximum(end, value)))

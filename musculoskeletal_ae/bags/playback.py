@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Playing a recording: what comes in one lap, and recorded time against the steady clock.
+
+recorded(t) = anchor_recorded + rate · (t − anchor_steady),  standing still while paused
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+
+from musculoskeletal_ae.bags.reader import Bag, BagMessage
+
+# A player that was suspended goes on instead of catching up on more than this.
+LONGEST_LAG = 1.0  # [s]
+
+
+def latched_topics(bag: Bag) -> set[str]:
+    """Return the recorded names of topics whose last message reaches late joiners."""
+    return {name for name, topic in bag.topics.items() if 'transient_local' in topic.qos}
+
+
+def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
+    """Yield what is published from start to stop [ns, recorded].
+
+    What was latched before the start comes first, as it would reach a late joiner. Messages that
+    cannot be decoded end the replay: they do not reach the nodes.
+
+    Raises:
+        BagError: At such a message, or if the file has changed.
+    """
+    held: dict[str, BagMessage] = {}
+    if start > bag.start:
+        for message in bag.messages(latched_topics(bag) & set(topics), stop=start - 1):
+            held[message.topic] = message
+    yield from held.values()
+    for message in bag.messages(topics, start, stop):
+        bag.decode(message)
+        yield message
+
+
+class Timeline:
+    """Which recorded time it is now.
+
+    Attributes:
+        rate: Recorded seconds in one second.
+        paused: Whether recorded time stands still.
+    """
+
+    def __init__(self, start: int, rate: float, now: float) -> None:
+        """Begin at `start` [ns, recorded] when the steady clock says `now` [s]."""
+        self.rate, self.paused = rate, False
+        self._recorded, self._steady = start, now
+
+    def recorded(self, now: float) -> int:
+        """Return the recorded time [ns]."""
+        if self.paused:
+            return self._recorded
+        return self._recorded + int((now - self._steady) * self.rate * 1e9)
+
+    def wait(self, recorded: int, now: float) -> float:
+        """Return the seconds until a recorded time [ns] is due, infinite if paused before it.
+
+        It is negative for what should have been published before.
+        """
+        if self.paused:
+            return math.inf if recorded > self._recorded else 0.0
+        return (recorded - self._recorded) / (self.rate * 1e9) - (now - self._steady)
+
+    def jump(self, recorded: int, now: float) -> None:
+        """Make it this recorded time [ns] now; paused, everything up to it is due."""
+        self._recorded, self._steady = recorded, now
+
+    def pause(self, now: float) -> None:
+        """Stand still."""
+        self.jump(self.recorded(now), now)
+        self.paused = True
+
+    def resume(self, now: float) -> None:
+        """Go on from where it stands."""
+        if self.paused:
+            self._steady = now
+            self.paused = False
+
+    def catch_up(self, recorded: int, now: float) -> None:
+        """Go on from `recorded` if it should have been published long ago."""
+        if self.wait(recorded, now) < -LONGEST_LAG:
+            self.jump(recorded, now)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small bags of every kind a reader meets, for tests and for `fuzz`."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+from musculoskeletal_ae.bags import definitions
+from musculoskeletal_ae.bags.metadata import offered_qos
+from musculoskeletal_ae.bags.topics import DIAGNOSTICS, TOPICS
+from musculoskeletal_ae.bags.writer import BagWriter
+
+START = 1_800_000_000_000_000_000  # [ns]
+PERIOD = 10_000_000  # [ns]
+
+
+class Sample(NamedTuple):
+    """A message to write: absolute topic, type, times [ns], serialized data."""
+
+    topic: str
+    type: str
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+def filled(type_name: str, rng: random.Random) -> Any:
+    """Return a message of a type with a random value in every field."""
+    kind = definitions.message_class(type_name)
+    return kind(
+        **{
+            field: _value(node, rng)
+            for field, node in definitions.fields(type_name)
+            if field != 'structure_needs_at_least_one_member'
+        }
+    )
+
+
+def _value(node: Any, rng: random.Random) -> Any:
+    kind, detail = node
+    if kind == definitions.BASE:
+        return _basic(detail[0], rng)
+    if kind == definitions.NAME:
+        return filled(detail, rng)
+    (inner, inner_detail), count = detail
+    count = count if kind == definitions.ARRAY else rng.randrange(4)
+    values = [_value((inner, inner_detail), rng) for _ in range(count)]
+    if inner != definitions.BASE or inner_detail[0] == 'string':
+        return values
+    name = {'bool': 'bool', 'byte': 'uint8', 'char': 'uint8'}.get(inner_detail[0], inner_detail[0])
+    return np.array(values, dtype=name)
+
+
+def _basic(name: str, rng: random.Random) -> Any:
+    if name == 'string':
+        return ''.join(rng.choices('abc µθ_/', k=rng.randrange(12)))
+    if name == 'bool':
+        return rng.random() < 0.5
+    return rng.uniform(-1.0, 1.0) if name.startswith('float') else rng.randrange(100)
+
+
+def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
+    """Return `count` messages in order, over all topics of the interface in turn."""
+    rng = random.Random(seed)  # noqa: S311 - test data
+    found = []
+    for i, name in zip(range(count), list(TOPICS) * (count // len(TOPICS) + 1), strict=False):
+        data = definitions.encode(filled(TOPICS[name].type, rng), TOPICS[name].type)
+        topic = name if name == DIAGNOSTICS else f'{namespace}/{name}'
+        time = START + i * PERIOD
+        found.append(Sample(topic, TOPICS[name].type, time, time - rng.randrange(100_000), data))
+    return found
+
+
+def write_ours(path: Path, content: list[Sample], compression: str, finish: bool) -> None:
+    """Write with our recorder's writer, chunks of ten messages; unfinished: as after SIGKILL."""
+    writer = BagWriter(path, compression)
+    numbers: dict[str, int] = {}
+    for i, sample in enumerate(content):
+        if sample.topic not in numbers:
+            latched = sample.topic.endswith('robot_description')
+            numbers[sample.topic] = writer.add_topic(
+                sample.topic, sample.type, [offered_qos(latched)]
+            )
+        writer.write(numbers[sample.topic], *sample[2:])
+        if i % 10 == 9:
+            writer.flush()
+    if finish:
+        writer.close()
+    else:
+        writer.flush()
+
+
+def write_mcap(path: Path, content: list[Sample], **options: Any) -> None:
+    """Write a bare file with the mcap library, as other recorders may."""
+    with path.open('wb') as file:
+        writer = Writer(file, chunk_size=2000, enable_data_crcs=True, **options)
+        writer.start(profile='ros2')
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        for topic, kind, log_time, publish_time, data in content:
+            if kind not in schemas:
+                text = definitions.definition(kind).encode()
+                schemas[kind] = writer.register_schema(kind, definitions.ENCODING, text)
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, 'cdr', schemas[kind])
+            writer.add_message(channels[topic], log_time, data, publish_time)
+        writer.finish()
+
+
+def write_rosbags(path: Path, content: list[Sample]) -> None:
+    """Write a directory with the rosbags library, which computes no checksums."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for topic, kind, log_time, _, data in content:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], log_time, data)
+
+
+BARE: dict[str, dict[str, Any]] = {
+    'zstd chunks': {},
+    'lz4 chunks': {'compression': CompressionType.LZ4},
+    'no chunks': {'use_chunking': False},
+    'no summary': {
+        'index_types': IndexType.NONE,
+        'repeat_channels': False,
+        'repeat_schemas': False,
+        'use_statistics': False,
+        'use_summary_offsets': False,
+    },
+}

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning the body online: what counts as a sample, the corrected body, the network's updates."""

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fitting the corrected body to samples: maximum a posteriori, muscle by muscle, robustly.
+
+    min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k (w_k / s_k)²
+
+by Gauss–Newton from where the last fit ended. The prior spreads s are physical: how far a hand
+places an attachment, how far elastic units of one kind differ. The weights ω are those of a
+Student distribution, so that a sample taken while the arm was touched, or a glitch, counts little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.learning.body import CorrectedBody, Layout
+
+Array = NDArray[np.float64]
+
+FREEDOM = 4.0  # of the Student distribution
+ROUNDS = 6  # of Gauss–Newton per fit
+SHORTEST = 0.05  # share of a Gauss–Newton step that is still tried
+FIRST_NOISE = 0.002  # [m], before anything is known
+#: residuals beyond this many σ say that a sample does not fit the body
+OUTLIER = 6.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How much a body differs from its geometric model (one standard deviation each).
+
+    Attributes:
+        attachment: Each coordinate of each route point [m].
+        elastic: Logarithm of each elastic constant.
+        friction: Relative tension loss along the route, around its mean.
+        friction_mean: Its mean.
+        offset: Zero of the length sensor [m].
+        smooth: The smooth rest [m].
+        noise: Least standard deviation of a length at rest that the rest does not explain [m].
+    """
+
+    attachment: float = 0.007
+    elastic: float = 0.2
+    friction: float = 0.05
+    friction_mean: float = 0.05
+    offset: float = 0.001
+    smooth: float = 0.002
+    noise: float = 0.0003
+
+    def spread(self, layout: Layout) -> Array:
+        """Return s of every parameter of a muscle."""
+        spread = np.empty(layout.size)
+        spread[layout.attachment] = self.attachment
+        spread[layout.elastic] = self.elastic
+        spread[layout.friction] = self.friction
+        spread[layout.offset] = self.offset
+        spread[layout.rest] = self.smooth
+        return spread
+
+    def mean(self, layout: Layout) -> Array:
+        """Return the prior mean of every parameter of a muscle."""
+        mean = np.zeros(layout.size)
+        mean[layout.friction] = self.friction_mean
+        return mean
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N samples at rest.
+
+    Attributes:
+        theta: θ [rad], shape (N, D).
+        tension: T at the motors [N], shape (N, M).
+        length: l [m], shape (N, M).
+        sliding: s in [−1, 1], shape (N, M).
+        known: Which of them say something about which muscle, shape (N, M).
+    """
+
+    theta: Array
+    tension: Array
+    length: Array
+    sliding: Array
+    known: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.theta)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a fit found out about the samples.
+
+    Attributes:
+        residual: l − l(θ, T; w) [m], shape (N, M).
+        noise: σ of each muscle [m], shape (M,).
+        weight: ω in (0, 1], shape (N, M); 0 where a sample says nothing about a muscle.
+    """
+
+    residual: Array
+    noise: Array
+    weight: Array
+
+
+def fit_body(
+    body: CorrectedBody, seen: Observations, prior: Prior, rounds: int = ROUNDS
+) -> Fit:
+    """Fit the parameters of a body in place.
+
+    Args:
+        body: Starts from its present parameters.
+        seen: The samples.
+        prior: What is known without any.
+        rounds: Gauss–Newton steps.
+    """
+    parts = [
+        _fit_muscle(body, seen, prior, rounds, m) for m in range(body.robot.muscle_count)
+    ]
+    residual, noise, weight = zip(*parts, strict=True)
+    return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
+
+
+def _fit_muscle(
+    body: CorrectedBody, seen: Observations, prior: Prior, rounds: int, m: int
+) -> tuple[Array, float, Array]:
+    layout = body.layouts[m]
+    precision = 1.0 / prior.spread(layout) ** 2
+    mean = prior.mean(layout)
+    known = seen.known[:, m].astype(float)
+    noise, weight = FIRST_NOISE, known
+    data = seen.theta, seen.tension[:, m], seen.sliding[:, m]
+    length, jacobian = body.linearised(*data, m)
+    for _ in range(rounds):
+        at = body.parameters[m]
+        target = seen.length[:, m] - length + jacobian @ at
+        # The robust weights are iterated within one linearisation.
+        for _ in range(3):
+            weighted = jacobian * (weight / noise**2)[:, None]
+            curvature = weighted.T @ jacobian
+            normal = curvature + np.diag(precision)
+            found = np.linalg.solve(normal, weighted.T @ target + precision * mean)
+            used = np.trace(np.linalg.solve(normal, curvature))
+            freedom = max(1.0, float(known.sum() - used))
+            residual = target - jacobian @ found
+            noise, weight = _noise_and_weight(residual, known, noise, freedom, prior.noise)
+
+        def cost(values: Array, length: Array) -> float:
+            misfit = weight @ (seen.length[:, m] - length) ** 2 / noise**2
+            return float(misfit + precision @ (values - mean) ** 2)
+
+        before, share = cost(at, length), 1.0
+        while share > SHORTEST:
+            body.parameters[m] = at + share * (found - at)
+            length, jacobian = body.linearised(*data, m)
+            if cost(body.parameters[m], length) <= before:
+                break
+            share *= 0.5
+        else:
+            body.parameters[m] = at
+            length, jacobian = body.linearised(*data, m)
+            break
+    residual = seen.length[:, m] - length
+    noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), prior.noise)
+    return residual, noise, weight
+
+
+def _noise_and_weight(
+    residual: Array, known: Array, noise: float, freedom: float, least: float
+) -> tuple[float, Array]:
+    """One step of the EM algorithm for the scale and weights of a Student distribution."""
+    weight = known * (FREEDOM + 1.0) / (FREEDOM + (residual / noise) ** 2)
+    variance = (weight @ residual**2 + 4*least**2) / (freedom+4)
+    return max(least, float(np.sqrt(variance))), weight

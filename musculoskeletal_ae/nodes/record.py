@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tool `record`: the topics to an mcap bag that `ros2 bag` can read."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from argparse import Namespace
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos
+
+from musculoskeletal_ae.bags.metadata import offered_qos
+from musculoskeletal_ae.bags.options import parse_record
+from musculoskeletal_ae.bags.recover import recover
+from musculoskeletal_ae.bags.topics import TOPICS, Topic
+from musculoskeletal_ae.bags.writer import BagWriter
+from musculoskeletal_ae.nodes.tool import message_class, run_tool, start_ros
+
+# What the recorder may lose when it is killed is what is younger than this.
+FLUSH_PERIOD = 0.5  # [s]
+# A second or two of the fastest topic, while the disk is busy.
+DEPTH = 1000
+LATCHED_DEPTH = 10
+# After Ctrl-C: what has arrived and waits to be taken still belongs to the recording.
+DRAIN_TIME = 0.5  # [s]
+
+
+class Record(Node):
+    """Writes what arrives, serialized as it is."""
+
+    def __init__(self, writer: BagWriter, topics: list[str]) -> None:
+        """Subscribe to the topics."""
+        super().__init__('record')
+        self.writer = writer
+        self.received = 0
+        self._numbers: dict[str, int] = {}
+        self._sim_time = self.get_parameter('use_sim_time').value
+        for name in topics:
+            topic = TOPICS[name]
+            resolved = self.resolve_topic_name(name)
+            qos = QoSProfile(
+                depth=LATCHED_DEPTH if topic.latched else DEPTH,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL
+                if topic.latched
+                else DurabilityPolicy.VOLATILE,
+            )
+            receive = partial(self._receive, resolved, topic)
+            self.create_subscription(message_class(topic.type), name, receive, qos, raw=True)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(FLUSH_PERIOD, writer.flush, clock=steady)
+
+    def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
+        now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
+        if name not in self._numbers:
+            self._numbers[name] = self.writer.add_topic(
+                name, topic.type, self._offered(name, topic)
+            )
+        self.writer.write(self._numbers[name], now, info['source_timestamp'], data)
+        self.received += 1
+
+    def _offered(self, name: str, topic: Topic) -> list[Qos]:
+        """Return what the publishers of a topic offer; their depth cannot be seen from here."""
+        profiles = [info.qos_profile for info in self.get_publishers_info_by_topic(name)]
+        offered = [
+            offered_qos(
+                profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
+            )
+            for profile in profiles
+        ]
+        return offered or [offered_qos(topic.latched)]
+
+
+def _record(options: Namespace, arguments: list[str]) -> None:
+    # The end is taken by hand, so that what waits in the queues is still written.
+    stop: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: stop.append(received))
+    start_ros(arguments)
+    out = options.out or Path(f'{datetime.now():%Y_%m_%d-%H_%M_%S}_bag')  # noqa: DTZ005 - local
+    with BagWriter(out, options.compression) as writer:
+        node = Record(writer, options.topics)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
+        end = time.monotonic() + (options.duration or float('inf'))
+        while not stop and time.monotonic() < end:
+            executor.spin_once(timeout_sec=min(0.1, max(0.0, end - time.monotonic())))
+        drained, before = time.monotonic() + DRAIN_TIME, -1
+        while time.monotonic() < drained and node.received != before:
+            before = node.received
+            executor.spin_once(timeout_sec=0.05)
+        node.destroy_node()
+    print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
+
+
+def _work(options: Namespace, arguments: list[str]) -> int:
+    if options.recover:
+        bag, count, backup = recover(options.recover, options.out)
+        kept = f'; the original is kept as {backup}' if backup else ''
+        print(f'{count} messages recovered to {bag}{kept}')
+    else:
+        _record(options, arguments)
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the tool; exit status 0: recorded, also after Ctrl-C, 1: failed, 2: wrong options."""
+    return run_tool('record', parse_record, _work, argv)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `replay`: plays a recorded mcap bag onto the topics, and says what is in one."""
+
+from __future__ import annotations
+
+import sys
+import time
+from argparse import Namespace
+
+from builtin_interfaces.msg import Time
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+from tqdm import tqdm
+
+from musculoskeletal_ae.bags.options import parse_replay
+from musculoskeletal_ae.bags.playback import Timeline, lap, latched_topics
+from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.selection import select
+from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.nodes.tool import message_class, run_tool, start_ros
+
+# Deep enough that a reader that is late by a second still gets everything.
+DEPTH = 1000
+# /clock comes at this spacing of recorded time, but not more often than nodes can bear.
+CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
+# Services are answered at least so often; between, a short wait is slept.
+SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
+# A publisher sees its subscriber a little before the subscriber sees it and takes messages.
+SETTLE_TIME = 0.3  # [s]
+ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class Replay(Node):
+    """Publishes recorded bytes at their time."""
+
+    def __init__(self, bag: Bag, names: dict[str, str], options: Namespace) -> None:
+        """Advertise the topics.
+
+        Args:
+            bag: An opened bag.
+            names: What to publish each recorded topic on.
+            options: Of the command line.
+        """
+        super().__init__('replay')
+        self._bag, self._names = bag, names
+        self._start = bag.start + round(options.start * 1e9)
+        self._stop = bag.end
+        if options.duration is not None:
+            self._stop = min(bag.end, self._start + round(options.duration * 1e9))
+        latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
+        self._publisher = {
+            recorded: self.create_publisher(
+                message_class(bag.topics[recorded].type),
+                name,
+                LATCHED if recorded in latched else reliable,
+            )
+            for recorded, name in names.items()
+        }
+        self._clock_publisher = (
+            self.create_publisher(Clock, '/clock', QoSProfile(depth=1)) if options.clock else None
+        )
+        self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
+        self._next_tick = self._next_service = 0.0
+        self._next_time = self._start
+        self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
+        if options.paused:
+            self._timeline.pause(time.monotonic())
+        self.create_service(Trigger, 'replay/pause', self._pause)
+        self.create_service(Trigger, 'replay/resume', self._resume)
+        self.create_service(Trigger, 'replay/step', self._step)
+        self._spinner = SingleThreadedExecutor()
+        self._spinner.add_node(self)
+
+    def wait_for_subscribers(self, longest: float) -> None:
+        """Wait until every topic has a subscriber, at most so long [s]."""
+        end = time.monotonic() + longest
+        publishers = self._publisher.values()
+        while time.monotonic() < end and not all(p.get_subscription_count() for p in publishers):
+            self._spinner.spin_once(timeout_sec=0.02)
+        time.sleep(SETTLE_TIME if longest else 0.0)
+
+    def play(self, progress: tqdm) -> None:
+        """Publish everything once, from start to stop."""
+        # Just before the first message, so that it is not due when the lap begins paused.
+        self._timeline.jump(self._start - 1, time.monotonic())
+        self._next_tick = 0.0
+        progress.reset()
+        for message in lap(self._bag, self._names, self._start, self._stop):
+            self._next_time = message.log_time
+            while self._timeline.wait(message.log_time, time.monotonic()) > 0:
+                self._idle(message, progress)
+            self._timeline.catch_up(message.log_time, time.monotonic())
+            self._tick()
+            self._publisher[message.topic].publish(message.data)
+
+    def acknowledge(self) -> None:
+        """Give reliable readers time to get the last messages."""
+        end = time.monotonic() + ACKNOWLEDGE_TIME
+        for publisher in self._publisher.values():
+            left = max(0.0, end - time.monotonic())
+            publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
+
+    def _idle(self, message: BagMessage, progress: tqdm) -> None:
+        """Answer services, publish the clock and wait, for at most until the message is due."""
+        self._tick()
+        now = time.monotonic()
+        wait = min(self._timeline.wait(message.log_time, now), SERVICE_PERIOD)
+        if self._clock_publisher:
+            wait = min(wait, self._next_tick - now)
+        if wait > SLEPT or now > self._next_service:
+            self._next_service = now + SERVICE_PERIOD
+            self._spinner.spin_once(timeout_sec=max(wait, 0.0))
+            done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
+            progress.update(max(0.0, done - progress.n))
+        elif wait > 0:
+            time.sleep(wait)
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        if self._clock_publisher and now >= self._next_tick:
+            self._next_tick = now + self._clock_period
+            seconds, nanoseconds = divmod(self._timeline.recorded(now), 1_000_000_000)
+            self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+
+    def _pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._timeline.pause(time.monotonic())
+        return self._answer(response, 'paused')
+
+    def _resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._timeline.resume(time.monotonic())
+        return self._answer(response, 'playing')
+
+    def _step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Publish all messages of the next recorded time."""
+        if not self._timeline.paused:
+            response.success, response.message = False, 'not paused: call replay/pause first'
+            return response
+        self._timeline.jump(self._next_time, time.monotonic())
+        return self._answer(response, 'stepped')
+
+    def _answer(self, response: Trigger.Response, what: str) -> Trigger.Response:
+        at = (self._timeline.recorded(time.monotonic()) - self._bag.start) / 1e9
+        response.success, response.message = True, f'{what} at {max(at, 0.0):.6f} s'
+        return response
+
+
+def _replay(options: Namespace, arguments: list[str]) -> int:
+    bag = Bag.open(options.bag, unfinished=True)
+    for reason in bag.unfinished:
+        print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
+    names = select(bag, options.topics, options.from_namespace, options.keep_names)
+    length = (bag.end - bag.start) / 1e9
+    if options.start > length:
+        raise BagError(bag.path, None, f'is {length:.3f} s long', 'give a smaller --start')
+    if options.loop and not options.clock:
+        problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
+        print(f'warning: --loop: {problem}', file=sys.stderr)
+    start_ros(arguments)
+    node = Replay(bag, names, options)
+    left = min(length - options.start, options.duration or length)
+    bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
+    with tqdm(total=left, bar_format=bar, disable=None, leave=False) as progress:
+        node.wait_for_subscribers(options.wait)
+        node.play(progress)
+        while options.loop:
+            node.play(progress)
+    node.acknowledge()
+    node.destroy_node()
+    return 0
+
+
+def _check(options: Namespace) -> int:
+    # The robot's model takes a second to load, which playing does not need.
+    from musculoskeletal_ae.bags.check import check_bag
+
+    check = check_bag(options.bag, options.robot, options.from_namespace)
+    print('\n'.join([*check.lines, *(f'fault: {fault}' for fault in check.faults)]))
+    return 1 if check.faults else 0
+
+
+def _work(options: Namespace, arguments: list[str]) -> int:
+    return _check(options) if options.check else _replay(options, arguments)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node; exit status 0: played or Ctrl-C, 1: the bag is bad, 2: wrong options."""
+    return run_tool('replay', parse_replay, _work, argv)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a user may choose about control: every setting with its meaning, unit and range.
+
+One table for the core and the node: the node declares a parameter for each field here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
+PRESETS = ('paper', 'default')
+
+
+def choice(default: str, legal: tuple[str, ...], meaning: str) -> Any:
+    """Return the field of a setting that is one of a few words."""
+    return field(default=default, metadata={'meaning': meaning, 'legal': legal})
+
+
+def quantity(default: float, low: float, high: float, meaning: str) -> Any:
+    """Return the field of a setting that is a number within [low, high]."""
+    return field(default=default, metadata={'meaning': meaning, 'range': (low, high)})
+
+
+@dataclass
+class Settings:
+    """Settings of control; the owner may change them at any time.
+
+    Attributes are described by their own `meaning`, except for
+    joint_stiffness: wished diagonal entries of the joint stiffness [N·m/rad], one for each joint,
+        0 as it comes; empty for all as they come.
+    """
+
+    method: str = choice('proposed', METHODS, 'how a target posture becomes a command')
+    preset: str = choice('default', PRESETS, 'of the method proposed')
+    first_duration: float = quantity(5.0, 0.1, 60.0, 'of a movement [s]')
+    second_duration: float = quantity(
+        2.0, 0.1, 60.0, 'of the second movement of second, and after a new checkpoint [s]'
+    )
+    constant_tension: float = quantity(0.0, 0.0, 1000.0, 'T_const of first [N]; 0: T_bias')
+    rate_limit: float = quantity(
+        0.1, 0.001, 1.0, 'fastest change of a commanded length [m/s]; of a tension K_stiff times it'
+    )
+    position_gain: float = quantity(
+        10.0, 0.0, 200.0, 'method tension: torque towards the target [N·m/rad]; 0: torque only'
+    )
+    velocity_gain: float = quantity(
+        0.5, 0.0, 20.0, 'method tension: damping torque [N·m·s/rad]; 0: torque only'
+    )
+    feedback_gain: float = quantity(
+        0.0, 0.0, 2.0, 'proposed, stiffness: slow correction of a resting error [1/s]; 0: none'
+    )
+    max_age: float = quantity(
+        0.2, 0.01, 10.0, 'older muscle_states or estimated_joint_states stop the arm [s]'
+    )
+    hold_time: float = quantity(0.5, 0.0, 60.0, 'a stop holds the last command so long [s]')
+    temperature_limit: float = quantity(
+        85.0, 40.0, 200.0, 'a module this hot pulls with T_bias only [°C]'
+    )
+    joint_stiffness: tuple[float, ...] = ()

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print how far the emulated arms are from their model: the calibration table.
+
+calibrate_emulator [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from tqdm import tqdm
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.calibration import calibration, table
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import to_mae
+from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def _trained(robot: Robot, preset: str) -> Mae:
+    network, _ = initial_training(robot, preset)
+    return to_mae(network, robot.joints, robot.muscles, preset, 'initial, on geometry')
+
+
+def main() -> None:
+    """Train both presets, record the motion on every individual and print the errors."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--robot', default='musashi_left_arm', help='name or directory')
+    parser.add_argument('--seeds', default='0,1,2,3,4,5,6,7,8,9', help='individuals')
+    parser.add_argument('--minutes', type=float, default=5.0, help='of held-out motion')
+    arguments = parser.parse_args()
+    try:
+        seeds = [int(seed) for seed in arguments.seeds.split(',')]
+    except ValueError:
+        parser.error(f'--seeds {arguments.seeds!r}: expected whole numbers such as 0,1,2')
+    if not 0.1 <= arguments.minutes <= 1000.0:
+        parser.error(f'--minutes {arguments.minutes:g}: expected 0.1 to 1000')
+    try:
+        robot = Robot.load(arguments.robot)
+        default, paper = _trained(robot, 'default'), _trained(robot, 'paper')
+        total = 60.0 * arguments.minutes * len(seeds)
+        with tqdm(total=total, unit=' robot s', unit_scale=True) as bar:
+            rows = calibration(robot, default, paper, seeds, arguments.minutes, bar.update)
+    except MusculoskeletalError as error:
+        print(f'error: {error}', file=sys.stderr)
+        sys.exit(1)
+    print(table(rows))

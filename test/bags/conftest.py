@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags for tests, and the tools as processes on a ROS graph of their own."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from graph import DEADLINE, Graph
+
+from musculoskeletal_ae.bags import samples
+
+_counter = itertools.count(1)
+
+
+
+@pytest.fixture(scope='session')
+def content():
+    """Messages on every topic of the interface."""
+    return samples.samples(63, '/left_arm')
+
+
+@pytest.fixture
+def bag(tmp_path, content):
+    """A sound bag of our own recorder's writer."""
+    samples.write_ours(tmp_path / 'bag', content, 'zstd', finish=True)
+    return tmp_path / 'bag'
+
+
+class Tool:
+    """`record` or `replay` as a process; ended by the test that started it."""
+
+    def __init__(self, name: str, *arguments: str | Path) -> None:
+        code = f'import sys; from musculoskeletal_ae.nodes.{name} import main; sys.exit(main())'
+        self.process = subprocess.Popen(
+            [sys.executable, '-c', code, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {'PYTHONPATH': str(Path(__file__).parents[2])},
+        )
+
+    def wait_for(self, text: str) -> str:
+        """Read lines until one contains the text."""
+        for line in self.process.stdout:
+            if text in line:
+                return line
+        raise AssertionError(f'{text!r} was never printed')
+
+    def end(self, number: int = signal.SIGINT) -> str:
+        """Send a signal and return the rest of the output."""
+        self.process.send_signal(number)
+        return self.output()
+
+    def output(self) -> str:
+        """Wait for the end and return the rest of the output."""
+        return self.process.communicate(timeout=DEADLINE)[0]
+
+
+@pytest.fixture
+def tool():
+    """Start tools; what is still running at the end of the test is killed."""
+    started: list[Tool] = []
+
+    def start(name: str, *arguments: str | Path) -> Tool:
+        started.append(Tool(name, *arguments))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.process.kill()
+            one.process.communicate()
+
+
+@pytest.fixture
+def graph():
+    """Return a graph whose topics no other test sees: a namespace of its own."""
+    graph = Graph(f'/bags_{os.getpid()}_{next(_counter)}')
+    yield graph
+    graph.close()
+
+
+@pytest.fixture(autouse=True, scope='session')
+def private_graph():
+    """Stay off the network when the tests are not run by test.sh, which sets these."""
+    os.environ.setdefault('ROS_DOMAIN_ID', '67')
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from musculoskeletal_ae.bags import options
+from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, latched_topics
+from musculoskeletal_ae.bags.reader import Bag
+
+SECOND = 1_000_000_000
+
+
+@pytest.mark.parametrize('rate', [0.25, 1.0, 8.0])
+def test_recorded_time_passes_at_the_rate(rate):
+    timeline = Timeline(5 * SECOND, rate, now=100.0)
+    assert timeline.recorded(100.0) == 5 * SECOND
+    assert timeline.recorded(102.0) == 5 * SECOND + 2 * rate * SECOND
+    assert timeline.wait(6 * SECOND, 100.0) == pytest.approx(1 / rate)
+    assert timeline.wait(6 * SECOND, 100.0 + 2 / rate) == pytest.approx(-1 / rate)
+
+
+def test_paused_time_stands_still_and_goes_on_where_it_stood():
+    timeline = Timeline(0, 1.0, now=10.0)
+    timeline.pause(12.0)
+    assert timeline.recorded(50.0) == 2 * SECOND
+    assert timeline.wait(2 * SECOND + 1, 50.0) == math.inf
+    timeline.resume(60.0)
+    assert timeline.recorded(61.0) == 3 * SECOND
+    timeline.resume(61.0)
+    assert timeline.recorded(61.0) == 3 * SECOND
+
+
+def test_a_step_makes_everything_up_to_its_time_due():
+    timeline = Timeline(0, 1.0, now=0.0)
+    timeline.pause(0.0)
+    timeline.jump(7, 1.0)
+    assert timeline.wait(7, 2.0) == 0.0
+    assert timeline.wait(8, 2.0) == math.inf
+
+
+def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
+    timeline = Timeline(0, 1.0, now=0.0)
+    timeline.catch_up(SECOND, 1.0 + 0.9 * LONGEST_LAG)
+    assert timeline.wait(2 * SECOND, 2.0) == 0.0
+    timeline.catch_up(SECOND, 100.0)
+    assert timeline.wait(2 * SECOND, 100.0) == 1.0
+
+
+def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
+    opened = Bag.open(bag)
+    found = list(lap(opened, opened.topics, opened.start, opened.end))
+    assert [message.data for message in found] == [sample.data for sample in content]
+
+
+def test_what_was_latched_before_the_start_comes_first(bag, content):
+    opened = Bag.open(bag)
+    assert latched_topics(opened) == {'/left_arm/robot_description'}
+    at = next(i for i, s in enumerate(content) if s.topic.endswith('robot_description')) + 25
+    last = [s for s in content[:at] if s.topic.endswith('robot_description')][-1]
+    found = list(lap(opened, opened.topics, content[at].log_time, opened.end))
+    assert [message.data for message in found] == [last.data, *(s.data for s in content[at:])]
+
+
+@pytest.mark.parametrize(
+    ('parse', 'arguments', 'problem'),
+    [
+        (options.parse_replay, [], 'BAG'),
+        (options.parse_replay, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
+        (options.parse_replay, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
+        (options.parse_replay, ['bag', '--rate', 'nan', '--clock'], 'not a number of at least 0'),
+        (options.parse_replay, ['bag', '--start', '-1'], 'not a number of at least 0'),
+        (options.parse_replay, ['bag', '--duration', 'inf'], 'not a number of at least 0'),
+        (options.parse_replay, ['bag', '--topics', ','], 'no topic is named'),
+        (options.parse_replay, ['bag', '--robot', 'arm26'], '--robot is for --check'),
+        (options.parse_replay, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
+        (options.parse_record, ['--topics', 'muscle_states,nothing'], "'nothing' is none of joint_"),
+        (options.parse_record, ['--duration', '0'], 'not a number above 0'),
+        (options.parse_record, ['a', '-o', 'b'], 'DIR is given twice'),
+        (options.parse_record, ['--compression', 'rar'], 'invalid choice'),
+    ],
+)
+def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(arguments)
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert problem in message
+    assert message.count('\n') == 1

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from musculoskeletal_ae.bags import definitions, samples
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.selection import interface_topics, select
+from musculoskeletal_ae.bags.topics import SENT, TOPICS, recorded_namespace, relative_name
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+
+# INTERFACE.md, Bags.
+DEFAULT = {
+    'joint_states',
+    'muscle_states',
+    'marker_pose',
+    'robot_description',
+    'target_joint_states',
+    'muscle_length_command',
+    'muscle_tension_command',
+    'sim/external_wrench',
+    'sim/fixed_joint_states',
+}
+STRING = 'std_msgs/msg/String'
+
+
+def make(path, *topics):
+    rng = random.Random(0)
+    content = [
+        samples.Sample(name, kind, i, i, definitions.encode(samples.filled(kind, rng), kind))
+        for i, (name, kind) in enumerate(topics)
+    ]
+    samples.write_mcap(path / 'a.mcap', content)
+    return Bag.open(path / 'a.mcap')
+
+
+def ours(*names):
+    return [(name, TOPICS[relative].type) for name, relative in names]
+
+
+@pytest.mark.parametrize(
+    ('names', 'namespace'),
+    [
+        (['/muscle_states', '/sim/joint_states', '/diagnostics'], ''),
+        (['/left_arm/muscle_states', '/left_arm/sim/joint_states', '/diagnostics', '/tf'], '/left_arm'),
+        (['/a/b/anomaly'], '/a/b'),
+        (['/sim/joint_states'], ''),
+        (['/sim/joint_states', '/sim/muscle_length_command'], '/sim'),
+        (['/sim/sim/joint_states'], '/sim'),
+        (['/diagnostics', '/tf', '/camera/image'], ''),
+        ([], ''),
+    ],
+)
+def test_the_namespace_is_the_one_that_explains_all_topics(names, namespace):
+    assert recorded_namespace(names) == namespace
+
+
+def test_of_several_namespaces_none_is_guessed():
+    names = ['/left/muscle_states', '/right/muscle_states', '/joint_states']
+    with pytest.raises(MusculoskeletalError, match=r'several namespaces: /, /left, /right; .*--from'):
+        recorded_namespace(names)
+    assert recorded_namespace(names, '/left') == recorded_namespace(names, 'left/') == '/left'
+
+
+def test_names_outside_the_namespace_stay_absolute():
+    assert relative_name('/left/sim/markers', '/left') == 'sim/markers'
+    assert relative_name('/left_foot/x', '/left') == '/left_foot/x'
+    assert relative_name('/diagnostics', '') == '/diagnostics'
+
+
+def test_what_hardware_vision_user_and_controller_sent_is_played_by_default(bag):
+    chosen = select(Bag.open(bag), ['default'], None, keep_names=False)
+    assert set(chosen.values()) == DEFAULT == set(SENT)
+    assert set(chosen) == {f'/left_arm/{name}' for name in DEFAULT}
+
+
+def test_all_adds_what_nodes_compute(bag):
+    assert set(select(Bag.open(bag), ['all'], None, keep_names=False).values()) == set(TOPICS)
+
+
+def test_kept_names_are_the_recorded_ones(bag):
+    chosen = select(Bag.open(bag), ['default'], None, keep_names=True)
+    assert all(name == to for name, to in chosen.items())
+    assert '/left_arm/muscle_states' in chosen
+
+
+def test_topics_are_chosen_by_relative_or_recorded_name(tmp_path):
+    bag = make(tmp_path, *ours(('/l/anomaly', 'anomaly')), ('/l/note', STRING), ('/other', STRING))
+    assert select(bag, ['anomaly', '/l/note', '/other'], None, False) == {
+        '/l/anomaly': 'anomaly',
+        '/l/note': 'note',
+        '/other': '/other',
+    }
+    with pytest.raises(BagError, match=r'topic nothing is not in the bag; it has: /l/anomaly, '):
+        select(bag, ['nothing'], None, False)
+
+
+def test_one_of_two_arms_can_be_chosen_or_both_kept(tmp_path):
+    names = [('/l/muscle_states', 'muscle_states'), ('/r/muscle_states', 'muscle_states')]
+    bag = make(tmp_path, *ours(*names))
+    with pytest.raises(BagError, match='several namespaces: /l, /r'):
+        select(bag, ['all'], None, False)
+    assert select(bag, ['all'], '/r', False) == {'/r/muscle_states': 'muscle_states'}
+    assert len(select(bag, ['all'], None, True)) == 2
+
+
+def test_a_bag_of_other_topics_says_what_it_has(tmp_path):
+    bag = make(tmp_path, ('/camera/note', STRING))
+    with pytest.raises(BagError, match=r'no topic to replay by default; it has: /camera/note'):
+        select(bag, ['default'], None, False)
+
+
+def test_a_topic_of_the_wrong_type_is_refused(tmp_path):
+    bag = make(tmp_path, ('/muscle_states', STRING))
+    for use in (interface_topics, lambda bag: select(bag, ['all'], None, False)):
+        with pytest.raises(BagError, match=r"/muscle_states has the type .*String', not 'std_msgs"):
+            use(bag)

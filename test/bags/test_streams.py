@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
+from numpy.testing import assert_allclose, assert_array_equal
+
+from musculoskeletal_ae.bags.check import check_bag
+from musculoskeletal_ae.bags.muscle_order import misplaced_muscles
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.robot.robot import Robot
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('arm26')
+
+
+@pytest.fixture
+def arm(robot):
+    return Arm(robot)
+
+
+def streams(arm, robot, tmp_path):
+    return read_streams(Bag.open(arm.write(tmp_path / 'bag')), robot)
+
+
+def test_streams_are_what_was_recorded(arm, robot, tmp_path):
+    arm.add('/muscle_length_command', ARRAY, 0.5, array(arm.length[0]))
+    found = streams(arm, robot, tmp_path)
+    assert_array_equal(found.joints.values, arm.theta)
+    assert_array_equal(found.muscles.values[:, 0], arm.length)
+    assert_array_equal(found.muscles.values[:, 1], arm.tension)
+    assert_allclose(found.muscles.time, arm.time, atol=1e-9)
+    assert_allclose(found.length_commands.time, [0.5], atol=1e-9)
+    assert_array_equal(found.length_commands.values, [arm.length[0]])
+    assert found.tension_commands.values.shape == (0, robot.muscle_count)
+    assert not found.rejected
+
+
+def test_theta_is_paired_with_the_nearest_muscle_state(arm, robot, tmp_path):
+    pairs = streams(arm, robot, tmp_path).pairs()
+    assert_array_equal(pairs.theta, arm.theta)
+    assert_array_equal(pairs.length, arm.length)
+    assert_array_equal(pairs.tension, arm.tension)
+
+
+@pytest.mark.parametrize(('late', 'paired'), [(0.0049, 20), (0.006, 19), (0.051, 15)])
+def test_pairs_are_no_further_apart_than_half_a_period(late, paired, robot, tmp_path):
+    found = streams(Arm(robot, count=20, late=late), robot, tmp_path)
+    pairs = found.pairs(0.01)
+    assert len(pairs.time) == paired
+    nearest = np.abs(found.joints.time[:, None] - pairs.time).min(axis=0)
+    assert (nearest <= 0.005).all()
+
+
+def test_without_joint_sensors_there_are_no_pairs(arm, robot, tmp_path):
+    arm.content = [sample for sample in arm.content if sample.type != JOINTS]
+    found = streams(arm, robot, tmp_path)
+    assert len(found.muscles.time) == 200
+    assert found.pairs().theta.shape == (0, robot.joint_count)
+
+
+def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_path):
+    bad = np.full(3 * robot.muscle_count, np.nan)
+    arm.add('/muscle_states', ARRAY, 0.0051, array(bad))
+    arm.add('/muscle_states', ARRAY, 0.0052, array(bad[1:]))
+    arm.add('/joint_states', JOINTS, 0.0053, joints(robot.joints[:1], [0.0]))
+    # Joints of another arm on the same topic, and any order, are legal.
+    names = ['other', *reversed(robot.joints)]
+    arm.add('/joint_states', JOINTS, 0.0054, joints(names, [9.0, *arm.theta[0, ::-1]]))
+    found = streams(arm, robot, tmp_path)
+    assert found.rejected == {
+        '/muscle_states: not finite': 1,
+        '/muscle_states: wrong length': 1,
+        '/joint_states: missing joint': 1,
+    }
+    assert len(found.muscles.time) == 200
+    assert_array_equal(found.joints.values[1], arm.theta[0])
+
+
+def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):
+    late = arm.content[40]
+    arm.content.append(late._replace(log_time=late.log_time + 30_000_000))
+    assert streams(arm, robot, tmp_path).rejected == {f'{late.topic}: repeated or reordered': 1}
+
+
+def test_a_recording_of_another_arm_is_refused(arm, tmp_path):
+    other = Robot.load('musashi_left_arm')
+    with pytest.raises(BagError, match=r'joint_states fits the robot \(missing joint'):
+        streams(arm, other, tmp_path)
+
+
+def test_muscles_in_another_order_are_named(robot, tmp_path):
+    order = [1, 0, *range(2, robot.muscle_count)]
+    found = streams(Arm(robot, order=order), robot, tmp_path)
+    names = robot.muscles
+    assert misplaced_muscles(found.pairs(), robot) == [(names[0], names[1]), (names[1], names[0])]
+
+
+def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot, tmp_path):
+    rng = np.random.default_rng(1)
+    pairs = streams(arm, robot, tmp_path).pairs()
+    scale = rng.uniform(0.8, 1.2, robot.muscle_count)
+    length = pairs.length * scale + rng.normal(0.0, 0.002, pairs.length.shape) + 0.05
+    assert misplaced_muscles(pairs._replace(length=length), robot) == []
+
+
+def test_the_check_says_what_is_in_a_bag_and_what_it_fits(arm, tmp_path):
+    check = check_bag(arm.write(tmp_path / 'bag'))
+    text = '\n'.join(check.lines)
+    assert check.faults == []
+    assert '400 messages, 1.992 s' in text
+    assert 'counts: as in the summary, as in metadata.yaml' in text
+    assert 'order: no messages in the file are earlier' in text
+    assert any(line.split()[:4] == ['/muscle_states', '200', '100.00', '0.010'] for line in check.lines)
+    assert 'fits: arm26' in text
+
+
+def test_the_check_of_a_bag_of_another_arm_fails(arm, tmp_path):
+    check = check_bag(arm.write(tmp_path / 'bag'), 'musashi_left_arm')
+    assert any('does not fit musashi_left_arm' in fault for fault in check.faults)
+
+
+def test_the_check_of_muscles_in_another_order_fails(robot, tmp_path):
+    arm = Arm(robot, order=[*range(1, robot.muscle_count), 0])
+    faults = check_bag(arm.write(tmp_path / 'bag'), 'arm26').faults
+    assert any('the order of muscles is not that of arm26' in fault for fault in faults)
+
+
+def test_the_check_of_damage_fails_and_says_where(arm, tmp_path):
+    file = arm.write(tmp_path / 'bag') / 'bag_0.mcap'
+    data = bytearray(file.read_bytes())
+    data[2000] ^= 1
+    file.write_bytes(data)
+    (fault,) = check_bag(tmp_path / 'bag').faults
+    assert 'bag_0.mcap, byte ' in fault

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from musculoskeletal_ae.bags import definitions, samples
+from musculoskeletal_ae.bags.metadata import offered_qos, read_qos
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.topics import TOPICS
+from musculoskeletal_ae.bags.writer import BagWriter
+from musculoskeletal_ae.exceptions import BagError
+
+
+@pytest.mark.parametrize('type_name', sorted({topic.type for topic in TOPICS.values()}))
+def test_a_message_of_each_type_comes_back_as_it_was_written(type_name, tmp_path):
+    data = definitions.encode(samples.filled(type_name, random.Random(1)), type_name)
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic('/topic', type_name, [offered_qos(latched=False)])
+        writer.write(number, 20, 10, data)
+    bag = Bag.open(tmp_path / 'bag')
+    (message,) = bag.messages()
+    assert message[:4] == ('/topic', 20, 10, data)
+    assert definitions.encode(bag.decode(message), type_name) == data
+
+
+def test_our_types_are_those_of_the_installed_ros_messages():
+    share = Path(sys.prefix) / 'share'
+    compared = 0
+    for type_name in {topic.type for topic in TOPICS.values()}:
+        package, _, name = type_name.split('/')
+        file = share / package / 'msg' / f'{name}.msg'
+        if not file.exists():
+            pytest.skip('the message packages are not in this environment')
+        # As rosbag2 writes it: with comments, constants, defaults and unqualified names.
+        text = file.read_text() + ''.join(
+            f'{"=" * 80}\nMSG: {other}\n{(share / other.split("/")[0] / "msg").joinpath(other.split("/")[1] + ".msg").read_text()}'
+            for other in _contained(type_name)
+        )
+        assert not definitions.contradiction(type_name, 'ros2msg', text.encode(), '')
+        compared += 1
+    assert compared == len({topic.type for topic in TOPICS.values()})
+
+
+def _contained(type_name):
+    lines = definitions.definition(type_name).splitlines()
+    return [line[5:] for line in lines if line.startswith('MSG: ')]
+
+
+def test_other_peoples_readers_count_the_same_messages(bag, content):
+    expected = [(sample.topic, sample.log_time, sample.data) for sample in content]
+    with Reader(bag) as reader:
+        assert reader.message_count == len(content)
+        assert [(c.topic, t, bytes(d)) for c, t, d in reader.messages()] == expected
+    with AnyReader([bag]) as reader:
+        assert sum(1 for _ in reader.messages()) == len(content)
+    with (bag / 'bag_0.mcap').open('rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == 'ros2'
+        assert reader.get_summary().statistics.message_count == len(content)
+        read = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+        assert read == expected
+        assert {c.message_encoding for c in reader.get_summary().channels.values()} == {'cdr'}
+        assert {s.encoding for s in reader.get_summary().schemas.values()} == {'ros2msg'}
+
+
+def test_metadata_says_what_is_in_the_file(bag, content):
+    info = yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert info['version'] == 9
+    assert info['storage_identifier'] == 'mcap'
+    assert info['relative_file_paths'] == ['bag_0.mcap']
+    assert info['message_count'] == len(content)
+    assert info['starting_time']['nanoseconds_since_epoch'] == content[0].log_time
+    assert info['duration']['nanoseconds'] == content[-1].log_time - content[0].log_time
+    for topic in info['topics_with_message_count']:
+        entry = topic['topic_metadata']
+        count = sum(sample.topic == entry['name'] for sample in content)
+        assert topic['message_count'] == count
+        (qos,) = entry['offered_qos_profiles']
+        assert qos['reliability'] == 'reliable'
+        latched = entry['name'].endswith('robot_description')
+        assert qos['durability'] == ('transient_local' if latched else 'volatile')
+
+
+def test_qos_in_the_mcap_file_can_be_read_again(bag):
+    (found,) = read_qos(Bag.open(bag).topics['/left_arm/robot_description'].qos)
+    assert found == offered_qos(latched=True)
+
+
+def test_messages_are_ordered_by_time_whatever_order_they_came_in(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic('/anomaly', 'std_msgs/msg/Float64', [])
+        data = definitions.encode(
+            samples.filled('std_msgs/msg/Float64', random.Random(0)), 'std_msgs/msg/Float64'
+        )
+        for times in ((5, 3, 9), (2, 7, 4), (1, 8, 6)):
+            for time in times:
+                writer.write(number, time, 0, data)
+            writer.flush()
+    read = [message.log_time for message in Bag.open(tmp_path / 'bag').messages()]
+    assert read == sorted(read) == list(range(1, 10))
+
+
+def test_a_directory_that_is_not_empty_is_refused(bag):
+    with pytest.raises(BagError, match='is not empty; name a new directory'):
+        BagWriter(bag)
+    assert Bag.open(bag).message_count
+
+
+def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(BagError, match=r'file/bag: cannot be written: Not a directory'):
+        BagWriter(tmp_path / 'file' / 'bag')
+
+
+def test_an_empty_recording_is_a_sound_bag(tmp_path):
+    BagWriter(tmp_path / 'bag').close()
+    bag = Bag.open(tmp_path / 'bag')
+    assert (bag.message_count, bag.unfinished, list(bag.messages())) == (0, [], [])

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""./bringup.sh as a user runs it: a fresh robot, two arms on one graph, faults, and a clean end."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from graph import DEADLINE, Graph
+from robots import write_robot
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from musculoskeletal_ae.nodes.shell import LATCHED
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+STATUS = re.compile(r'^ *\d+ s  error (\d+\.\d+) rad  A (\d+\.\d+)  samples \d+  checkpoints \d+')
+
+
+@pytest.fixture(scope='module')
+def environment(tmp_path_factory):
+    """Return an environment in which all runs of this module share a cache of their own."""
+    cache = tmp_path_factory.mktemp('cache')
+    return {**os.environ, 'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
+
+
+def bringup(environment, *arguments):
+    return subprocess.Popen(
+        [str(REPOSITORY / 'bringup.sh'), *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def left_behind(process):
+    """Return the commands that still run in the session of a bring-up, one a line."""
+    listed = subprocess.run(
+        ['ps', '-ww', '-s', str(process.pid), '-o', 'pid=,args='], capture_output=True, text=True
+    )
+    return listed.stdout.strip()
+
+
+def statuses(output):
+    return [match for line in output.splitlines() if (match := STATUS.match(line))]
+
+
+def test_a_robot_nobody_saw_before_is_trained_brought_up_and_estimated(environment, tmp_path):
+    robot = write_robot(tmp_path / 'other')
+    process = bringup(environment, '--robot', str(robot), '--duration', '5', '--seed', '3')
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    lines = statuses(output)
+    assert len(lines) >= 4, output
+    for line in lines:
+        assert float(line.group(1)) < 3.0
+        assert float(line.group(2)) < 100.0
+    assert left_behind(process) == ''
+
+
+def test_two_arms_share_a_graph_and_ctrl_c_ends_one_cleanly(environment):
+    left = bringup(environment, '--robot', 'arm26', '--namespace', 'left_arm')
+    right = bringup(environment, '--robot', 'arm26', '--namespace', 'right_arm', '--no-explore')
+    graph = Graph()
+    try:
+        for side in ('left_arm', 'right_arm'):
+            graph.listen(JointState, f'/{side}/estimated_joint_states')
+        for side in ('left_arm', 'right_arm'):
+            graph.wait(
+                lambda side=side: graph.received[f'/{side}/estimated_joint_states'],
+                f'{side} to estimate',
+                deadline=5 * DEADLINE,
+            )
+    finally:
+        graph.close()
+        for process in (left, right):
+            os.kill(process.pid, signal.SIGINT)
+        outputs = [process.communicate(timeout=DEADLINE)[0] for process in (left, right)]
+    assert [left.returncode, right.returncode] == [130, 130], outputs
+    assert 'Traceback' not in ''.join(outputs)
+    assert left_behind(left) == left_behind(right) == ''
+
+
+def test_a_cut_muscle_is_detected_and_reset_after_mending(environment):
+    process = bringup(environment, '--robot', 'arm26', '--namespace', 'cut')
+    graph = Graph('/cut')
+    try:
+        graph.listen(Bool, 'anomaly_detected', LATCHED)
+        graph.listen(JointState, 'estimated_joint_states')
+        graph.wait(lambda: graph.received['estimated_joint_states'], 'the arm', 5 * DEADLINE)
+        assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', ['brachialis'])[0]
+        detected = graph.received['anomaly_detected']
+        graph.wait(lambda: detected and detected[-1].data, 'the detection')
+        graph.spin(2.5)  # a status line is printed once a second
+        assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+        graph.wait(
+            lambda: graph.call(Trigger, 'estimator/reset').success
+            and graph.spin(2.0) is None
+            and not detected[-1].data,
+            'the detection to stay cleared',
+        )
+    finally:
+        graph.close()
+        os.kill(process.pid, signal.SIGTERM)
+        output, _ = process.communicate(timeout=DEADLINE)
+    assert 'ANOMALY: brachialis' in output
+
+
+def test_a_dead_node_is_named_and_nothing_is_left(environment):
+    process = bringup(environment, '--robot', 'arm26', '--namespace', 'dying')
+    graph = Graph('/dying')
+    try:
+        graph.listen(JointState, 'estimated_joint_states')
+        graph.wait(lambda: graph.received['estimated_joint_states'], 'the arm', 5 * DEADLINE)
+    finally:
+        graph.close()
+    victim = next(line for line in left_behind(process).splitlines() if '/estimator ' in line)
+    os.kill(int(victim.split()[0]), signal.SIGKILL)
+    output, _ = process.communicate(timeout=DEADLINE)
+    assert process.returncode == 1
+    assert 'estimator ended with status' in output
+    end = time.monotonic() + DEADLINE
+    while left_behind(process) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert left_behind(process) == ''
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'expected'),
+    [
+        (['--robot', 'no_such_robot'], 'musashi_left_arm'),
+        (['--duration', 'soon'], 'soon'),
+        (['--seed', '-1'], '-1'),
+        (['--preset', 'best'], 'default or paper'),
+        (['--namespace', '1st'], '1st'),
+        (['--checkpoint', '/no/such/file'], '/no/such/file'),
+        (['--fly'], '--robot'),
+        (['--robot'], 'needs a value'),
+    ],
+)
+def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments, expected):
+    process = bringup(environment, *arguments)
+    output, _ = process.communicate(timeout=DEADLINE)
+    assert process.returncode == 2
+    assert expected in output

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A test's view of a real ROS graph: real processes, real DDS, waits with deadlines."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+
+DEADLINE = 60.0  # [s] a wait may take on a loaded machine before the test fails
+
+
+def executable(name: str) -> list[str]:
+    """Return the command of an installed executable, as `ros2 run` finds it."""
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
+        if file.exists():
+            return [sys.executable, str(file)]
+    raise FileNotFoundError(f'{name} is not installed; run ./test.sh, which builds the package')
+
+
+class Process:
+    """One node or tool, ended when the test ends."""
+
+    def __init__(self, name: str, *arguments: str) -> None:
+        """Start an executable of the package."""
+        self.name = name
+        self.process = subprocess.Popen(
+            [*executable(name), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self.process.poll() is None
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Stop it; return exit status and output."""
+        if self.alive():
+            self.process.send_signal(number)
+        try:
+            output, _ = self.process.communicate(timeout=DEADLINE)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            output, _ = self.process.communicate()
+        return self.process.returncode, output
+
+
+class Graph:
+    """A node of the test, what it received, and the processes it started."""
+
+    def __init__(self, namespace: str = '') -> None:
+        """Join the graph of ROS_DOMAIN_ID."""
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node('test', context=self.context, namespace=namespace)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.namespace = namespace
+        self.received: dict[str, list[Any]] = defaultdict(list)
+        self.processes: list[Process] = []
+
+    def start(self, name: str, **parameters: Any) -> Process:
+        """Start a node with parameters, in this graph's namespace."""
+        arguments = ['--ros-args']
+        for key, value in parameters.items():
+            arguments += ['-p', f'{key}:={_yaml(value)}']
+        if self.namespace:
+            arguments += ['-r', f'__ns:={self.namespace}']
+        process = Process(name, *arguments)
+        self.processes.append(process)
+        return process
+
+    def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
+        """Subscribe; return the list that messages are appended to."""
+        self.node.create_subscription(kind, topic, self.received[topic].append, qos)
+        return self.received[topic]
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> Any:
+        """Advertise a topic and wait until somebody listens."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.wait(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {topic}')
+        return publisher
+
+    def spin(self, seconds: float) -> None:
+        """Handle messages for a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
+
+    def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
+        """Handle messages until a condition holds; fail with what was waited for."""
+        end = time.monotonic() + deadline
+        while not (value := condition()):
+            dead = [p for p in self.processes if not p.alive()]
+            if dead:
+                status, output = dead[0].end()
+                raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
+            if time.monotonic() > end:
+                raise AssertionError(f'waited {deadline:g} s in vain for {what}')
+            self.executor.spin_once(timeout_sec=0.05)
+        return value
+
+    def next(self, topic: str, count: int = 1) -> Any:
+        """Return the count-th message from now on."""
+        messages = self.received[topic]
+        wanted = len(messages) + count
+        self.wait(lambda: len(messages) >= wanted, f'{count} messages on {topic}')
+        return messages[-1]
+
+    def call(self, kind: type, service: str, request: Any = None) -> Any:
+        """Call a service and return its response."""
+        client = self.node.create_client(kind, service)
+        self.wait(client.service_is_ready, f'service {service}')
+        future = client.call_async(request or kind.Request())
+        self.wait(future.done, f'an answer of {service}')
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameter(self, node: str, name: str, value: Any) -> tuple[bool, str]:
+        """Set a parameter of another node; return success and reason."""
+        message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        result = self.call(SetParameters, f'{node}/set_parameters', request).results[0]
+        return result.successful, result.reason
+
+    def close(self) -> None:
+        """Leave the graph and end what was started."""
+        for process in self.processes:
+            process.end()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{value}'"
+    return str(value)

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors import safe_open
+
+from musculoskeletal_ae.exceptions import CheckpointError
+from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.checkpoint import from_bytes, load, save, to_bytes
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def small() -> Mae:
+    """One joint, two muscles, hidden layers of 4: small enough to break in every byte."""
+    rng = np.random.default_rng(0)
+    sizes = (8, 4, 3, 4, 5)
+    stack = [(rng.normal(size=(o, i)), rng.normal(size=o)) for i, o in pairwise(sizes)]
+    return Mae(
+        joints=('knee',),
+        muscles=('quad', 'ham'),
+        preset='default',
+        activation='silu',
+        encoder=tuple(stack[:2]),
+        decoder=tuple(stack[2:]),
+        mean=rng.normal(size=5),
+        std=np.ones(5),
+        version=7,
+        training='by hand; θ',
+        anomaly=AnomalyStatistics.of(rng.normal(size=(50, 4)), True, {'norm': 0.25}),
+    )
+
+
+GOOD = to_bytes(small())
+
+
+def rewritten(header_change) -> bytes:
+    size = int.from_bytes(GOOD[:8], 'little')
+    header = json.loads(GOOD[8 : 8 + size])
+    header = header_change(header) or header
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, 'little') + text + GOOD[8 + size :]
+
+
+def with_metadata(**changes) -> bytes:
+    def change(header):
+        header['__metadata__'].update({k: json.dumps(v) for k, v in changes.items()})
+
+    return rewritten(change)
+
+
+def arrays(mae: Mae):
+    result = [part for layer in (*mae.encoder, *mae.decoder) for part in layer]
+    result += [mae.mean, mae.std]
+    if mae.anomaly is not None:
+        result += [mae.anomaly.mean, mae.anomaly.covariance]
+    return result
+
+
+def check_same(one: Mae, two: Mae) -> None:
+    for a, b in zip(arrays(one), arrays(two), strict=True):
+        assert a.tobytes() == b.tobytes()
+    for name in ('joints', 'muscles', 'preset', 'activation', 'version', 'training'):
+        assert getattr(one, name) == getattr(two, name)
+    if one.anomaly is not None:
+        assert one.anomaly.calibrated is two.anomaly.calibrated
+        assert one.anomaly.samples == two.anomaly.samples
+        assert dict(one.anomaly.thresholds) == dict(two.anomaly.thresholds)
+
+
+def test_round_trip_keeps_every_bit(mae, robot):
+    check_same(mae, from_bytes(to_bytes(mae), robot))
+    check_same(small(), from_bytes(GOOD))
+    bare = replace(small(), anomaly=None)
+    assert from_bytes(to_bytes(bare)).anomaly is None
+    check_same(bare, from_bytes(to_bytes(bare)))
+
+
+def test_file_round_trip_leaves_nothing_beside_it(mae, robot, tmp_path):
+    file = tmp_path / 'a.safetensors'
+    file.write_bytes(b'old')
+    save(mae, file)
+    check_same(mae, load(file, robot))
+    assert [p.name for p in tmp_path.iterdir()] == ['a.safetensors']
+
+
+def test_failed_write_keeps_the_old_file(mae, tmp_path, monkeypatch):
+    file = tmp_path / 'a.safetensors'
+    file.write_bytes(b'old')
+    monkeypatch.setattr('os.fsync', lambda _: (_ for _ in ()).throw(OSError('disk full')))
+    with pytest.raises(OSError, match='disk full'):
+        save(mae, file)
+    assert file.read_bytes() == b'old'
+    assert [p.name for p in tmp_path.iterdir()] == ['a.safetensors']
+
+
+def test_metadata_says_what_the_checkpoint_is(mae, robot, tmp_path):
+    save(mae, tmp_path / 'a')
+    with safe_open(tmp_path / 'a', 'numpy') as file:
+        text = {key: json.loads(value) for key, value in file.metadata().items()}
+    assert text['format_version'] == 1
+    assert text['joints'] == list(robot.joints)
+    assert text['muscles'] == list(robot.muscles)
+    assert text['layer_sizes'] == list(mae.layer_sizes)
+    assert text['anomaly_calibrated'] is False
+    assert 'arm26' in text['training']
+
+
+def test_checkpoint_of_another_robot_is_refused_by_name(mae):
+    with pytest.raises(CheckpointError, match=r'joints shoulder.*shoulder_roll'):
+        from_bytes(to_bytes(mae), Robot.load('musashi_left_arm'))
+
+
+def test_permuted_muscles_are_refused(mae, robot):
+    permuted = replace(mae, muscles=mae.muscles[::-1])
+    with pytest.raises(CheckpointError, match='in this order'):
+        from_bytes(to_bytes(permuted), robot)
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        ({'format_version': 2}, 'format_version 2'),
+        ({'format_version': True}, 'format_version'),
+        ({'joints': ['knee', 'ankle']}, 'layer_sizes'),
+        ({'joints': []}, 'joints'),
+        ({'joints': [1]}, 'joints'),
+        ({'muscles': ['quad', 'quad']}, 'different names'),
+        ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
+        ({'layer_sizes': [8, 4, 3, 4, 6]}, 'layer_sizes'),
+        ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, 'layer_sizes'),
+        ({'layer_sizes': 'x'}, 'layer_sizes'),
+        ({'activation': 'relu'}, "'tanh' or 'silu'"),
+        ({'preset': 'other'}, "'paper' or 'default'"),
+        ({'units': 'degree'}, 'units'),
+        ({'version': -1}, 'version'),
+        ({'training': 5}, 'training'),
+        ({'anomaly_calibrated': 'yes'}, 'anomaly_calibrated'),
+        ({'anomaly_calibrated': None}, 'anomaly'),
+        ({'anomaly_samples': 1.5}, 'anomaly_samples'),
+        ({'anomaly_thresholds': {'norm': 'x'}}, 'anomaly_thresholds'),
+        ({'anomaly_thresholds': {'norm': float('nan')}}, 'NaN'),
+        ({'anomaly_thresholds': {'norm': 10**400}}, 'anomaly_thresholds'),
+        ({'extra': 1}, 'extra'),
+    ],
+)
+def test_wrong_metadata_is_refused_by_name(change, says):
+    with pytest.raises(CheckpointError, match=says):
+        from_bytes(with_metadata(**change))
+
+
+@pytest.mark.parametrize('name', ['mean', 'std', 'encoder.0.weight', 'anomaly.covariance'])
+@pytest.mark.parametrize('value', [np.nan, np.inf, 1e300])
+def test_numbers_that_are_no_weights_are_refused(name, value):
+    size = int.from_bytes(GOOD[:8], 'little')
+    start = json.loads(GOOD[8 : 8 + size])[name]['data_offsets'][0] + 8 + size
+    data = GOOD[:start] + np.float64(value).tobytes() + GOOD[start + 8 :]
+    with pytest.raises(CheckpointError, match=name):
+        from_bytes(data)
+
+
+def test_zero_spread_is_refused():
+    with pytest.raises(CheckpointError, match='std'):
+        from_bytes(to_bytes(replace(small(), std=np.full(5, 1e-30))))
+
+
+@pytest.mark.parametrize('covariance', [-np.eye(4), np.triu(np.ones((4, 4))), np.zeros((4, 4))])
+def test_covariance_that_is_none_is_refused(covariance):
+    good = small()
+    bad = replace(good, anomaly=replace(good.anomaly, covariance=covariance))
+    with pytest.raises(CheckpointError, match='covariance'):
+        from_bytes(to_bytes(bad))
+
+
+@pytest.mark.parametrize(
+    'data',
+    [
+        b'',
+        b'\x80\x04N.',  # a pickle
+        (2**63).to_bytes(8, 'little') + b'{}',
+        (2).to_bytes(8, 'little') + b'{}',
+        (2).to_bytes(8, 'little') + b'[]',
+        (200_000).to_bytes(8, 'little') + b'[' * 200_000,
+        (8).to_bytes(8, 'little') + b'{"a":\xff}',
+    ],
+)
+def test_bytes_that_are_no_checkpoint_are_refused(data):
+    with pytest.raises(CheckpointError, match='train'):
+        from_bytes(data)
+
+
+@pytest.mark.parametrize('nested', ['[' * 50_000, '{"a":' * 50_000])
+def test_deep_metadata_is_refused(nested):
+    def change(header):
+        header['__metadata__']['joints'] = nested
+
+    with pytest.raises(CheckpointError, match='joints'):
+        from_bytes(rewritten(change))
+
+
+def test_float32_weights_are_refused_by_type():
+    def change(header):
+        header['mean']['dtype'] = 'F32'
+
+    with pytest.raises(CheckpointError, match='F64'):
+        from_bytes(rewritten(change))
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r'none\.safetensors'):
+        load(tmp_path / 'none.safetensors')
+    with pytest.raises(CheckpointError, match='cannot be read'):
+        load(tmp_path)
+
+
+@given(st.integers(0, len(GOOD) - 1), st.integers(1, 255))
+def test_any_changed_byte_gives_a_sound_network_or_a_checkpoint_error(place, flip):
+    data = bytearray(GOOD)
+    data[place] ^= flip
+    try:
+        mae = from_bytes(bytes(data))
+    except CheckpointError:
+        return
+    # A flipped bit of a weight is another weight; it must still be one that computes.
+    assert all(np.isfinite(part).all() for part in arrays(mae))
+
+
+@given(st.integers(0, len(GOOD) - 1))
+def test_any_cut_file_is_refused(length):
+    with pytest.raises(CheckpointError):
+        from_bytes(GOOD[:length])
+
+
+@given(st.binary(max_size=200))
+def test_any_header_gives_a_checkpoint_error(header):
+    with pytest.raises(CheckpointError):
+        from_bytes(len(header).to_bytes(8, 'little') + header)

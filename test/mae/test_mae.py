@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from musculoskeletal_ae.mae.evaluation import unseen_states
+from musculoskeletal_ae.mae.network import from_mae
+from musculoskeletal_ae.mae.units import Mask, scale_vector
+
+
+@pytest.fixture
+def states(robot):
+    return unseen_states(robot, 12, np.random.default_rng(0), 0.0, robot.tension.max)
+
+
+def test_one_scaled_unit_is_a_radian_200_newton_and_100_millimetres():
+    np.testing.assert_allclose(scale_vector(1, 2) * [1, 200, 200, 0.1, 0.1], np.ones(5))
+
+
+@pytest.mark.parametrize('index', range(3))
+def test_numpy_agrees_with_torch(mae, states, index):
+    scaled = np.concatenate(states, axis=1) * scale_vector(2, 6)
+    mask = list(Mask)[index]
+    with torch.no_grad():
+        expected = from_mae(mae)(
+            torch.tensor(scaled, dtype=torch.float32), torch.full((len(scaled),), index)
+        )
+    z = mae.encode(mask, *states)
+    np.testing.assert_allclose(mae.decode_scaled(z), expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(
+        np.concatenate(mae.decode(z), axis=-1) * scale_vector(2, 6), expected.numpy(), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize('mask', Mask)
+def test_masked_input_is_ignored(mae, states, mask):
+    hidden = [
+        part if seen else np.full_like(part, np.nan) for part, seen in zip(states, mask.value)
+    ]
+    absent = [part if seen else None for part, seen in zip(states, mask.value)]
+    expected = mae.encode(mask, *states)
+    np.testing.assert_array_equal(mae.encode(mask, *hidden), expected)
+    np.testing.assert_array_equal(mae.encode(mask, *absent), expected)
+
+
+@pytest.mark.parametrize('mask', Mask)
+def test_missing_input_is_refused(mae, mask):
+    with pytest.raises(ValueError, match=mask.name):
+        mae.encode(mask)
+
+
+def test_latent_has_as_many_entries_as_joints_and_muscles(mae, states):
+    assert mae.encode(Mask.THETA_TENSION, *states).shape == (12, 2 + 6) == (12, mae.latent_size)
+
+
+def test_single_state_gives_what_the_batch_gives(mae, states):
+    batch = mae.estimate(states.tension, states.length)
+    for i in range(12):
+        single = mae.estimate(states.tension[i], states.length[i])
+        for one, many in zip(single, batch, strict=True):
+            np.testing.assert_allclose(one, many[i], rtol=1e-9, atol=1e-9)
+
+
+def test_estimate_is_decoded_encoding_of_tension_and_length(mae, states):
+    expected = mae.decode(mae.encode(Mask.TENSION_LENGTH, None, states.tension, states.length))
+    for got, want in zip(mae.estimate(states.tension, states.length), expected, strict=True):
+        np.testing.assert_array_equal(got, want)
+
+
+def test_inputs_stay_as_they_were(mae, states):
+    before = [part.copy() for part in states]
+    mae.muscle_jacobian(states.theta, states.tension)
+    z = mae.encode(Mask.THETA_LENGTH, *states)
+    kept = z.copy()
+    mae.decode(z), mae.decode_jacobian(z), mae.decode_pullback(z)[1](np.ones((12, 14)))
+    np.testing.assert_array_equal(z, kept)
+    for part, copy in zip(states, before, strict=True):
+        np.testing.assert_array_equal(part, copy)
+
+
+def test_decoder_jacobian_is_the_limit_of_differences(mae, states):
+    z = mae.encode(Mask.TENSION_LENGTH, *states)
+    y, jacobian = mae.decode_jacobian_scaled(z)
+    np.testing.assert_allclose(y, mae.decode_scaled(z), atol=1e-12)
+    step = 1e-5 * np.eye(8)
+    difference = [(mae.decode_scaled(z + d) - mae.decode_scaled(z - d)) / 2e-5 for d in step]
+    np.testing.assert_allclose(jacobian, np.stack(difference, axis=-1), atol=1e-7)
+    si = mae.decode_jacobian(z) * scale_vector(2, 6)[:, None]
+    np.testing.assert_allclose(si, jacobian, atol=1e-12)
+
+
+def test_pullback_is_the_transposed_jacobian(mae, states):
+    z = mae.encode(Mask.TENSION_LENGTH, *states)
+    gradient = np.random.default_rng(1).normal(size=(12, 14))
+    y, pullback = mae.decode_pullback(z)
+    jacobian = mae.decode_jacobian_scaled(z)[1]
+    np.testing.assert_allclose(y, mae.decode_scaled(z), atol=1e-12)
+    np.testing.assert_allclose(
+        pullback(gradient), np.einsum('ni,nij->nj', gradient, jacobian), atol=1e-10
+    )
+
+
+def test_muscle_jacobian_is_the_limit_of_the_papers_difference(mae, states):
+    analytic = mae.muscle_jacobian(states.theta, states.tension)
+    assert analytic.shape == (12, 6, 2)
+    fine = mae.muscle_jacobian_difference(states.theta, states.tension, step=1e-6)
+    np.testing.assert_allclose(analytic, fine, atol=1e-6)
+    coarse = mae.muscle_jacobian_difference(states.theta, states.tension)
+    assert 0.0 < np.abs(coarse - analytic).max() < 0.02
+    np.testing.assert_allclose(
+        mae.muscle_jacobian(states.theta[0], states.tension[0]), analytic[0], atol=1e-12
+    )
+
+
+def test_weights_cannot_be_written(mae):
+    for weight, bias in (*mae.encoder, *mae.decoder, (mae.mean, mae.std)):
+        assert not weight.flags.writeable and not bias.flags.writeable

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import pytest
+
+from musculoskeletal_ae.mae.checkpoint import load
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.train import main
+
+
+def test_train_writes_checkpoint_and_plot_and_prints_the_nine_errors(tmp_path, capsys):
+    out, plot = tmp_path / 'a.safetensors', tmp_path / 'a.png'
+    arguments = ['--robot', 'arm26', '--preset', 'paper', '--quick']
+    assert main([*arguments, '--out', str(out), '--plot', str(plot)]) == 0
+    printed = capsys.readouterr().out
+    robot = Robot.load('arm26')
+    assert load(out, robot).preset == 'paper'
+    assert plot.read_bytes().startswith(b'\x89PNG')
+    for text in ('①', '②', '③', '[rad]', '[N]', '[mm]', *robot.joints):
+        assert text in printed
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        [],
+        ['--robot', 'arm26'],
+        ['--robot', 'arm26', '--out', 'x', '--preset', 'best'],
+        ['--robot', 'arm26', '--out', 'x', '--seed', '-1'],
+        ['--robot', 'arm26', '--out', 'x', '--seed', 'one'],
+    ],
+)
+def test_bad_options_exit_with_2(options):
+    with pytest.raises(SystemExit) as exit_:
+        main(options)
+    assert exit_.value.code == 2
+
+
+def test_unknown_robot_exits_with_1_in_one_line(tmp_path, capsys):
+    assert main(['--robot', 'nobody', '--out', str(tmp_path / 'x')]) == 1
+    error = capsys.readouterr().err
+    assert 'nobody' in error and error.count('\n') == 1
+
+
+def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):
+    assert main(['--robot', 'arm26', '--out', str(tmp_path / 'none' / 'x')]) == 1
+    assert main(['--robot', 'arm26', '--out', str(tmp_path)]) == 1
+    assert capsys.readouterr().err.count('\n') == 2

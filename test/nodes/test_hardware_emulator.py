@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated hardware as a robot on the graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from musculoskeletal_ae.nodes.messages import array_message, read_array
+from musculoskeletal_ae.nodes.shell import LATCHED
+
+
+@pytest.fixture
+def arm(graph):
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.listen(JointState, 'joint_states')
+    graph.listen(String, 'robot_description', LATCHED)
+    graph.listen(MarkerArray, 'hardware_emulator/markers')
+    graph.listen(PoseStamped, 'marker_pose')
+    graph.node_under_test = graph.start('hardware_emulator', robot='arm26', seed=1)
+    graph.next('muscle_states')
+    return graph
+
+
+def rows(graph, robot):
+    return read_array(graph.next('muscle_states'), 3, robot.muscle_count)
+
+
+def drive(graph, robot, command, condition, what):
+    publisher = graph.publisher(Float64MultiArray, 'muscle_length_command')
+
+    def done():
+        publisher.publish(array_message(command, 'muscle'))
+        graph.spin(0.02)
+        return condition()
+
+    graph.wait(done, what)
+
+
+def test_it_publishes_what_musashi_s_modules_would(arm, arm26):
+    message = arm.next('muscle_states')
+    assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
+        ('quantity', 3, 18),
+        ('muscle', 6, 6),
+    ]
+    _, tension, temperature = rows(arm, arm26)
+    assert np.all(tension > 0.5 * arm26.tension.bias)
+    assert np.all(np.abs(temperature - 25.0) < 5.0)
+    joints = arm.next('joint_states')
+    assert tuple(joints.name) == arm26.joints
+    assert arm.received['robot_description'][0].data == arm26.description.urdf
+    arm.next('hardware_emulator/markers')
+    markers = arm.received['hardware_emulator/markers'][-1].markers
+    assert sum(m.ns == 'muscles' for m in markers) == 6
+    assert {m.header.frame_id for m in markers} == {arm26.root_link}
+
+
+def test_length_commands_move_it_and_silence_makes_it_safe(arm, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    tension = np.full(6, 80.0)
+    command = arm26.muscle_lengths(theta, tension) - 50.0 / arm26.stiffness
+    drive(
+        arm,
+        arm26,
+        command,
+        lambda: np.abs(np.array(arm.received['joint_states'][-1].position) - theta).max() < 0.4,
+        'the posture',
+    )
+    arm.wait(lambda: rows(arm, arm26)[1].max() > 50.0, 'tension')
+    arm.wait(lambda: rows(arm, arm26)[1].max() < 35.0, 'the safe state after the timeout')
+
+
+def test_a_muscle_can_be_cut_and_mended_at_run_time(arm, arm26):
+    name = arm26.muscles[3]
+    success, reason = arm.set_parameter('hardware_emulator', 'ruptured_muscles', ['biceps'])
+    assert not success
+    assert name in reason  # the legal names
+    assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
+    before = rows(arm, arm26)
+    assert before[1, 3] == 0.0
+    arm.wait(lambda: rows(arm, arm26)[0, 3] < before[0, 3] - 0.01, 'winding in')
+    assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    arm.wait(lambda: rows(arm, arm26)[1, 3] > 15.0, 'tension')
+
+
+def test_payload_offset_and_wrench_act(arm, arm26):
+    start = rows(arm, arm26)[0]
+    assert arm.set_parameter('hardware_emulator', 'length_offset', [0.01])[0]
+    np.testing.assert_allclose(rows(arm, arm26)[0], start + 0.01, atol=3e-3)
+    for wrong in ([0.1, 0.2], [float('nan')]):
+        assert not arm.set_parameter('hardware_emulator', 'length_offset', wrong)[0]
+    assert arm.set_parameter('hardware_emulator', 'payload', 2.0)[0]
+    assert not arm.set_parameter('hardware_emulator', 'payload', -1.0)[0]
+    push = arm.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
+    message = WrenchStamped()
+    message.wrench.force.x = 30.0
+    at_rest = np.array(arm.next('joint_states').position)
+
+    def moved():
+        push.publish(message)
+        return np.abs(np.array(arm.next('joint_states').position) - at_rest).max() > 0.1
+
+    arm.wait(moved, 'the push')
+
+
+def test_a_marker_pose_is_published_on_request(arm, arm26):
+    assert arm.set_parameter('hardware_emulator', 'marker_rate', 30.0)[0]
+    pose = arm.next('marker_pose', 3)
+    assert pose.header.frame_id == arm26.root_link
+    theta = np.array(arm.received['joint_states'][-1].position)
+    expected = arm26.kinematics.end_effector_pose(theta)
+    p, q = pose.pose.position, pose.pose.orientation
+    np.testing.assert_allclose([p.x, p.y, p.z], expected.translation, atol=0.02)
+    turn = pin.Quaternion(q.w, q.x, q.y, q.z).toRotationMatrix().T @ expected.rotation
+    assert np.linalg.norm(pin.log3(turn)) < 0.1
+
+
+def test_bad_commands_do_not_move_it(arm, arm26):
+    publisher = arm.publisher(Float64MultiArray, 'muscle_length_command')
+    before = rows(arm, arm26)[0]
+    for data in ([float('nan')] * 6, [-0.05] * 5, [], [0.0] * 1_300_000):
+        publisher.publish(Float64MultiArray(data=data))
+    arm.next('muscle_states', 30)
+    np.testing.assert_allclose(rows(arm, arm26)[0], before, atol=2e-3)
+    assert arm.node_under_test.alive()
+
+
+def test_reset_brings_it_back(arm, arm26):
+    command = rows(arm, arm26)[0] - 0.02
+    start = np.array(arm.next('joint_states').position)
+    drive(arm, arm26, command, lambda: rows(arm, arm26)[1].max() > 60.0, 'tension')
+    assert arm.call(Trigger, 'hardware_emulator/reset').success
+    np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
+
+
+def test_without_joint_sensors_there_are_no_joint_states(graph):
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.start('hardware_emulator', robot='arm26', joint_sensors=False)
+    graph.next('muscle_states', 10)
+    assert graph.node.count_publishers('joint_states') == 0

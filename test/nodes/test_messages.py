@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of validity, on messages without a graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.nodes.messages import (
+    array_message,
+    read_array,
+    read_joints,
+    read_posture,
+)
+
+JOINTS = ('a', 'b')
+
+
+def muscle_array(data, sizes=None, strides=None, offset=0):
+    strides = strides or [0] * len(sizes or [])
+    dims = [
+        MultiArrayDimension(size=size, stride=stride)
+        for size, stride in zip(sizes or [], strides, strict=True)
+    ]
+    return Float64MultiArray(layout=MultiArrayLayout(dim=dims, data_offset=offset), data=data)
+
+
+@given(st.integers(1, 3), st.integers(1, 8))
+def test_what_is_written_is_read(rows, columns):
+    values = np.arange(rows * columns, dtype=float)
+    shaped = values.reshape(rows, columns) if rows > 1 else values
+    labels = ('quantity', 'muscle') if rows > 1 else ('muscle',)
+    np.testing.assert_array_equal(read_array(array_message(shaped, *labels), rows, columns), shaped)
+
+
+def test_an_array_without_layout_is_accepted_by_its_length():
+    assert read_array(muscle_array([1.0, 2.0]), 1, 2).tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ('message', 'reason'),
+    [
+        (muscle_array([]), 'empty'),
+        (muscle_array([1.0]), 'wrong length'),
+        (muscle_array([1.0] * 7), 'wrong length'),
+        (muscle_array([0.0] * 1_000_000), 'oversized'),
+        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('nan')]), 'not finite'),
+        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('-inf')]), 'not finite'),
+        (muscle_array([0.0] * 6, [2, 3]), 'wrong layout'),
+        (muscle_array([0.0] * 6, [6]), 'wrong layout'),
+        (muscle_array([0.0] * 6, [3, 2], [6, 3]), 'wrong layout'),
+        (muscle_array([0.0] * 6, offset=1), 'wrong layout'),
+    ],
+)
+def test_a_wrong_array_is_rejected_by_reason(message, reason):
+    with pytest.raises(MessageError) as error:
+        read_array(message, 3, 2)
+    assert error.value.reason == reason
+
+
+def test_joints_are_matched_by_name_and_foreign_ones_ignored():
+    message = JointState(name=['b', 'x', 'a'], position=[2.0, float('nan'), 1.0])
+    assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
+
+
+def test_an_effort_nobody_measures_does_not_reject_a_measurement():
+    message = JointState(name=['a', 'b'], position=[1.0, 2.0], effort=[float('nan')] * 2)
+    assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ('message', 'reason'),
+    [
+        (JointState(), 'empty'),
+        (JointState(name=['a'], position=[1.0]), 'missing joint'),
+        (JointState(name=['a', 'b', 'a'], position=[1.0, 2.0, 3.0]), 'duplicate joint'),
+        (JointState(name=['a', 'b'], position=[1.0]), 'wrong length'),
+        (JointState(name=['a', 'b'], position=[1.0, 2.0], effort=[1.0]), 'wrong length'),
+        (JointState(name=['a', 'b'], position=[1.0, float('inf')]), 'not finite'),
+        (JointState(name=['x'] * 20_000, position=[0.0] * 20_000), 'oversized'),
+    ],
+)
+def test_a_wrong_measurement_is_rejected_by_reason(message, reason):
+    with pytest.raises(MessageError) as error:
+        read_posture(message, JOINTS)
+    assert error.value.reason == reason
+
+
+def test_a_target_may_name_a_subset_and_effort():
+    message = JointState(name=['b'], position=[2.0], effort=[3.0])
+    assert read_joints(message, JOINTS, foreign_allowed=False) == {'b': (2.0, 3.0)}
+
+
+@pytest.mark.parametrize(
+    ('message', 'reason'),
+    [
+        (JointState(name=['x'], position=[1.0]), 'unknown joint'),
+        (JointState(name=['a', 'a'], position=[1.0, 1.0]), 'duplicate joint'),
+        (JointState(name=['a'], position=[1.0], effort=[float('nan')]), 'not finite'),
+        (JointState(), 'empty'),
+    ],
+)
+def test_a_wrong_target_is_rejected_by_reason(message, reason):
+    with pytest.raises(MessageError) as error:
+        read_joints(message, JOINTS, foreign_allowed=False)
+    assert error.value.reason == reason
