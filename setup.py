@@ -9,7 +9,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
-NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'render']
+NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'render', 'sim']
 TOOLS = ['calibrate_emulator', 'check_robot', 'fit_series_elastic', 'train']
 
 

@@ -33,16 +33,13 @@ def executable(name: str) -> list[str]:
 
 
 class Process:
-    """One node or tool, ended when the test ends."""
+    """One command, ended when the test ends."""
 
-    def __init__(self, name: str, *arguments: str) -> None:
-        """Start an executable of the package."""
+    def __init__(self, name: str, command: list[str], **options: Any) -> None:
+        """Start a command; options are those of Popen."""
         self.name = name
         self.process = subprocess.Popen(
-            [*executable(name), *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
         )
 
     def alive(self) -> bool:
@@ -82,7 +79,7 @@ class Graph:
             arguments += ['-p', f'{key}:={_yaml(value)}']
         if self.namespace:
             arguments += ['-r', f'__ns:={self.namespace}']
-        process = Process(name, *arguments)
+        process = Process(name, [*executable(name), *arguments])
         self.processes.append(process)
         return process
 

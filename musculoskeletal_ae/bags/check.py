@@ -30,6 +30,9 @@ class BagCheck:
     lines: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return '\n'.join([*self.lines, *(f'fault: {fault}' for fault in self.faults)])
+
 
 @dataclass
 class _Timing:

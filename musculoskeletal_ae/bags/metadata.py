@@ -138,8 +138,9 @@ def write_metadata(directory: Path, metadata: Metadata) -> None:
     new = file.with_suffix('.yaml.new')
     with new.open('w', encoding='utf-8') as stream:
         stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
+        if metadata.finished:
+            stream.flush()
+            os.fsync(stream.fileno())
     new.replace(file)
 
 

@@ -8,16 +8,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
+from itertools import chain
 
 from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.topics import TOPICS, interface_name
+from musculoskeletal_ae.exceptions import BagError
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
 
 
 def latched_topics(bag: Bag) -> set[str]:
-    """Return the recorded names of topics whose last message reaches late joiners."""
-    return {name for name, topic in bag.topics.items() if 'transient_local' in topic.qos}
+    """Return the recorded names of topics whose last message reaches late joiners.
+
+    Those of the interface are latched even if the recorder took no note of it.
+    """
+    return {
+        name
+        for name, topic in bag.topics.items()
+        if 'transient_local' in topic.qos
+        or ((ours := TOPICS.get(interface_name(name))) and ours.latched)
+    }
+
+
+def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
+    """Return from when to when [ns, recorded] a bag is played.
+
+    Args:
+        bag: An opened bag.
+        start: Seconds from its beginning.
+        duration: Seconds to play; None for all that is left.
+
+    Raises:
+        BagError: If the bag is shorter than that.
+    """
+    length = (bag.end - bag.start) / 1e9
+    if start > length:
+        raise BagError(bag.path, None, f'is {length:.3f} s long', 'give a smaller --start')
+    first = bag.start + round(start * 1e9)
+    return first, bag.end if duration is None else min(bag.end, first + round(duration * 1e9))
 
 
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
@@ -32,9 +61,8 @@ def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[Ba
     held: dict[str, BagMessage] = {}
     if start > bag.start:
         for message in bag.messages(latched_topics(bag) & set(topics), stop=start - 1):
-            held[message.topic] = message
-    yield from held.values()
-    for message in bag.messages(topics, start, stop):
+            held[message.topic] = message._replace(log_time=start - 1)
+    for message in chain(held.values(), bag.messages(topics, start, stop)):
         bag.decode(message)
         yield message
 

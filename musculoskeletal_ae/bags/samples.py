@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from musculoskeletal_ae.bags import definitions
 from musculoskeletal_ae.bags.metadata import offered_qos
-from musculoskeletal_ae.bags.topics import DIAGNOSTICS, TOPICS
+from musculoskeletal_ae.bags.topics import DIAGNOSTICS, TOPICS, interface_name
 from musculoskeletal_ae.bags.writer import BagWriter
 
 START = 1_800_000_000_000_000_000  # [ns]
@@ -85,7 +85,7 @@ def write_ours(path: Path, content: list[Sample], compression: str, finish: bool
     numbers: dict[str, int] = {}
     for i, sample in enumerate(content):
         if sample.topic not in numbers:
-            latched = sample.topic.endswith('robot_description')
+            latched = TOPICS[interface_name(sample.topic)].latched
             numbers[sample.topic] = writer.add_topic(
                 sample.topic, sample.type, [offered_qos(latched)]
             )

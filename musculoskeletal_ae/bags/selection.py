@@ -6,7 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import SENT, TOPICS, recorded_namespace, relative_name
+from musculoskeletal_ae.bags.topics import (
+    SENT,
+    TOPICS,
+    interface_name,
+    recorded_namespace,
+    relative_name,
+)
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 
 DEFAULT, ALL = 'default', 'all'
@@ -46,7 +52,7 @@ def select(
     """
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.
-        relative = {name: _longest_ending(name) for name in bag.topics}
+        relative = {name: interface_name(name) for name in bag.topics}
     else:
         relative = _stripped(bag, namespace)
     has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
@@ -74,11 +80,6 @@ def _stripped(bag: Bag, namespace: str | None) -> dict[str, str]:
     except MusculoskeletalError as error:
         raise BagError(bag.path, None, *str(error).split('; ', 1)) from error
     return {name: relative_name(name, namespace) for name in bag.topics}
-
-
-def _longest_ending(name: str) -> str:
-    endings = [topic for topic in TOPICS if name.endswith(f'/{topic.lstrip("/")}')]
-    return max(endings, key=len, default=name)
 
 
 def _compare_type(bag: Bag, name: str, relative: str) -> None:

@@ -94,3 +94,9 @@ def relative_name(name: str, namespace: str) -> str:
     if name == DIAGNOSTICS or not name.startswith(f'{namespace}/'):
         return name
     return name[len(namespace) + 1 :]
+
+
+def interface_name(name: str) -> str:
+    """Return the longest name of the interface that a recorded name ends in, or the name."""
+    endings = [topic for topic in TOPICS if name.endswith(f'/{topic.lstrip("/")}')]
+    return max(endings, key=len, default=name)

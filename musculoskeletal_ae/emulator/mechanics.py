@@ -131,9 +131,7 @@ class Scratch(NamedTuple):
 
 
 @njit(cache=True)
-def tension_from_elongation(
-    elongation: float, force: float, rate: float, stretch: float
-) -> float:
+def tension_from_elongation(elongation: float, force: float, rate: float, stretch: float) -> float:
     """Return T with ln(1 + T/force)/rate + stretch·T = elongation; 0 for a slack wire.
 
     Newton in u = ln(1 + T/force), where the equation is convex and u = rate·elongation lies
@@ -155,9 +153,7 @@ def tension_from_elongation(
 
 
 @njit(cache=True)
-def module_reference(
-    kind: int, command: float, length: float, before: float, body: Body
-) -> float:
+def module_reference(kind: int, command: float, length: float, before: float, body: Body) -> float:
     """Return T_ref [N] of one module that reads `length` [m] and had T_ref `before`."""
     if kind == FOLLOW_LENGTH:
         wished = body.tension_bias + max(0.0, body.stiffness * (length - command))
@@ -222,9 +218,7 @@ def muscle_step(
     for s in range(routes.first.shape[0]):
         i, k, ball = routes.first[s], routes.second[s], routes.sphere_joint[s]
         centre = scratch.translation[ball]
-        segment_length(
-            world[i], world[k], centre, routes.radius[s], scratch.leave, scratch.arrive
-        )
+        segment_length(world[i], world[k], centre, routes.radius[s], scratch.leave, scratch.arrive)
         pull = muscle.end_tension[routes.muscle[s]]
         translation, axis = scratch.translation, scratch.axis
         add_torque(
@@ -238,9 +232,7 @@ def muscle_step(
         if routes.radius[s] > 0.0:
             for r in range(3):
                 scratch.leave[r] += scratch.arrive[r]
-            add_torque(
-                tree, translation, axis, ball, centre, scratch.leave, -pull, joint.torque
-            )
+            add_torque(tree, translation, axis, ball, centre, scratch.leave, -pull, joint.torque)
     _external_wrench(tree, joint, scratch, wrench, effector, effector_joint)
 
 

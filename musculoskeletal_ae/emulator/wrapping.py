@@ -65,9 +65,7 @@ class WrappedRoutes(NamedTuple):
 
 
 @njit(cache=True)
-def tree_poses(
-    tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array
-) -> None:
+def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array) -> None:
     """Fill rotation (J, 3, 3), translation (J, 3), axis (J, 3) of all joints for q (J−1,)."""
     rotation[0] = np.eye(3)
     translation[0] = 0.0
@@ -109,9 +107,7 @@ def tree_poses(
 
 
 @njit(cache=True)
-def place_points(
-    routes: WrappedRoutes, rotation: Array, translation: Array, world: Array
-) -> None:
+def place_points(routes: WrappedRoutes, rotation: Array, translation: Array, world: Array) -> None:
     """Fill world (P, 3) with the route points in the root link's frame."""
     for p in range(routes.point.shape[0]):
         j = routes.point_joint[p]

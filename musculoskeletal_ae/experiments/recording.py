@@ -78,9 +78,7 @@ def record(
     for goal in goals:
         start = command
         for tick in range(round(goal.duration / SAMPLE_TIME)):
-            command = ramp(
-                start, goal.length, (tick + 1) * SAMPLE_TIME, RAMP_SHARE * goal.duration
-            )
+            command = ramp(start, goal.length, (tick + 1) * SAMPLE_TIME, RAMP_SHARE * goal.duration)
             arm.command_length(command)
             arm.step(SAMPLE_TIME)
             read = arm.sense()

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 Array = NDArray[np.float64]
 
-FEATURES = 80  # of the smooth rest, per muscle
+FEATURES = 60  # of the smooth rest, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges
 # More than twice the tension at the elastic unit than at the motor is no friction.
 LARGEST_FRICTION = 0.5
@@ -105,32 +106,6 @@ class CorrectedBody:
 
     # -- parts ----------------------------------------------------------------------------------
 
-    def _smooth(self, theta: Array, m: int) -> Array:
-        """Return ψ(θ) − ψ(0) of one muscle, shape (N, features)."""
-        scale = np.sqrt(2.0 / max(1, len(self._phase[m])))
-        values = np.cos(theta @ self._frequency[m].T + self._phase[m]) - np.cos(self._phase[m])
-        return scale * values
-
-    def _route(
-        self, rotation: Array, translation: Array, m: int, gradient: bool
-    ) -> tuple[Array, Array]:
-        """Return f_i [m] (N,) and ∂f_i/∂δ (N, 3 points), the latter empty if not asked for."""
-        routes, layout = self.robot.routes, self.layouts[m]
-        joint = routes.joint[layout.points]
-        shift = self.parameters[m][layout.attachment].reshape(-1, 3)
-        local = routes.point[layout.points] + shift
-        turn = rotation[:, joint]  # (N, P, 3, 3)
-        world = np.einsum('npij,pj->npi', turn, local) + translation[:, joint]
-        line = world[:, 1:] - world[:, :-1]
-        norm = np.linalg.norm(line, axis=-1)
-        if not gradient:
-            return norm.sum(axis=1), np.empty(0)
-        direction = line / np.maximum(norm, 1e-9)[..., None]
-        pull = np.zeros_like(world)
-        pull[:, 1:] += direction
-        pull[:, :-1] -= direction
-        return norm.sum(axis=1), np.einsum('npij,npi->npj', turn, pull).reshape(len(world), -1)
-
     def elastic(self, m: int) -> SeriesElastic:
         """Return the constants of one muscle, arrays of shape ()."""
         nominal = self.robot.series_elastic
@@ -140,62 +115,93 @@ class CorrectedBody:
             nominal.force[m] * force, nominal.rate[m] * rate, nominal.wire_stretch[m] * stretch
         )
 
-    def friction(self) -> Array:
-        """Return μ of every muscle, shape (M,)."""
-        values = [p[lay.friction] for p, lay in zip(self.parameters, self.layouts, strict=True)]
-        return np.clip(np.array(values), 0.0, LARGEST_FRICTION)
+    def friction(self, m: int) -> float:
+        """Return μ of one muscle."""
+        value = self.parameters[m][self.layouts[m].friction]
+        return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
+
+    def poses(self, theta: Array) -> JointPoses:
+        """Return the joint poses of θ (N, D) and, in the last place, of θ = 0."""
+        return self.robot.kinematics.joint_poses(np.vstack([theta, np.zeros(theta.shape[1])]))
+
+    def _world(self, poses: JointPoses, m: int) -> tuple[Array, Array]:
+        """Return the route's points in the root link's frame, and how their links are turned."""
+        layout, routes = self.layouts[m], self.robot.routes
+        joint = routes.joint[layout.points]
+        shift = self.parameters[m][layout.attachment].reshape(-1, 3)
+        turn = poses.rotation[:, joint]  # (N, P, 3, 3)
+        local = routes.point[layout.points] + shift
+        return (turn @ local[:, :, None])[..., 0] + poses.translation[:, joint], turn
+
+    def _smooth(self, theta: Array, m: int) -> Array:
+        """Return ψ(θ) − ψ(0) of one muscle, shape (N, features)."""
+        scale = np.sqrt(2.0 / max(1, len(self._phase[m])))
+        values = np.cos(theta @ self._frequency[m].T + self._phase[m]) - np.cos(self._phase[m])
+        return scale * values
 
     # -- lengths --------------------------------------------------------------------------------
 
-    def lengths(self, theta: Array, tension: Array, sliding: Array | None = None) -> Array:
-        """Return l [m] (N, M) at θ [rad] (N, D) and the motor's T [N] (N, M).
+    def lengths(self, theta: Array, tension: Array, *sliding: Array) -> tuple[Array, ...]:
+        """Return l [m] (N, M) at θ [rad] (N, D) and the motors' T [N] (N, M).
 
         Args:
             theta: θ.
-            tension: T where the module measures it.
-            sliding: s in [−1, 1], shape (N, M); 0 by default, the mean of both directions.
+            tension: T where the modules measure it.
+            sliding: For each result s in [−1, 1], shape (N, M); 0 is the mean of both directions.
         """
-        columns = [
-            self._muscle(theta, tension[:, m], None if sliding is None else sliding[:, m], m)
-            for m in range(self.robot.muscle_count)
-        ]
-        return np.stack(columns, axis=1)
-
-    def _muscle(self, theta: Array, tension: Array, sliding: Array | None, m: int) -> Array:
-        return self.linearised(theta, tension, sliding, m, gradient=False)[0]
+        result = tuple(np.empty_like(tension) for _ in sliding)
+        poses = self.poses(theta)
+        for m, layout in enumerate(self.layouts):
+            world, _ = self._world(poses, m)
+            absolute = np.linalg.norm(world[:, 1:] - world[:, :-1], axis=-1).sum(axis=1)
+            absolute, at_zero = absolute[:-1], absolute[-1]
+            fixed = absolute - at_zero + self.parameters[m][layout.offset]
+            fixed += self._smooth(theta, m) @ self.parameters[m][layout.rest]
+            elastic, friction = self.elastic(m), self.friction(m)
+            for lengths, slid in zip(result, sliding, strict=True):
+                end = tension[:, m] * np.exp(-friction * slid[:, m])
+                lengths[:, m] = fixed - elastic.elongation(absolute, end)
+        return result
 
     def linearised(
-        self, theta: Array, tension: Array, sliding: Array | None, m: int, gradient: bool = True
+        self, poses: JointPoses, theta: Array, tension: Array, sliding: Array, m: int
     ) -> tuple[Array, Array]:
-        """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P)."""
+        """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
+
+        Args:
+            poses: Of θ, from `poses`.
+            theta: θ [rad], shape (N, D).
+            tension: T_i at the motor [N], shape (N,).
+            sliding: s_i in [−1, 1], shape (N,).
+            m: The muscle.
+        """
         layout, parameters = self.layouts[m], self.parameters[m]
-        poses = self.robot.kinematics.joint_poses(np.vstack([theta, np.zeros(theta.shape[1])]))
-        absolute, by_point = self._route(poses.rotation, poses.translation, m, gradient)
-        absolute, at_zero = absolute[:-1], absolute[-1]
-        friction = np.clip(parameters[layout.friction], -LARGEST_FRICTION, LARGEST_FRICTION)
-        slid = np.zeros(len(theta)) if sliding is None else sliding
-        end = tension * np.exp(-friction * slid)
+        world, turn = self._world(poses, m)
+        line = world[:, 1:] - world[:, :-1]
+        norm = np.linalg.norm(line, axis=-1)
+        direction = line / np.maximum(norm, 1e-9)[..., None]
+        pull = np.zeros_like(world)
+        pull[:, 1:] += direction
+        pull[:, :-1] -= direction
+        by_point = (pull[:, :, None] @ turn).reshape(len(world), -1)
+        absolute, at_zero = norm[:-1].sum(axis=1), norm[-1].sum()
         elastic = self.elastic(m)
+        end = np.maximum(tension * np.exp(-self.friction(m) * sliding), 0.0)
         smooth = self._smooth(theta, m)
-        elongation = elastic.elongation(absolute, end)
-        length = absolute - at_zero - elongation + parameters[layout.offset]
-        length = length + smooth @ parameters[layout.rest]
-        if not gradient:
-            return length, np.empty(0)
+        length = absolute - at_zero - elastic.elongation(absolute, end)
+        length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
         slope = 1.0 - elastic.length_slope(end)
         jacobian = np.empty((len(theta), layout.size))
         jacobian[:, layout.attachment] = slope[:, None] * by_point[:-1] - by_point[-1]
-        pull = np.maximum(end, 0.0)
-        unit = np.log1p(pull / elastic.force) / elastic.rate
         jacobian[:, layout.elastic] = np.stack(
             [
-                pull / (elastic.force + pull) / elastic.rate,
-                unit,
-                -elastic.wire_stretch * absolute * pull,
+                end / (elastic.force + end) / elastic.rate,
+                np.log1p(end / elastic.force) / elastic.rate,
+                -elastic.wire_stretch * absolute * end,
             ],
             axis=1,
         )
-        jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * slid
+        jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * sliding
         jacobian[:, layout.offset] = 1.0
         jacobian[:, layout.rest] = smooth
         return length, jacobian

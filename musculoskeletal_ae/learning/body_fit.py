@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.learning.body import CorrectedBody, Layout
+from musculoskeletal_ae.robot.kinematics import JointPoses
 
 Array = NDArray[np.float64]
 
@@ -115,22 +116,23 @@ def fit_body(
         prior: What is known without any.
         rounds: Gauss–Newton steps.
     """
+    poses = body.poses(seen.theta)
     parts = [
-        _fit_muscle(body, seen, prior, rounds, m) for m in range(body.robot.muscle_count)
+        _fit_muscle(body, poses, seen, prior, rounds, m) for m in range(body.robot.muscle_count)
     ]
     residual, noise, weight = zip(*parts, strict=True)
     return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
 
 
 def _fit_muscle(
-    body: CorrectedBody, seen: Observations, prior: Prior, rounds: int, m: int
+    body: CorrectedBody, poses: JointPoses, seen: Observations, prior: Prior, rounds: int, m: int
 ) -> tuple[Array, float, Array]:
     layout = body.layouts[m]
     precision = 1.0 / prior.spread(layout) ** 2
     mean = prior.mean(layout)
     known = seen.known[:, m].astype(float)
     noise, weight = FIRST_NOISE, known
-    data = seen.theta, seen.tension[:, m], seen.sliding[:, m]
+    data = poses, seen.theta, seen.tension[:, m], seen.sliding[:, m]
     length, jacobian = body.linearised(*data, m)
     for _ in range(rounds):
         at = body.parameters[m]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, /diagnostics → stdout.
+joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, /diagnostics →
+stdout.
 """
 
 from __future__ import annotations

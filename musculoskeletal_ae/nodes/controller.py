@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `controller`: target posture → muscle length command, with a latched safe stop.
+"""The node `controller`: target posture → muscle commands, with a latched safe stop.
 
-target_joint_states, estimated_joint_states, muscle_states, anomaly_detected → muscle_length_command.
+target_joint_states, estimated_joint_states, muscle_states, anomaly_detected →
+muscle_length_command, or muscle_tension_command with method `tension`.
 """
 
 from __future__ import annotations
 
-import math
 import time
+from collections.abc import Iterable
+from dataclasses import Field, fields
+from typing import Any
 
-import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
@@ -36,226 +38,146 @@ from musculoskeletal_ae.nodes.shell import (
     run,
     text,
 )
-from musculoskeletal_ae.tasks.posture_control import METHODS, PostureControl, Settings
-from musculoskeletal_ae.tasks.safety import SafetyFilter, thermal_limit
+from musculoskeletal_ae.tasks.control_report import control_report, stiffness_values
+from musculoskeletal_ae.tasks.controller import Controller as Core
+from musculoskeletal_ae.tasks.safety import LENGTH, TENSION, Muscles
+from musculoskeletal_ae.tasks.settings import Settings, read_stiffness
+from musculoskeletal_ae.tasks.stiffness_control import StiffnessSolution
 
-PRESETS = ('paper', 'default')
+LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}
 
 
 class Controller(Shell):
-    """Node shell of posture control and its safety filter."""
+    """Node shell of control."""
 
     def __init__(self) -> None:
         """Declare parameters, topics and services."""
         super().__init__('controller')
-        self.control = PostureControl(self.robot, Settings())
-        self.safety = SafetyFilter(self.robot)
-        self.anomaly = False
-        self.clamped = ''
-        self.ticked = self.muscle_arrival = self.estimate_arrival = -math.inf
-        self.length = self.tension = self.temperature = None
-        self.estimate = None
-        self._declare_all()
-        self.publisher = self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE)
-        self.follow_checkpoints(self.control.use)
+        self.declare_parameter('explore', False, text('explore from the start', read_only=True))
+        self.declare_parameter('seed', 0, text('seed of the exploration', read_only=True))
+        self.settings = Settings()
+        self.core = Core(self.robot, self.settings, self.get_parameter('seed').value)
+        self._declare_settings()
+        self.cause = ''
+        self.stiffness: StiffnessSolution | None = None
+        self.publishers_of = {
+            LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
+            TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
+        }
+        self.follow_checkpoints(self.core.use, self._unfit)
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
-        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
+        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         self.create_service(SetBool, 'controller/explore', self._explore)
         self.create_service(Trigger, 'controller/stop', self._stop)
         self.create_service(Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.get_parameter('explore').value:
-            self._start_exploring()
+            self.core.explore(True)
 
-    def _declare_all(self) -> None:
-        settings, safety = self.control.settings, self.safety
-        self.declare_parameter('explore', False, text('explore from the start', read_only=True))
-        self.declare_parameter('seed', 0, text('seed of the exploration', read_only=True))
+    # -- parameters -----------------------------------------------------------------------------
 
-        def one_of(name: str, legal: tuple[str, ...], meaning: str) -> None:
-            def setter(value: str) -> str | None:
-                if value not in legal:
-                    return f'{value!r}; legal: {", ".join(legal)}'
-                setattr(settings, name, value)
-                return None
-
-            described = text(f'{meaning}; one of: {", ".join(legal)}')
-            self.settable(name, getattr(settings, name), described, setter)
-
-        def of(owner: object, name: str, described: ParameterDescriptor) -> None:
-            self.settable(
-                name, getattr(owner, name), described, lambda value: setattr(owner, name, value)
-            )
-
-        one_of('method', METHODS, 'how a target becomes muscle lengths, from the next target on')
-        one_of('preset', PRESETS, 'of the method proposed')
-        of(settings, 'first_duration', number('of a movement [s]', 0.1, 60.0))
-        of(settings, 'second_duration', number('of the second movement of second [s]', 0.1, 60.0))
-        most = self.robot.tension.limit
-        of(settings, 'constant_tension', number('T_const of first [N]; 0: T_bias', 0.0, most))
-        of(safety, 'hold_time', number('a stop holds the last command so long [s]', 0.0, 60.0))
+    def _declare_settings(self) -> None:
+        for setting in fields(Settings):
+            if setting.metadata:
+                self._declare_setting(setting)
         self.settable(
-            'rate_limit',
-            settings.rate_limit,
-            number('fastest change of a commanded length [m/s]', 0.001, 1.0),
-            self._set_rate_limit,
-        )
-        self.max_age = 0.2
-        self.settable(
-            'max_age',
-            self.max_age,
-            number('older muscle_states or estimated_joint_states stop the arm [s]', 0.01, 10.0),
-            lambda value: setattr(self, 'max_age', value),
-        )
-        self.temperature_limit = 85.0
-        self.settable(
-            'temperature_limit',
-            self.temperature_limit,
-            number('a module this hot pulls with T_bias only [°C]', 40.0, 200.0),
-            lambda value: setattr(self, 'temperature_limit', value),
+            'joint_stiffness',
+            [0.0],
+            ParameterDescriptor(
+                description='wished joint stiffness [N·m/rad], one per joint; 0 or []: as it comes',
+                dynamic_typing=True,  # `[]` is an array of bytes to rclpy
+            ),
+            self._set_stiffness,
         )
 
-    def _set_rate_limit(self, value: float) -> None:
-        self.control.settings.rate_limit = self.safety.rate_limit = value
+    def _declare_setting(self, setting: Field[Any]) -> None:
+        name, told = setting.name, setting.metadata
+        legal = told.get('legal')
+        if legal is None:
+            descriptor = number(told['meaning'], *told['range'])
+        else:
+            descriptor = text(f'{told["meaning"]}; one of: {", ".join(legal)}')
+
+        def setter(value: Any) -> str | None:
+            if legal is not None and value not in legal:
+                return f'{value!r}; legal: {", ".join(legal)}'
+            setattr(self.settings, name, value)
+            return None
+
+        self.settable(name, setting.default, descriptor, setter)
+
+    def _set_stiffness(self, wished: Iterable[Any]) -> str | None:
+        try:
+            self.settings.joint_stiffness = read_stiffness(wished, self.robot.joint_count)
+        except MusculoskeletalError as error:
+            return str(error)
+        self.core.posture.start()
+        return None
 
     # -- messages -------------------------------------------------------------------------------
 
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
-        self.length, self.tension, self.temperature = rows
-        self.muscle_arrival = time.monotonic()
+        self.core.muscles(Muscles(*rows), time.monotonic())
 
     def _estimated(self, message: JointState) -> None:
-        self.estimate = read_posture(message, self.robot.joints)
-        self.estimate_arrival = time.monotonic()
+        self.core.estimated(read_posture(message, self.robot.joints), time.monotonic())
         # The estimate is made from the newest muscle states: now everything is fresh.
-        self._tick()
+        self._step()
 
     def _target(self, message: JointState) -> None:
-        found = read_joints(message, self.robot.joints, foreign_allowed=False)
-        kept = self.control.theta
-        if kept is None:
-            kept = self.estimate if self.estimate is not None else np.zeros(self.robot.joint_count)
-        theta, effort = kept.copy(), self.control.effort.copy()
-        for i, name in enumerate(self.robot.joints):
-            if name in found:
-                theta[i], effort[i] = found[name]
-        inside = np.clip(theta, self.robot.lower, self.robot.upper)
-        beyond = [n for n, a, b in zip(self.robot.joints, theta, inside, strict=True) if a != b]
-        self.clamped = ', '.join(beyond)
-        if beyond:
-            self.get_logger().warning(f'target clamped to the joint limits: {self.clamped}')
-        self.control.set_target(inside, effort)
+        self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
+        if self.core.clamped:
+            clamped = ', '.join(self.core.clamped)
+            self.get_logger().warning(f'target clamped to the joint limits: {clamped}')
 
-    def _anomaly(self, message: Bool) -> None:
-        self.anomaly = message.data
+    def _unfit(self, reason: str) -> None:
+        self.core.stop(f'unfit checkpoint: {reason}')
 
     # -- services -------------------------------------------------------------------------------
 
     def _explore(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        response.success = True
-        if not request.data:
-            self.control.explore(None)
-            response.message = 'holding'
-        elif self.safety.cause:
-            response.success, response.message = False, f'stopped: {self.safety.cause}'
-        else:
-            response.success = self._start_exploring()
-            response.message = 'exploring' if response.success else 'no posture can be held'
+        reason = self.core.explore(request.data)
+        response.success = not reason
+        response.message = reason or ('exploring' if request.data else 'holding')
         return response
 
-    def _start_exploring(self) -> bool:
-        self.control.explore(self.get_parameter('seed').value)
-        return True
-
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._stop_for('controller/stop was called')
-        response.success, response.message = True, 'stopped'
+        self.core.stop('controller/stop was called')
+        response.success, response.message = True, 'stopped; controller/reset ends it'
         return response
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        cause = self._present_cause()
-        if cause:
-            response.success, response.message = False, f'refused: {cause}'
-            return response
-        response.success, response.message = True, 'ready'
-        if self.safety.cause:
-            self.safety.reset()
-            self.control.hold()
+        reason = self.core.reset(time.monotonic())
+        response.success = not reason
+        response.message = f'refused: {reason}' if reason else 'going on to the last target, if any'
         return response
 
-    # -- the loop -------------------------------------------------------------------------------
-
-    def _present_cause(self) -> str:
-        """Return why the arm must not move now, or ''."""
-        now = time.monotonic()
-        if self.mae is None:
-            return 'no checkpoint'
-        if self.anomaly:
-            return 'anomaly_detected; call estimator/reset when it is mended'
-        for what, arrival in (
-            ('muscle_states', self.muscle_arrival),
-            ('estimated_joint_states', self.estimate_arrival),
-        ):
-            if now - arrival > self.max_age:
-                return f'{what} older than {self.max_age:g} s'
-        return ''
-
-    def _stop_for(self, cause: str) -> None:
-        if not self.safety.cause:
-            self.get_logger().warning(f'stopped: {cause}')
-        self.control.explore(None)
-        self.safety.stop(cause)
+    # -- time -----------------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        # Before the first command there is nothing to stop.
-        cause = self._present_cause()
-        if cause and self.safety.command is not None:
-            self._stop_for(cause)
-        if time.monotonic() - self.ticked > 1.5 / self.rate:
-            self._tick()
+        if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:
+            self._step()
 
-    def _tick(self) -> None:
-        now = time.monotonic()
-        dt, self.ticked = min(now - self.ticked, 0.1), now
-        if self.length is None:
-            return
-        limit = thermal_limit(self.robot, self.temperature, self.temperature_limit)
-        wished = None
-        if not self.safety.cause and not self._present_cause():
-            if self.safety.command is None:
-                # MSC at the present length pulls with T_bias only: the gentlest start.
-                self.control.start_from(self.length)
-            try:
-                planned = np.minimum(limit, self.robot.tension.limit)
-                wished = self.control.step(self.tension, planned, dt)
-            except MusculoskeletalError as error:
-                self._stop_for(str(error))
-        command = self.safety.step(wished, self.length, limit, dt)
+    def _step(self) -> None:
+        command = self.core.step(time.monotonic())
         if command is not None:
-            self.publisher.publish(array_message(command, 'muscle'))
+            self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
 
     def state(self) -> tuple[bytes, str, dict[str, str]]:
-        """Return what /diagnostics shows."""
-        values = {'method': self.control.settings.method}
-        if self.clamped:
-            values['target clamped at'] = self.clamped
-        if self.temperature is not None:
-            limit = thermal_limit(self.robot, self.temperature, self.temperature_limit)
-            hot = limit < self.robot.tension.max
-            names = [n for n, h in zip(self.robot.muscles, hot, strict=True) if h]
-            if names:
-                values['tension limited by heat'] = ', '.join(names)
-        if self.safety.cause:
-            return ERROR, f'stopped: {self.safety.cause}', values
-        if self.control.exploring:
-            return OK, 'exploring', values
-        if np.abs(self.control.missing_torque).max() > 0.0:
-            return WARN, 'the target needs more torque than the muscles have', values
-        return OK, 'holding' if self.control.theta is not None else 'no target', values
+        """Return what /diagnostics shows, and log what has changed."""
+        report = control_report(self.robot, self.core, time.monotonic())
+        cause, found = self.core.safety.cause, self.core.posture.stiffness
+        if cause and cause != self.cause:
+            self.get_logger().warning(f'stopped: {cause}')
+        if found is not None and found is not self.stiffness:
+            for what, said in stiffness_values(self.robot, self.settings, found).items():
+                self.get_logger().info(f'{what}: {said}')
+        self.cause, self.stiffness = cause, found
+        return LEVELS[report.level], report.message, report.values
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `estimator`: joint angles from muscle length and tension, and whether the body is healthy.
+"""The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
 muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected.
 """
@@ -48,12 +48,12 @@ class Estimator(Shell):
         self.settable(
             'anomaly_threshold',
             0.0,
-            number('A above it in 5 messages running is an anomaly; 0: calibrated detector', 0, 1e6),
+            number(
+                'A above it in 5 messages running is an anomaly; 0: calibrated detector', 0, 1e6
+            ),
             self._set_threshold,
         )
-        self.joint_publisher = self.create_publisher(
-            JointState, 'estimated_joint_states', RELIABLE
-        )
+        self.joint_publisher = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscle_publisher = self.create_publisher(
             Float64MultiArray, 'estimated_muscle_states', RELIABLE
         )

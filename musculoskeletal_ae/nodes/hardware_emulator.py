@@ -19,9 +19,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.messages import array_message, read_array
+from musculoskeletal_ae.nodes.messages import array_message, read_array, read_wrench
 from musculoskeletal_ae.nodes.shell import LATCHED, OK, RELIABLE, WARN, Shell, number, run, text
 from musculoskeletal_ae.robot.drawing import draw_arm
 
@@ -51,7 +50,7 @@ class HardwareEmulator(Shell):
             self._set_timeout,
         )
         self.settable(
-            'ruptured_muscles', [''], text("names of cut muscles; \"['']\" heals"), self._rupture
+            'ruptured_muscles', [''], text('names of cut muscles; "[\'\']" heals'), self._rupture
         )
         self.settable('payload', 0.0, number('in the hand [kg]', 0.0, 20.0), self._set_payload)
         self.settable(
@@ -118,13 +117,7 @@ class HardwareEmulator(Shell):
         self.arm.command_tension(read_array(message, 1, self.robot.muscle_count))
 
     def _push(self, message: WrenchStamped) -> None:
-        force, torque = message.wrench.force, message.wrench.torque
-        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
-        if message.header.frame_id not in ('', self.robot.root_link):
-            raise MessageError('wrong frame', f'{message.header.frame_id!r}')
-        if not np.isfinite(wrench).all():
-            raise MessageError('not finite', 'a force or torque')
-        self.arm.set_wrench(wrench)
+        self.arm.set_wrench(read_wrench(message, self.robot.root_link))
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.arm.reset()

@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Sequence
 
 import numpy as np
+from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
@@ -115,3 +116,18 @@ def read_posture(message: JointState, joints: Sequence[str]) -> Array:
     """Return θ [rad] (D,) of a message that has all listed joints, others ignored."""
     found = read_joints(message, joints, foreign_allowed=True)
     return np.array([found[name][0] for name in joints])
+
+
+def read_wrench(message: WrenchStamped, root_link: str) -> Array:
+    """Return force [N] and torque [N·m] (6,), in axes of the root link; an empty frame is that.
+
+    Raises:
+        MessageError: If it is given in another frame or not finite.
+    """
+    force, torque = message.wrench.force, message.wrench.torque
+    wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+    if message.header.frame_id not in ('', root_link):
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
+    if not np.isfinite(wrench).all():
+        raise MessageError('not finite', 'a force or torque')
+    return wrench

@@ -7,30 +7,27 @@ import sys
 import time
 from argparse import Namespace
 
-from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 from musculoskeletal_ae.bags.options import parse_replay
-from musculoskeletal_ae.bags.playback import Timeline, lap, latched_topics
-from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.playback import Timeline, lap, latched_topics, window
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.selection import select
-from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.nodes.clock import RecordedClock
 from musculoskeletal_ae.nodes.tool import message_class, run_tool, start_ros
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
-# /clock comes at this spacing of recorded time, but not more often than nodes can bear.
-CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
 # Services are answered at least so often; between, a short wait is slept.
 SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 # A publisher sees its subscriber a little before the subscriber sees it and takes messages.
 SETTLE_TIME = 0.3  # [s]
+LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
 LATCHED = QoSProfile(
     depth=1,
@@ -52,10 +49,7 @@ class Replay(Node):
         """
         super().__init__('replay')
         self._bag, self._names = bag, names
-        self._start = bag.start + round(options.start * 1e9)
-        self._stop = bag.end
-        if options.duration is not None:
-            self._stop = min(bag.end, self._start + round(options.duration * 1e9))
+        self._start, self._stop = window(bag, options.start, options.duration)
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher = {
             recorded: self.create_publisher(
@@ -65,11 +59,8 @@ class Replay(Node):
             )
             for recorded, name in names.items()
         }
-        self._clock_publisher = (
-            self.create_publisher(Clock, '/clock', QoSProfile(depth=1)) if options.clock else None
-        )
-        self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
-        self._next_tick = self._next_service = 0.0
+        self._recorded_clock = RecordedClock(self, options.rate) if options.clock else None
+        self._next_service = 0.0
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -83,8 +74,8 @@ class Replay(Node):
     def wait_for_subscribers(self, longest: float) -> None:
         """Wait until every topic has a subscriber, at most so long [s]."""
         end = time.monotonic() + longest
-        publishers = self._publisher.values()
-        while time.monotonic() < end and not all(p.get_subscription_count() for p in publishers):
+        topics = self._publisher.values()
+        while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)
 
@@ -92,15 +83,18 @@ class Replay(Node):
         """Publish everything once, from start to stop."""
         # Just before the first message, so that it is not due when the lap begins paused.
         self._timeline.jump(self._start - 1, time.monotonic())
-        self._next_tick = 0.0
         progress.reset()
         for message in lap(self._bag, self._names, self._start, self._stop):
-            self._next_time = message.log_time
-            while self._timeline.wait(message.log_time, time.monotonic()) > 0:
-                self._idle(message, progress)
+            self._wait(message.log_time, progress)
             self._timeline.catch_up(message.log_time, time.monotonic())
             self._tick()
             self._publisher[message.topic].publish(message.data)
+
+    def play_again_and_again(self, progress: tqdm) -> None:
+        """Publish everything until the process is ended."""
+        while True:
+            self.play(progress)
+            self._wait(self._stop + LAP_GAP, progress)
 
     def acknowledge(self) -> None:
         """Give reliable readers time to get the last messages."""
@@ -109,27 +103,26 @@ class Replay(Node):
             left = max(0.0, end - time.monotonic())
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
 
-    def _idle(self, message: BagMessage, progress: tqdm) -> None:
-        """Answer services, publish the clock and wait, for at most until the message is due."""
-        self._tick()
-        now = time.monotonic()
-        wait = min(self._timeline.wait(message.log_time, now), SERVICE_PERIOD)
-        if self._clock_publisher:
-            wait = min(wait, self._next_tick - now)
-        if wait > SLEPT or now > self._next_service:
-            self._next_service = now + SERVICE_PERIOD
-            self._spinner.spin_once(timeout_sec=max(wait, 0.0))
-            done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
-            progress.update(max(0.0, done - progress.n))
-        elif wait > 0:
-            time.sleep(wait)
+    def _wait(self, recorded: int, progress: tqdm) -> None:
+        """Answer services and publish the clock until a recorded time [ns] is due."""
+        self._next_time = recorded
+        while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
+            self._tick()
+            wait = min(due, SERVICE_PERIOD)
+            if self._recorded_clock:
+                wait = min(wait, max(self._recorded_clock.next_tick - now, 0.0))
+            if wait > SLEPT or now > self._next_service:
+                self._next_service = now + SERVICE_PERIOD
+                self._spinner.spin_once(timeout_sec=wait)
+                done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
+                progress.update(max(0.0, done - progress.n))
+            else:
+                time.sleep(wait)
 
     def _tick(self) -> None:
         now = time.monotonic()
-        if self._clock_publisher and now >= self._next_tick:
-            self._next_tick = now + self._clock_period
-            seconds, nanoseconds = divmod(self._timeline.recorded(now), 1_000_000_000)
-            self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        if self._recorded_clock:
+            self._recorded_clock.tick(self._timeline.recorded(now), now)
 
     def _pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._timeline.pause(time.monotonic())
@@ -158,23 +151,17 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     for reason in bag.unfinished:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
     names = select(bag, options.topics, options.from_namespace, options.keep_names)
-    length = (bag.end - bag.start) / 1e9
-    if options.start > length:
-        raise BagError(bag.path, None, f'is {length:.3f} s long', 'give a smaller --start')
+    start, stop = window(bag, options.start, options.duration)
     if options.loop and not options.clock:
         problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
         print(f'warning: --loop: {problem}', file=sys.stderr)
     start_ros(arguments)
     node = Replay(bag, names, options)
-    left = min(length - options.start, options.duration or length)
     bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
-    with tqdm(total=left, bar_format=bar, disable=None, leave=False) as progress:
+    with tqdm(total=(stop - start) / 1e9, bar_format=bar, disable=None, leave=False) as progress:
         node.wait_for_subscribers(options.wait)
-        node.play(progress)
-        while options.loop:
-            node.play(progress)
+        (node.play_again_and_again if options.loop else node.play)(progress)
     node.acknowledge()
-    node.destroy_node()
     return 0
 
 
@@ -183,12 +170,17 @@ def _check(options: Namespace) -> int:
     from musculoskeletal_ae.bags.check import check_bag
 
     check = check_bag(options.bag, options.robot, options.from_namespace)
-    print('\n'.join([*check.lines, *(f'fault: {fault}' for fault in check.faults)]))
+    print(check)
     return 1 if check.faults else 0
 
 
 def _work(options: Namespace, arguments: list[str]) -> int:
-    return _check(options) if options.check else _replay(options, arguments)
+    if options.check:
+        return _check(options)
+    try:
+        return _replay(options, arguments)
+    except KeyboardInterrupt:
+        return 0  # as `ros2 bag play`
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -134,8 +134,15 @@ class Shell(Node):
 
     # -- checkpoints ----------------------------------------------------------------------------
 
-    def follow_checkpoints(self, use: Callable[[Mae], None]) -> None:
-        """Take checkpoints from the parameter and the topic; the last valid one wins."""
+    def follow_checkpoints(
+        self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Take checkpoints from the parameter and the topic; the last valid one wins.
+
+        Args:
+            use: Takes a checked network.
+            unfit: Is told why one that came by topic cannot be used; the one in use stays.
+        """
         self.mae: Mae | None = None
 
         def take(mae: Mae) -> None:
@@ -151,7 +158,12 @@ class Shell(Node):
             return None
 
         def from_topic(message: UInt8MultiArray) -> None:
-            take(checkpoints.from_bytes(bytes(message.data), self.robot))
+            try:
+                mae = checkpoints.from_bytes(bytes(message.data), self.robot)
+            except MusculoskeletalError as error:
+                unfit(str(error))
+                raise
+            take(mae)
 
         self.settable('checkpoint', '', text('MAE checkpoint file; empty: wait for one'), from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
@@ -182,7 +194,8 @@ class Shell(Node):
             else:
                 self._received[topic] += 1
 
-        self.create_subscription(kind, topic, receive, qos)
+        # rclpy accepts (message, info) callbacks; its annotations do not know them.
+        self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
     # -- diagnostics ----------------------------------------------------------------------------
 

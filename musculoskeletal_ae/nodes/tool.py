@@ -8,7 +8,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
@@ -37,9 +37,20 @@ def start_ros(arguments: list[str]) -> None:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        reason = ' '.join(str(error).split(', at /')[0].split())
-        print(f'{arguments[0]}: error: --ros-args: {reason}', file=sys.stderr)
-        sys.exit(2)
+        _refuse(arguments, error)
+
+
+def _own_arguments(arguments: list[str]) -> list[str]:
+    try:
+        return remove_ros_args(arguments)[1:]
+    except RuntimeError as error:
+        _refuse(arguments, error)
+
+
+def _refuse(arguments: list[str], error: RuntimeError) -> NoReturn:
+    reason = ' '.join(str(error).split(', at /')[0].split())
+    print(f'{arguments[0]}: error: --ros-args: {reason}', file=sys.stderr)
+    sys.exit(2)
 
 
 def run_tool(
@@ -50,8 +61,6 @@ def run_tool(
 ) -> int:
     """Parse options, work and return the exit status.
 
-    Ctrl-C ends a tool as it ends `ros2 bag`: without complaint, status 0.
-
     Args:
         name: Of the tool.
         parse: Reads the options; ends with status 2 if they are wrong.
@@ -61,11 +70,11 @@ def run_tool(
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        return work(parse(remove_ros_args(arguments)[1:]), arguments)
+        return work(parse(_own_arguments(arguments)), arguments)
     except (MusculoskeletalError, InvalidTopicNameException) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 0
+        return 130
     finally:
         rclpy.try_shutdown()

@@ -68,7 +68,8 @@ class Kinematics:
         pin.computeJointJacobians(self.model, self.data, pin.neutral(self.model))
         for i in range(1, joint_count):
             local = pin.getJointJacobian(self.model, self.data, i, pin.ReferenceFrame.LOCAL)
-            subspace = local[:, self.model.joints[i].idx_v]
+            # pinocchio returns one column as a plain vector
+            subspace = local.reshape(6, -1)[:, self.model.joints[i].idx_v]
             self.prismatic[i] = self.model.joints[i].shortname() in PRISMATIC
             self.local_axis[i] = subspace[:3] if self.prismatic[i] else subspace[3:]
         #: position in θ of joint i of pinocchio's tree
@@ -138,7 +139,7 @@ class Kinematics:
             self.end_effector_frame,
             pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
         )
-        columns: Array = jacobian[:, self.order]
+        columns: Array = jacobian.reshape(6, -1)[:, self.order]
         return columns
 
     def end_effector_pose(self, theta: Array) -> pin.SE3:

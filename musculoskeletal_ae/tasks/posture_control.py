@@ -6,12 +6,16 @@ ramped to and then held. A new target, method or network starts a new ramp from 
 moment, so that nothing jumps. T_current is read once, when a method starts: read again and again,
 `second` would raise the tension without end.
 
-While the arm rests, a slow integral may correct what is left (LINEAGE, hysteresis feedback):
+While the arm rests under `proposed`, a slow integral of the estimated error corrects what friction
+and errors of the body image leave (LINEAGE, hysteresis feedback):
 
-    dc/dt = gain (θ_target − θ_estimated),  |c| ≤ CORRECTION,   l_target = ①(θ_target + c, T) + l_comp(T)
+    dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
+    l_target = ①(θ_target + c, T) + l_comp(T)
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +37,14 @@ SETTLING = 0.5  # [s] after a ramp until feedback takes the arm for resting
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
 
 
+class Goal(NamedTuple):
+    """A method, how long it may take [s], and whether it reads T_current anew."""
+
+    method: str
+    duration: float
+    reads: bool = True
+
+
 class PostureControl:
     """Commands muscle lengths towards target postures.
 
@@ -52,16 +64,17 @@ class PostureControl:
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self.stiffness: StiffnessSolution | None = None
         self._exploration: Exploration | None = None
-        self._goals: list[tuple[str, float]] = []
+        self._goals: list[Goal] = []
         self._method = ''
         self._remaining = 0.0
         self._constant: Array = np.full(robot.muscle_count, robot.tension.bias)
-        self._current: Array | None = None
+        self._current: Array = self._constant
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
         self._solution: Solution | None = None
         self._correction: Array = np.zeros(robot.joint_count)
+        self._rested = 0.0
 
     @property
     def exploring(self) -> bool:
@@ -91,11 +104,14 @@ class PostureControl:
         chosen = self._settings
         constant = max(chosen.constant_tension, self._robot.tension.bias)
         self._constant = np.full(self._robot.muscle_count, constant)
-        self._current, self._remaining = None, 0.0
+        self._remaining = 0.0
         self._correction = np.zeros(self._robot.joint_count)
-        self._goals = [(chosen.method, chosen.first_duration)]
+        self._goals = [Goal(chosen.method, chosen.first_duration)]
         if chosen.method == 'second':
-            self._goals = [('first', chosen.first_duration), ('second', chosen.second_duration)]
+            self._goals = [
+                Goal('first', chosen.first_duration),
+                Goal('second', chosen.second_duration),
+            ]
 
     def start_from(self, command: Array) -> None:
         """Continue from a command [m] (M,): at the start, after a stop or another method."""
@@ -121,28 +137,30 @@ class PostureControl:
             return None
         if not self._ramp.done:
             self._command = self._ramp.step(dt)
-        elif self._settings.feedback_gain > 0.0 and self._remaining < -SETTLING:
-            self._correct(theta, dt)
+        else:
+            self._rested += dt
+            if self._rested > SETTLING:
+                self._correct(theta, dt)
         return self._command.copy()
 
     def _solve_again(self) -> None:
         if self._ramp is not None and not self._goals and self._exploration is None:
-            self._goals = [(self._method, self._settings.second_duration)]
+            self._goals = [Goal(self._method, self._settings.second_duration, reads=False)]
 
     def _next_goal(self, tension: Array, limit: Array) -> None:
         if self._exploration is not None and not self._goals:
             planned = self._exploration.next_step()
             self.theta, self._constant = planned.theta, planned.tension
-            self._goals, self._current = [(planned.method, planned.duration)], None
+            self._goals = [Goal(planned.method, planned.duration)]
         if not self._goals or self._mae is None or self.theta is None:
             return
-        self._method, duration = self._goals.pop(0)
-        if self._current is None or self._method == 'second':
+        self._method, duration, reads = self._goals.pop(0)
+        if reads:
             self._current = tension
         self._limit = limit
         goal = self._solve(self._mae, self.theta, self._current, limit)
         self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self._settings.rate_limit)
-        self._remaining = max(duration, self._ramp.duration)
+        self._remaining, self._rested = max(duration, self._ramp.duration), 0.0
 
     def _solve(self, mae: Mae, theta: Array, current: Array, limit: Array) -> Array:
         robot, method = self._robot, self._method
@@ -169,9 +187,12 @@ class PostureControl:
 
     def _correct(self, theta: Array, dt: float) -> None:
         """Shift the commanded lengths so that the estimate comes nearer to the target."""
-        if self._solution is None or self._mae is None or self.theta is None:
+        chosen = self._settings
+        gain = chosen.feedback_gain if self._method == 'proposed' else 0.0
+        # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
+        if self._solution is None or gain == 0.0 or chosen.preset == 'paper':
             return
-        gain = self._settings.feedback_gain
+        assert self._mae is not None and self.theta is not None  # they gave the solution
         correction = self._correction + gain * dt * (self.theta - theta)
         self._correction = np.clip(correction, -CORRECTION, CORRECTION)
         tension, robot = self._solution.tension, self._robot

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user may choose about control: every setting with its meaning, unit and range.
 
-One table for the core and the node: the node declares a parameter for each field here.
+One table for the core and the node, which declares a parameter for each field here.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 PRESETS = ('paper', 'default')
@@ -49,7 +53,7 @@ class Settings:
         0.5, 0.0, 20.0, 'method tension: damping torque [N·m·s/rad]; 0: torque only'
     )
     feedback_gain: float = quantity(
-        0.0, 0.0, 2.0, 'proposed, stiffness: slow correction of a resting error [1/s]; 0: none'
+        0.5, 0.0, 2.0, 'proposed, default: correction of the error at rest [1/s]; 0: none'
     )
     max_age: float = quantity(
         0.2, 0.01, 10.0, 'older muscle_states or estimated_joint_states stop the arm [s]'
@@ -59,3 +63,22 @@ class Settings:
         85.0, 40.0, 200.0, 'a module this hot pulls with T_bias only [°C]'
     )
     joint_stiffness: tuple[float, ...] = ()
+
+
+def read_stiffness(wished: Iterable[Any], joints: int) -> tuple[float, ...]:
+    """Return the wish as `Settings` keeps it; nothing, or a single 0, is all as they come.
+
+    Raises:
+        MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
+    """
+    try:
+        values = tuple(float(value) for value in wished)
+    except (TypeError, ValueError):
+        values = (math.nan,)
+    if values == (0.0,):
+        return ()
+    if len(values) not in (0, joints) or not all(0.0 <= value < math.inf for value in values):
+        raise MusculoskeletalError(
+            f'joint stiffness {wished!r}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
+        )
+    return values

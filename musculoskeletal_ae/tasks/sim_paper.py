@@ -22,7 +22,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.descent import StepSearch, Term, descend
 from musculoskeletal_ae.tasks.length_command import msc_compensation
 from musculoskeletal_ae.tasks.sim_load import Load
-from musculoskeletal_ae.tasks.sim_step import ArmState
+from musculoskeletal_ae.tasks.sim_step import PAID_OUT, ArmState
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class PaperDescent:
         bias = self._robot.tension.bias
         load, _ = self._load(state.theta, wrench)
         length = command - msc_compensation(self._robot, np.maximum(state.tension, bias))
-        slack = state.tension <= bias
+        slack = (state.tension <= bias) | (command == PAID_OUT)
         length = np.where(slack, np.minimum(length, state.length), length)
         rows = [
             self._descend(
@@ -86,6 +86,6 @@ class PaperDescent:
         state = mae.decode(descend(mae, z, terms, SEARCH))
         return (
             np.clip(state.theta, robot.lower, robot.upper),
-            np.clip(state.tension, 0.0, robot.tension.max),
+            np.clip(state.tension, robot.tension.bias, robot.tension.max),
             state.length,
         )

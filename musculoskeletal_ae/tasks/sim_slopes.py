@@ -29,9 +29,7 @@ class Slopes:
     def __init__(self, robot: Robot, mae: Mae) -> None:
         """Fit the cubic over the whole joint range, muscles in the middle of their tensions."""
         joints, muscles = robot.joint_count, robot.muscle_count
-        basis = [
-            term for n in range(4) for term in combinations_with_replacement(range(joints), n)
-        ]
+        basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
         count = POSTURES_PER_COEFFICIENT * len(basis)
         theta = robot.random_postures(count, np.random.default_rng(0))
         middle = 0.5 * (robot.tension.bias + robot.tension.limit)
@@ -67,9 +65,7 @@ class Slopes:
         return jacobian.reshape(count, *self._shape), curvature.reshape(count, joints, joints)
 
 
-def _derivative(
-    basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int
-) -> Array:
+def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:
     """Return the matrices that take coefficients of monomials to those of their ∂/∂θ_d."""
     place = {term: i for i, term in enumerate(target)}
     matrices = np.zeros((joints, len(target), len(basis)))

@@ -28,8 +28,8 @@ from musculoskeletal_ae.tasks.sim_slopes import Slopes
 Array = NDArray[np.float64]
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias
-PAID_OUT = 1e3  # [m]
-VISCOSITY = 2.0  # [N·m·s/rad], B; chosen
+PAID_OUT = np.inf  # [m]
+VISCOSITY = 1.5  # [N·m·s/rad], B; motions then last as long as the emulated arm's (0.7 … 5 tried)
 JOINT_SPEED = 5.0  # [rad/s] or [m/s]; bounds a step, and with it every fault of a network
 MODULE_SPEED = 0.25  # [m/s] at which modules wind, chosen as in the emulator
 
@@ -81,7 +81,8 @@ class QuasiStatics:
         robot, theta, tension = self._robot, state.theta, state.tension
         stiffness, limits = robot.stiffness, robot.tension
         length, pullback = self._mae.lengths_with_pullback(theta, tension)
-        followed = follow(command, state.followed, length, MODULE_SPEED * h)
+        span = (limits.max - limits.bias) / stiffness
+        followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
         # MSC and the elastic unit in series: at rest posture T moves to `wished`, and with the
         # posture by `soft` K G Δθ.
         absolute = robot.routes.length_at_zero + length
@@ -135,10 +136,17 @@ class QuasiStatics:
         return scaled
 
 
-def follow(command: Array, followed: Array, length: Array, most: float) -> Array:
-    """Return the command as far as modules of limited speed have wound, at most `most` [m] on."""
-    known = (command < PAID_OUT) & (followed < PAID_OUT)
-    start = np.where(known, followed, np.where(command < PAID_OUT, length, PAID_OUT))
-    change = np.minimum(np.maximum(command - start, -most), most)
-    reached: Array = np.where(command < PAID_OUT, start + change, PAID_OUT)
-    return reached
+def follow(command: Array, followed: Array, length: Array, span: float, most: float) -> Array:
+    """Return the command as far as modules of limited speed have wound.
+
+    Args:
+        command: l_target [m], shape (N, M).
+        followed: How far they had wound a step before [m], shape (N, M).
+        length: l [m], shape (N, M).
+        span: How far below l a command still adds tension [m].
+        most: What a module winds in a step [m].
+    """
+    reached = followed + np.minimum(np.maximum(command - followed, -most), most)
+    # What lies beyond changes no tension; following it would take as long to come back from.
+    within: Array = np.minimum(np.maximum(reached, length - span), length + most)
+    return within

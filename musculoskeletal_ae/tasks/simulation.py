@@ -10,9 +10,6 @@ equations of preset `default`, `sim_paper` the printed descent.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,12 +17,13 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.sim_paper import PaperDescent
 from musculoskeletal_ae.tasks.sim_step import PAID_OUT, ArmState, QuasiStatics
+from musculoskeletal_ae.tasks.sim_threads import on_all_cores
 
 Array = NDArray[np.float64]
 
 LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
-#: arms whose arrays fit a core's cache together
-CHUNK = 64
+#: arms whose arrays fit into a core's cache together
+CHUNK = 256
 SETTLING_STEP, SETTLING_STEPS = 0.1, 300  # [s], for `settle`
 SETTLED = 1e-6  # [rad] moved in a step
 
@@ -56,7 +54,6 @@ class Simulation:
         self.command: Array = np.full((arms, robot.muscle_count), PAID_OUT)
         self.wrench: Array = np.zeros((arms, 6))
         self.fixed: Array = np.full((arms, robot.joint_count), np.nan)
-        self._pool: ThreadPoolExecutor | None = None
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
 
@@ -73,7 +70,7 @@ class Simulation:
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)
         length = self._mae.lengths(theta, tension)
-        self.state = ArmState(theta, tension, length, self.command, np.zeros_like(theta))
+        self.state = ArmState(theta, tension, length, length, np.zeros_like(theta))
 
     def step(self, dt: float) -> ArmState:
         """Let time pass [s]; return the arms."""
@@ -125,7 +122,5 @@ class Simulation:
                 None if fixed is None else fixed[rows],
             )
 
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(os.cpu_count())
-        parts = list(self._pool.map(advance, range(0, count, CHUNK)))
+        parts = on_all_cores(advance, range(0, count, CHUNK))
         self.state = ArmState(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -73,7 +73,7 @@ def stiffness_model(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Sti
     raw = (around[1 : joints + 1] - around[joints + 1 :]).transpose(1, 2, 0) / (2.0 * STEP)
     levels = np.linspace(robot.tension.bias, robot.tension.limit, LEVELS)
     lengths = mae.lengths(np.tile(theta, (LEVELS, 1)), np.tile(levels[:, None], muscles))
-    cubic = np.polyfit(levels, -lengths, 3)  # (4, M)
+    cubic: Array = np.polyfit(levels, -lengths, 3)  # (4, M)
     return StiffnessModel(
         jacobian=around[0],
         hessian=0.5 * (raw + raw.transpose(0, 2, 1)),
@@ -101,5 +101,4 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
         wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
     """
     torque = robot.kinematics.end_effector_jacobian(theta).T @ wrench
-    turn: Array = np.linalg.solve(stiffness + gravity_gradient(robot, theta), torque)
-    return turn
+    return np.linalg.solve(stiffness + gravity_gradient(robot, theta), torque)

@@ -4,9 +4,9 @@
     τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
     T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
 
-with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the estimate.
-With both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
-floats and keeps no posture.
+with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the estimate,
+smoothed. With both gains zero the arm's weight is carried and `effort` is exerted, nothing more:
+such an arm floats and keeps no posture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from musculoskeletal_ae.tasks.settings import Settings
 
 Array = NDArray[np.float64]
 
-VELOCITY_SMOOTHING = 0.03  # [s] time constant of the low pass on the estimate's velocity
+SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
 
 class TorqueControl:
@@ -40,8 +40,7 @@ class TorqueControl:
     def start_from(self, tension: Array) -> None:
         """Continue from tensions [N] (M,), at the start, after a stop or another method."""
         self._command: Array = np.maximum(tension, self._robot.tension.bias)
-        self._before: Array | None = None
-        self._velocity: Array = np.zeros(self._robot.joint_count)
+        self._smooth: Array | None = None
 
     def step(
         self, mae: Mae, theta: Array, target: Array, effort: Array, limit: Array, dt: float
@@ -56,17 +55,15 @@ class TorqueControl:
             limit: Highest tension of each muscle [N], shape (M,).
             dt: Time since the step before [s].
         """
-        if self._before is not None and dt > 0.0:
-            share = dt / (dt + VELOCITY_SMOOTHING)
-            self._velocity = self._velocity + share * (
-                (theta - self._before) / dt - self._velocity
-            )
-        self._before = theta
+        before = theta if self._smooth is None else self._smooth
+        smooth = before + dt / (dt + SMOOTHING) * (theta - before)
+        self._smooth = smooth
+        velocity = (theta - smooth) / SMOOTHING
         chosen = self._settings
-        torque = self._robot.kinematics.holding_torque(theta) + effort
-        torque = torque + chosen.position_gain * (target - theta)
-        torque = torque - chosen.velocity_gain * self._velocity
-        found = self.exertion(mae, theta, torque, self._command, limit)
+        torque = self._robot.kinematics.holding_torque(smooth) + effort
+        torque = torque + chosen.position_gain * (target - smooth)
+        torque = torque - chosen.velocity_gain * velocity
+        found = self.exertion(mae, smooth, torque, self._command, limit)
         self.missing_torque = found.missing_torque
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
         change = found.tension - self._command

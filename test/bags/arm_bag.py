@@ -42,7 +42,9 @@ class Arm:
         for i in range(count):
             rows = [self.length[i, columns], self.tension[i, columns], np.full(len(columns), 30.0)]
             self.add('/muscle_states', ARRAY, i * PERIOD, array(rows))
-            self.add('/joint_states', JOINTS, i * PERIOD + late, joints(robot.joints, self.theta[i]))
+            self.add(
+                '/joint_states', JOINTS, i * PERIOD + late, joints(robot.joints, self.theta[i])
+            )
 
     def add(self, topic, kind, time, data):
         now = samples.START + round(time * 1e9)

@@ -18,7 +18,6 @@ from musculoskeletal_ae.bags import samples
 _counter = itertools.count(1)
 
 
-
 @pytest.fixture(scope='session')
 def content():
     """Messages on every topic of the interface."""

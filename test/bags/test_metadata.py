@@ -63,7 +63,9 @@ def test_what_is_no_metadata_is_refused(text, bag):
 
 
 def test_metadata_that_refers_to_itself_over_and_over_is_refused_at_once(bag):
-    lines = ['a0: &a0 [x, x]'] + [f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 9)}]' for i in range(1, 40)]
+    lines = ['a0: &a0 [x, x]'] + [
+        f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 9)}]' for i in range(1, 40)
+    ]
     lines.append('rosbag2_bagfile_information: {version: *a39}')
     (bag / 'metadata.yaml').write_text('\n'.join(lines))
     with pytest.raises(BagError, match='version is missing or not of type int'):
@@ -78,7 +80,7 @@ def test_older_versions_are_read(version, bag, content):
 
 def test_a_bag_without_metadata_is_unfinished(bag, content):
     (bag / 'metadata.yaml').unlink()
-    with pytest.raises(UnfinishedBagError, match='metadata.yaml is missing'):
+    with pytest.raises(UnfinishedBagError, match=r'metadata\.yaml is missing'):
         Bag.open(bag)
     assert len(list(Bag.open(bag, unfinished=True).messages())) == len(content)
 

@@ -5,9 +5,10 @@ import math
 
 import pytest
 
-from musculoskeletal_ae.bags import options
-from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, latched_topics
+from musculoskeletal_ae.bags import options, samples
+from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, latched_topics, window
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.exceptions import BagError
 
 SECOND = 1_000_000_000
 
@@ -54,13 +55,31 @@ def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
     assert [message.data for message in found] == [sample.data for sample in content]
 
 
+def test_a_window_lies_within_the_bag(bag, content):
+    opened = Bag.open(bag)
+    first, last = content[0].log_time, content[-1].log_time
+    assert window(opened, 0.0, None) == (first, last)
+    assert window(opened, 0.1, 0.2) == (first + SECOND // 10, first + 3 * SECOND // 10)
+    assert window(opened, 0.5, 100.0) == (first + SECOND // 2, last)
+    with pytest.raises(BagError, match=r'is 0.620 s long; give a smaller --start'):
+        window(opened, 1.0, None)
+
+
 def test_what_was_latched_before_the_start_comes_first(bag, content):
     opened = Bag.open(bag)
-    assert latched_topics(opened) == {'/left_arm/robot_description'}
-    at = next(i for i, s in enumerate(content) if s.topic.endswith('robot_description')) + 25
-    last = [s for s in content[:at] if s.topic.endswith('robot_description')][-1]
-    found = list(lap(opened, opened.topics, content[at].log_time, opened.end))
-    assert [message.data for message in found] == [last.data, *(s.data for s in content[at:])]
+    names = ('anomaly_detected', 'mae_checkpoint', 'robot_description')
+    assert latched_topics(opened) == {f'/left_arm/{name}' for name in names}
+    last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]
+    found = list(lap(opened, opened.topics, content[40].log_time, opened.end))
+    assert sorted(m.data for m in found[:3]) == sorted(sample.data for sample in last)
+    # They are due at once, and do not turn back recorded time.
+    assert {m.log_time for m in found[:3]} == {content[40].log_time - 1}
+    assert [m.data for m in found[3:]] == [sample.data for sample in content[40:]]
+
+
+def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
+    samples.write_mcap(tmp_path / 'a.mcap', content)
+    assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))
 
 
 @pytest.mark.parametrize(
@@ -75,7 +94,11 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
         (options.parse_replay, ['bag', '--topics', ','], 'no topic is named'),
         (options.parse_replay, ['bag', '--robot', 'arm26'], '--robot is for --check'),
         (options.parse_replay, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
-        (options.parse_record, ['--topics', 'muscle_states,nothing'], "'nothing' is none of joint_"),
+        (
+            options.parse_record,
+            ['--topics', 'muscle_states,nothing'],
+            "'nothing' is none of joint_",
+        ),
         (options.parse_record, ['--duration', '0'], 'not a number above 0'),
         (options.parse_record, ['a', '-o', 'b'], 'DIR is given twice'),
         (options.parse_record, ['--compression', 'rar'], 'invalid choice'),

@@ -28,7 +28,7 @@ def expected(content):
 
 
 def test_a_killed_recording_is_unfinished_and_loses_only_the_last_chunk(killed, content):
-    with pytest.raises(UnfinishedBagError, match='not completed.*ends at byte'):
+    with pytest.raises(UnfinishedBagError, match=r'not completed.*ends at byte'):
         Bag.open(killed)
     messages = list(Bag.open(killed, unfinished=True).messages())
     assert [message[:4] for message in messages] == expected(content[:60])
@@ -51,7 +51,7 @@ def test_recovery_into_a_new_directory_leaves_the_original_alone(killed, content
         Bag.open(killed)
 
 
-def test_a_bare_file_is_recovered_beside_it(killed, tmp_path):
+def test_a_bare_file_is_recovered_beside_it(killed):
     bag, count, _ = recover(killed / 'bag_0.mcap')
     assert (bag, count) == (killed / 'bag_0_recovered', 60)
     assert Bag.open(bag).message_count == 60

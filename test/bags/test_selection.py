@@ -44,7 +44,10 @@ def ours(*names):
     ('names', 'namespace'),
     [
         (['/muscle_states', '/sim/joint_states', '/diagnostics'], ''),
-        (['/left_arm/muscle_states', '/left_arm/sim/joint_states', '/diagnostics', '/tf'], '/left_arm'),
+        (
+            ['/left_arm/muscle_states', '/left_arm/sim/joint_states', '/diagnostics', '/tf'],
+            '/left_arm',
+        ),
         (['/a/b/anomaly'], '/a/b'),
         (['/sim/joint_states'], ''),
         (['/sim/joint_states', '/sim/muscle_length_command'], '/sim'),
@@ -59,7 +62,9 @@ def test_the_namespace_is_the_one_that_explains_all_topics(names, namespace):
 
 def test_of_several_namespaces_none_is_guessed():
     names = ['/left/muscle_states', '/right/muscle_states', '/joint_states']
-    with pytest.raises(MusculoskeletalError, match=r'several namespaces: /, /left, /right; .*--from'):
+    with pytest.raises(
+        MusculoskeletalError, match=r'several namespaces: /, /left, /right; .*--from'
+    ):
         recorded_namespace(names)
     assert recorded_namespace(names, '/left') == recorded_namespace(names, 'left/') == '/left'
 

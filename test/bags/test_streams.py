@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
 from numpy.testing import assert_allclose, assert_array_equal
 
+from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
 from musculoskeletal_ae.bags.check import check_bag
 from musculoskeletal_ae.bags.muscle_order import misplaced_muscles
 from musculoskeletal_ae.bags.reader import Bag
@@ -116,7 +116,9 @@ def test_the_check_says_what_is_in_a_bag_and_what_it_fits(arm, tmp_path):
     assert '400 messages, 1.992 s' in text
     assert 'counts: as in the summary, as in metadata.yaml' in text
     assert 'order: no messages in the file are earlier' in text
-    assert any(line.split()[:4] == ['/muscle_states', '200', '100.00', '0.010'] for line in check.lines)
+    assert any(
+        line.split()[:4] == ['/muscle_states', '200', '100.00', '0.010'] for line in check.lines
+    )
     assert 'fits: arm26' in text
 
 

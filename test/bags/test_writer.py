@@ -18,6 +18,8 @@ from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
 
+LATCHED = ('robot_description', 'anomaly_detected', 'mae_checkpoint')
+
 
 @pytest.mark.parametrize('type_name', sorted({topic.type for topic in TOPICS.values()}))
 def test_a_message_of_each_type_comes_back_as_it_was_written(type_name, tmp_path):
@@ -40,10 +42,11 @@ def test_our_types_are_those_of_the_installed_ros_messages():
         if not file.exists():
             pytest.skip('the message packages are not in this environment')
         # As rosbag2 writes it: with comments, constants, defaults and unqualified names.
-        text = file.read_text() + ''.join(
-            f'{"=" * 80}\nMSG: {other}\n{(share / other.split("/")[0] / "msg").joinpath(other.split("/")[1] + ".msg").read_text()}'
-            for other in _contained(type_name)
-        )
+        text = file.read_text()
+        for other in _contained(type_name):
+            package, name = other.split('/')
+            contained = (share / package / 'msg' / f'{name}.msg').read_text()
+            text += f'{"=" * 80}\nMSG: {other}\n{contained}'
         assert not definitions.contradiction(type_name, 'ros2msg', text.encode(), '')
         compared += 1
     assert compared == len({topic.type for topic in TOPICS.values()})
@@ -85,7 +88,7 @@ def test_metadata_says_what_is_in_the_file(bag, content):
         assert topic['message_count'] == count
         (qos,) = entry['offered_qos_profiles']
         assert qos['reliability'] == 'reliable'
-        latched = entry['name'].endswith('robot_description')
+        latched = entry['name'].split('/')[-1] in LATCHED
         assert qos['durability'] == ('transient_local' if latched else 'volatile')
 
 

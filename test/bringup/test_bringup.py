@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from graph import DEADLINE, Graph
+from graph import DEADLINE, Graph, Process
 from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -31,22 +31,14 @@ def environment(tmp_path_factory):
 
 
 def bringup(environment, *arguments):
-    return subprocess.Popen(
-        [str(REPOSITORY / 'bringup.sh'), *arguments],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
+    command = [str(REPOSITORY / 'bringup.sh'), *arguments]
+    return Process('bringup.sh', command, env=environment, start_new_session=True)
 
 
-def left_behind(process):
+def left_behind(run):
     """Return the commands that still run in the session of a bring-up, one a line."""
-    listed = subprocess.run(
-        ['ps', '-ww', '-s', str(process.pid), '-o', 'pid=,args='], capture_output=True, text=True
-    )
-    return listed.stdout.strip()
+    command = ['ps', '-ww', '-s', str(run.process.pid), '-o', 'pid=,args=']
+    return subprocess.run(command, capture_output=True, text=True).stdout.strip()
 
 
 def statuses(output):
@@ -55,21 +47,22 @@ def statuses(output):
 
 def test_a_robot_nobody_saw_before_is_trained_brought_up_and_estimated(environment, tmp_path):
     robot = write_robot(tmp_path / 'other')
-    process = bringup(environment, '--robot', str(robot), '--duration', '5', '--seed', '3')
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    run = bringup(environment, '--robot', str(robot), '--duration', '5', '--seed', '3')
+    output, _ = run.process.communicate(timeout=300)
+    assert run.process.returncode == 0, output
     lines = statuses(output)
     assert len(lines) >= 4, output
     for line in lines:
         assert float(line.group(1)) < 3.0
         assert float(line.group(2)) < 100.0
-    assert left_behind(process) == ''
+    assert left_behind(run) == ''
 
 
 def test_two_arms_share_a_graph_and_ctrl_c_ends_one_cleanly(environment):
     left = bringup(environment, '--robot', 'arm26', '--namespace', 'left_arm')
     right = bringup(environment, '--robot', 'arm26', '--namespace', 'right_arm', '--no-explore')
     graph = Graph()
+    graph.processes += [left, right]
     try:
         for side in ('left_arm', 'right_arm'):
             graph.listen(JointState, f'/{side}/estimated_joint_states')
@@ -80,18 +73,18 @@ def test_two_arms_share_a_graph_and_ctrl_c_ends_one_cleanly(environment):
                 deadline=5 * DEADLINE,
             )
     finally:
+        graph.processes.clear()
         graph.close()
-        for process in (left, right):
-            os.kill(process.pid, signal.SIGINT)
-        outputs = [process.communicate(timeout=DEADLINE)[0] for process in (left, right)]
-    assert [left.returncode, right.returncode] == [130, 130], outputs
-    assert 'Traceback' not in ''.join(outputs)
+        ended = [run.end(signal.SIGINT) for run in (left, right)]
+    assert [status for status, _ in ended] == [130, 130], ended
+    assert not any('Traceback' in output for _, output in ended)
     assert left_behind(left) == left_behind(right) == ''
 
 
 def test_a_cut_muscle_is_detected_and_reset_after_mending(environment):
-    process = bringup(environment, '--robot', 'arm26', '--namespace', 'cut')
+    run = bringup(environment, '--robot', 'arm26', '--namespace', 'cut')
     graph = Graph('/cut')
+    graph.processes.append(run)
     try:
         graph.listen(Bool, 'anomaly_detected', LATCHED)
         graph.listen(JointState, 'estimated_joint_states')
@@ -102,35 +95,39 @@ def test_a_cut_muscle_is_detected_and_reset_after_mending(environment):
         graph.spin(2.5)  # a status line is printed once a second
         assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
         graph.wait(
-            lambda: graph.call(Trigger, 'estimator/reset').success
-            and graph.spin(2.0) is None
-            and not detected[-1].data,
+            lambda: (
+                graph.call(Trigger, 'estimator/reset').success
+                and graph.spin(2.0) is None
+                and not detected[-1].data
+            ),
             'the detection to stay cleared',
         )
     finally:
+        graph.processes.clear()
         graph.close()
-        os.kill(process.pid, signal.SIGTERM)
-        output, _ = process.communicate(timeout=DEADLINE)
+        _, output = run.end()
     assert 'ANOMALY: brachialis' in output
 
 
 def test_a_dead_node_is_named_and_nothing_is_left(environment):
-    process = bringup(environment, '--robot', 'arm26', '--namespace', 'dying')
+    run = bringup(environment, '--robot', 'arm26', '--namespace', 'dying')
     graph = Graph('/dying')
+    graph.processes.append(run)
     try:
         graph.listen(JointState, 'estimated_joint_states')
         graph.wait(lambda: graph.received['estimated_joint_states'], 'the arm', 5 * DEADLINE)
     finally:
+        graph.processes.clear()
         graph.close()
-    victim = next(line for line in left_behind(process).splitlines() if '/estimator ' in line)
+    victim = next(line for line in left_behind(run).splitlines() if '/estimator ' in line)
     os.kill(int(victim.split()[0]), signal.SIGKILL)
-    output, _ = process.communicate(timeout=DEADLINE)
-    assert process.returncode == 1
+    output, _ = run.process.communicate(timeout=DEADLINE)
+    assert run.process.returncode == 1
     assert 'estimator ended with status' in output
     end = time.monotonic() + DEADLINE
-    while left_behind(process) and time.monotonic() < end:
+    while left_behind(run) and time.monotonic() < end:
         time.sleep(0.1)
-    assert left_behind(process) == ''
+    assert left_behind(run) == ''
 
 
 @pytest.mark.parametrize(
@@ -147,7 +144,7 @@ def test_a_dead_node_is_named_and_nothing_is_left(environment):
     ],
 )
 def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments, expected):
-    process = bringup(environment, *arguments)
-    output, _ = process.communicate(timeout=DEADLINE)
-    assert process.returncode == 2
+    run = bringup(environment, *arguments)
+    output, _ = run.process.communicate(timeout=DEADLINE)
+    assert run.process.returncode == 2
     assert expected in output

@@ -30,11 +30,11 @@ def drive(arm, length, seconds):
         arm.step(0.02)
 
 
-def held_posture(robot):
-    """Return a posture in the middle of the range and a command that reaches about there."""
+def held_command(robot):
+    """Return a command that reaches about the middle of the range."""
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, 80.0)
-    return theta, robot.muscle_lengths(theta, tension) - 50.0 / robot.stiffness
+    return robot.muscle_lengths(theta, tension) - 50.0 / robot.stiffness
 
 
 @given(st.floats(0.0, 2000.0), st.floats(20, 300), st.floats(10, 60), st.floats(0, 3e-5))
@@ -48,7 +48,7 @@ def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, st
 
 def test_at_rest_the_muscles_hold_the_weight(robot):
     arm = nominal_arm(robot)
-    _, command = held_posture(robot)
+    command = held_command(robot)
     drive(arm, command, 8.0)
     assert np.abs(arm.velocity).max() < 1e-6
     jacobian = robot.routes.muscle_jacobian(arm.theta)
@@ -59,7 +59,7 @@ def test_at_rest_the_muscles_hold_the_weight(robot):
 
 def test_at_rest_the_modules_follow_muscle_stiffness_control(robot):
     arm = nominal_arm(robot)
-    theta, command = held_posture(robot)
+    command = held_command(robot)
     drive(arm, command, 8.0)
     length = robot.muscle_lengths(arm.theta, arm.tension)
     pull = robot.tension.bias + np.maximum(0.0, robot.stiffness * (length - command))
@@ -68,7 +68,7 @@ def test_at_rest_the_modules_follow_muscle_stiffness_control(robot):
 
 def test_a_force_on_the_hand_and_a_payload_are_carried_by_the_muscles(robot):
     arm = nominal_arm(robot)
-    _, command = held_posture(robot)
+    command = held_command(robot)
     force = np.array([5.0, 0.0, -8.0, 0.0, 0.0, 0.0])
     arm.set_wrench(force)
     drive(arm, command, 8.0)
@@ -86,7 +86,7 @@ def test_a_force_on_the_hand_and_a_payload_are_carried_by_the_muscles(robot):
 
 def test_friction_leaves_hysteresis(robot):
     arm = EmulatedArm(robot, 1)
-    theta, command = held_posture(robot)
+    command = held_command(robot)
     ends = []
     for detour in (0.02, -0.02):
         drive(arm, command + detour, 3.0)
@@ -104,7 +104,7 @@ def test_friction_leaves_hysteresis(robot):
 
 def test_without_commands_the_modules_go_safe_and_pay_out_to_the_bias(robot):
     arm = nominal_arm(robot)
-    _, command = held_posture(robot)
+    command = held_command(robot)
     drive(arm, command, 2.0)
     assert not arm.safe
     assert arm.tension.max() > robot.tension.bias + 10.0
@@ -124,7 +124,7 @@ def test_tension_commands_are_followed_up_to_the_highest_tension(robot):
 
 def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot):
     arm = EmulatedArm(robot, 2)
-    _, command = held_posture(robot)
+    command = held_command(robot)
     drive(arm, command, 2.0)
     arm.set_ruptured([robot.muscles[1]])
     before = arm.sense().length
@@ -143,7 +143,7 @@ def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot):
 
 def test_a_length_offset_shifts_the_reading_and_with_it_the_arm(robot):
     arm = nominal_arm(robot)
-    _, command = held_posture(robot)
+    command = held_command(robot)
     drive(arm, command, 3.0)
     before = arm.theta
     arm.set_length_offset(np.array([0.01, 0, 0, 0, 0, 0]))
@@ -171,7 +171,7 @@ def test_heat_settles_where_the_two_resistors_say(robot):
 
 
 def test_same_seed_same_life(robot):
-    _, command = held_posture(robot)
+    command = held_command(robot)
     lives = []
     for _ in range(2):
         arm = EmulatedArm(robot, 7)
@@ -183,7 +183,7 @@ def test_same_seed_same_life(robot):
 def test_reset_brings_the_arm_back_to_rest(robot):
     arm = EmulatedArm(robot, 3)
     start = arm.theta
-    drive(arm, held_posture(robot)[1], 2.0)
+    drive(arm, held_command(robot), 2.0)
     arm.set_ruptured([robot.muscles[0]])
     arm.step(0.5)
     arm.reset()

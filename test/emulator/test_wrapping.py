@@ -13,24 +13,24 @@ from musculoskeletal_ae.emulator.wrapping import segment_length
 from musculoskeletal_ae.robot.robot import Robot
 
 
-def length(start, end, centre, radius):
+def wire(start, end, radius):
+    """Return length and pulls of a wire past a ball at the origin."""
     leave, arrive = np.zeros(3), np.zeros(3)
-    value = segment_length(
-        np.array(start, float), np.array(end, float), np.array(centre, float), radius, leave, arrive
-    )
-    return value, leave, arrive
+    ends = np.array(start, float), np.array(end, float)
+    return segment_length(*ends, np.zeros(3), radius, leave, arrive), leave, arrive
 
 
-def test_a_wire_over_half_a_ball_is_two_tangents_and_half_a_circle():
-    # From (1, −r) straight up to the ball's side would be tangent at (0, −r): start and end lie
-    # level with the lowest point and the highest one.
-    value, leave, arrive = length([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 0.0], 0.5)
-    assert value == pytest.approx(1.0)  # the straight line misses the ball
-    value, leave, arrive = length([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], [0.0, 0.0, 0.0], 0.5)
-    assert value == pytest.approx(2.0)  # just touching
-    value, leave, arrive = length([1.0, 0.0, 1e-9], [-1.0, 0.0, 1e-9], [0.0, 0.0, 0.0], 0.5)
-    tangent = np.sqrt(1.0 - 0.25)
-    assert value == pytest.approx(2.0 * tangent + 0.5 * (np.pi - 2.0 * np.arccos(0.5)), abs=1e-6)
+@pytest.mark.parametrize(
+    ('start', 'end', 'expected'),
+    [
+        ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # misses the ball
+        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches it
+        # straight at the centre: two tangents and an arc
+        ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
+    ],
+)
+def test_a_wire_is_straight_or_two_tangents_and_an_arc(start, end, expected):
+    assert wire(start, end, 0.5)[0] == pytest.approx(expected)
 
 
 point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
@@ -39,7 +39,7 @@ point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
 @given(point, point, st.floats(0.001, 0.1))
 def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
     straight = np.linalg.norm(np.subtract(end, start))
-    value, leave, arrive = length(start, end, [0.0, 0.0, 0.0], radius)
+    value, leave, arrive = wire(start, end, radius)
     assert value >= straight - 1e-9
     if straight > 1e-6:
         assert np.linalg.norm(leave) == pytest.approx(1.0, abs=1e-4)

@@ -32,7 +32,7 @@ def rows(graph, robot):
     return read_array(graph.next('muscle_states'), 3, robot.muscle_count)
 
 
-def drive(graph, robot, command, condition, what):
+def drive(graph, command, condition, what):
     publisher = graph.publisher(Float64MultiArray, 'muscle_length_command')
 
     def done():
@@ -67,7 +67,6 @@ def test_length_commands_move_it_and_silence_makes_it_safe(arm, arm26):
     command = arm26.muscle_lengths(theta, tension) - 50.0 / arm26.stiffness
     drive(
         arm,
-        arm26,
         command,
         lambda: np.abs(np.array(arm.received['joint_states'][-1].position) - theta).max() < 0.4,
         'the posture',
@@ -134,7 +133,7 @@ def test_bad_commands_do_not_move_it(arm, arm26):
 def test_reset_brings_it_back(arm, arm26):
     command = rows(arm, arm26)[0] - 0.02
     start = np.array(arm.next('joint_states').position)
-    drive(arm, arm26, command, lambda: rows(arm, arm26)[1].max() > 60.0, 'tension')
+    drive(arm, command, lambda: rows(arm, arm26)[1].max() > 60.0, 'tension')
     assert arm.call(Trigger, 'hardware_emulator/reset').success
     np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
 

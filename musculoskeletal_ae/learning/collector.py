@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the stream of messages to samples: rest, novelty, and the gate that anomalies close.
+
+What comes within `MARGIN` before an anomaly is noticed was already wrong; samples and healthy
+messages therefore wait that long before they count.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.learning.healthy import Reservoir
+from musculoskeletal_ae.learning.rest import RestDetector, RestSettings
+from musculoskeletal_ae.learning.sample import Sample
+from musculoskeletal_ae.learning.sliding import SlidingTracker
+from musculoskeletal_ae.learning.store import Novelty, SampleStore
+from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+MARGIN = 2.0  # [s] before a detection and after its reset
+# Beyond these a sensor errs, not the arm.
+OUTSIDE = 0.1  # of the joint's range
+TOO_TENSE = 1.1  # of tension.max
+
+
+class Waiting(NamedTuple):
+    """Something that counts once no anomaly has followed it for MARGIN."""
+
+    time: float
+    tension: Array
+    length: Array
+    sample: Sample | None
+
+
+class Collector:
+    """Steps through the messages and keeps what may be learned.
+
+    Attributes:
+        store: The samples.
+        reservoir: Healthy messages, moving and resting.
+        rejected: Rests that did not become samples, by reason.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        rest: RestSettings | None = None,
+        novelty: Novelty | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Watch `robot`."""
+        self._robot = robot
+        self.store = SampleStore(novelty)
+        self.reservoir = Reservoir(robot.muscle_count, seed)
+        self.rejected: Counter[str] = Counter()
+        self._rest = RestDetector(rest or RestSettings())
+        self._sliding = SlidingTracker(robot.muscle_count)
+        self._waiting: deque[Waiting] = deque()
+        self._time = 0.0
+        self._closed_until = 0.0
+        self._anomaly = False
+
+    def step(
+        self, tension: Array, length: Array, dt: float, theta: Array | None = None
+    ) -> Sample | None:
+        """Take one message of the muscle modules; return a sample that has just been accepted.
+
+        Args:
+            tension: T [N], shape (M,).
+            length: l [m], shape (M,).
+            dt: Time since the message before [s].
+            theta: θ measured at the same time [rad], shape (D,); None without.
+        """
+        self._time += dt
+        sliding = self._sliding.step(length, dt)
+        nothing = np.full(self._robot.joint_count, np.nan)
+        reading = Sample(nothing if theta is None else theta, tension, length, sliding)
+        rest = self._rest.step(reading, theta is not None, dt)
+        if self._anomaly or self._time < self._closed_until:
+            if rest is not None:
+                self.rejected['anomaly'] += 1
+            return None
+        self._waiting.append(Waiting(self._time, tension, length, rest))
+        accepted = None
+        while self._waiting and self._time - self._waiting[0].time >= MARGIN:
+            passed = self._waiting.popleft()
+            self.reservoir.step(passed.tension, passed.length, dt)
+            if passed.sample is not None and self._accept(passed.sample):
+                accepted = passed.sample
+        return accepted
+
+    def _accept(self, sample: Sample) -> bool:
+        reach = self._robot.upper - self._robot.lower
+        beyond = np.maximum(sample.theta - self._robot.upper, self._robot.lower - sample.theta)
+        if (beyond > OUTSIDE * reach).any():
+            self.rejected['θ far outside the joint limits'] += 1
+            return False
+        if (sample.tension > TOO_TENSE * self._robot.tension.max).any():
+            self.rejected['tension beyond the maximum'] += 1
+            return False
+        if not self.store.is_new(sample):
+            self.rejected['like a stored one'] += 1
+            return False
+        self.store.add(sample)
+        return True
+
+    def set_anomaly(self, detected: bool) -> None:
+        """Close the gate on an anomaly, open it some time after the reset."""
+        if detected and not self._anomaly:
+            lost = sum(1 for waiting in self._waiting if waiting.sample is not None)
+            self.rejected['anomaly'] += lost
+            self._waiting.clear()
+        if self._anomaly and not detected:
+            self._closed_until = self._time + MARGIN
+        self._anomaly = detected
+
+    def reset(self) -> None:
+        """Forget what is not a sample yet, as after a backward jump of the clock."""
+        self._rest.reset()
+        self._sliding.reset()
+        self._waiting.clear()

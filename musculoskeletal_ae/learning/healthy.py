@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the detector has to know of a healthy arm: residuals of ② over messages that were fine.
+
+    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · max d over the messages kept
+
+Messages, moving and resting, are kept in a reservoir, a uniform draw from all that ever came; each
+new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
+friction gives d heavy tails, and on a part of the messages that Σ did not see.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.evaluation import residuals
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.tasks.anomaly import DISTANCE
+
+Array = NDArray[np.float64]
+
+CAPACITY = 4000
+SPACING = 0.1  # [s] between messages that are kept
+#: healthy time [s] and samples learned before a detector is worth trusting
+LEAST_TIME, LEAST_SAMPLES = 60.0, 20
+#: threshold over the largest d seen
+MARGIN = 1.6
+#: Σ is mixed with its own diagonal, so that no combination of muscles looks impossible that was
+#: only not seen
+DIAGONAL_SHARE = 0.1
+
+
+class Reservoir:
+    """A uniform draw of bounded size from all healthy messages.
+
+    Attributes:
+        time: Healthy time seen [s].
+    """
+
+    def __init__(self, muscles: int, seed: int = 0, capacity: int = CAPACITY) -> None:
+        """Start empty."""
+        self._rng = np.random.default_rng([seed, 0x4E])
+        self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
+        self._seen = 0
+        self._since = 0.0
+        self.time = 0.0
+
+    def step(self, tension: Array, length: Array, dt: float) -> None:
+        """Take a healthy message."""
+        self._since += dt
+        if self._since < SPACING - 1e-9:
+            return
+        self.time += min(self._since, 2.0 * SPACING)
+        self._since = 0.0
+        capacity = len(self._kept)
+        place = self._seen if self._seen < capacity else int(self._rng.integers(self._seen + 1))
+        if place < capacity:
+            self._kept[place] = np.concatenate([tension, length])
+        self._seen += 1
+
+    def clear(self) -> None:
+        """Forget all, as when the body has changed."""
+        self._seen, self._since, self.time = 0, 0.0, 0.0
+
+    def messages(self) -> NDArray[np.float32]:
+        """Return (T, l) of the messages kept, shape (N, 2M)."""
+        return self._kept[: min(self._seen, len(self._kept))].copy()
+
+
+def calibrate(
+    mae: Mae, messages: NDArray[np.float32], time: float, samples: int
+) -> AnomalyStatistics | None:
+    """Return statistics of a network's residuals, or None where there is too little.
+
+    Args:
+        mae: The network.
+        messages: (T, l) of healthy messages, shape (N, 2M).
+        time: Healthy time they were drawn from [s].
+        samples: How many samples the network has learned.
+    """
+    if len(messages) < 2:
+        return None
+    tension, length = np.split(messages.astype(float), 2, axis=1)
+    error = residuals(mae, tension, length)
+    calibrated = time >= LEAST_TIME and samples >= LEAST_SAMPLES
+    part = AnomalyStatistics.of(error[::2], calibrated)
+    held_out = distances(_regularised(part), error[1::2])
+    statistics = _regularised(AnomalyStatistics.of(error, calibrated))
+    largest = max(float(held_out.max()), float(distances(statistics, error).max()))
+    norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error, 2, axis=1))
+    thresholds = {DISTANCE: MARGIN * largest, 'norm': float(np.max(norm))}
+    return AnomalyStatistics(
+        statistics.mean, statistics.covariance, calibrated, len(error), thresholds
+    )
+
+
+def distances(statistics: AnomalyStatistics, error: Array) -> Array:
+    """Return d of residuals (N, 2M)."""
+    centred = error - statistics.mean
+    squares = np.einsum('ni,ni->n', centred, np.linalg.solve(statistics.covariance, centred.T).T)
+    return np.sqrt(squares)
+
+
+def _regularised(statistics: AnomalyStatistics) -> AnomalyStatistics:
+    covariance = statistics.covariance
+    mixed = (1.0 - DIAGONAL_SHARE) * covariance + DIAGONAL_SHARE * np.diag(np.diag(covariance))
+    return AnomalyStatistics(statistics.mean, mixed, statistics.calibrated, statistics.samples)

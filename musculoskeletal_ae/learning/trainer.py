@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training the network on dreams, a few steps at a time, for as long as the robot lives.
+
+Muon at a constant step size never settles, but the average of its weights does: what is published
+is the average over about the last tenth of all steps, so that the network follows a body that is
+still being found out and becomes calm when it is known.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from musculoskeletal_ae.learning.dream import Dream
+from musculoskeletal_ae.mae.network import Network
+from musculoskeletal_ae.mae.optimisers import Muon
+from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY
+
+Array = NDArray[np.float64]
+
+STEP_SIZE = 2e-3
+BATCH = 128
+#: averaged over this share of the steps so far, but at least and at most so many steps
+AVERAGED_SHARE, LEAST_AVERAGED, MOST_AVERAGED = 0.1, 20.0, 2000.0
+
+
+class Trainer:
+    """Keeps a network, its optimiser and the average of its weights.
+
+    Attributes:
+        network: The average: what is published.
+        steps: Steps taken so far.
+    """
+
+    def __init__(self, network: Network, seed: int = 0, step_size: float = STEP_SIZE) -> None:
+        """Go on from a network's weights."""
+        self.network = network
+        self._restless = copy.deepcopy(network)
+        self._optimiser = Muon(self._restless, MUON_MATRIX_RATIO * step_size, step_size)
+        self._rng = np.random.default_rng([seed, 0x7A])
+        self.steps = 0
+
+    def train(self, data: Dream, steps: int) -> float:
+        """Take steps on batches of a dream; returns the mean loss of the last half of them."""
+        seen = torch.as_tensor(data.seen, dtype=torch.float32)
+        true = torch.as_tensor(data.true, dtype=torch.float32)
+        mask = torch.arange(3).repeat_interleave(BATCH)
+        losses = []
+        for _ in range(steps):
+            rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
+            value = _loss(self._restless, seen[rows], true[rows], mask)
+            value.backward()
+            self._optimiser.step(1.0)
+            self.steps += 1
+            self._average()
+            losses.append(value.item())
+        return float(np.mean(losses[len(losses) // 2 :]))
+
+    def _average(self) -> None:
+        span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
+        with torch.no_grad():
+            for mean, now in zip(self.network.parameters(), self._restless.parameters()):
+                mean.lerp_(now, 1.0 / span)
+
+
+def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
+    """Return the three norms, each in units of the spread of the data, all three masks entered."""
+    error = network.decode_standard(network.encode(seen.repeat(3, 1), mask))
+    error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
+    parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
+    return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

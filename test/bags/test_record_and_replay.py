@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real processes on a real graph."""
+
+from __future__ import annotations
+
+import signal
+import time
+from array import array
+
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+
+from musculoskeletal_ae.bags import samples
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.exceptions import UnfinishedBagError
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def ros(graph, *remaps):
+    return ['--ros-args', '-r', f'__ns:={graph.namespace}', *remaps]
+
+
+def record(tool, graph, out, *options):
+    recorder = tool('record', out, *options, *ros(graph))
+    recorder.wait_for('recording to')
+    return recorder
+
+
+def messages(path, namespace):
+    return [(m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages()]
+
+
+def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
+    content = samples.samples(252, '/left_arm')
+    samples.write_ours(tmp_path / 'first', content, 'zstd', finish=True)
+    for source, out in (('first', 'second'), ('second', 'third')):
+        recorder = record(tool, graph, tmp_path / out)
+        replay = tool('replay', tmp_path / source, '--topics', 'all', '--wait', '20', *ros(graph))
+        output = replay.output()
+        assert replay.process.returncode == 0, output
+        output = recorder.end(signal.SIGINT)
+        assert recorder.process.returncode == 0, output
+        assert 'Traceback' not in output
+    first = messages(tmp_path / 'first', '/left_arm')
+    second = messages(tmp_path / 'second', graph.namespace)
+    # On their way messages are padded to whole words, once and for all.
+    assert second == [(topic, data + bytes(-len(data) % 4)) for topic, data in first]
+    assert messages(tmp_path / 'third', graph.namespace) == second
+    times = [
+        np.array([m.log_time for m in Bag.open(tmp_path / name).messages()])
+        for name in ('second', 'third')
+    ]
+    error = np.abs(np.diff(times[1]) - np.diff(times[0])) / 1e9
+    # A loaded machine delays some messages by more than a player can make good.
+    assert np.median(error) < 0.002
+    assert np.percentile(error, 75) < 0.005
+
+
+def test_a_killed_recorder_loses_at_most_the_last_second(tool, graph, tmp_path):
+    recorder = record(tool, graph, tmp_path / 'bag')
+    latched = graph.publisher(String, 'robot_description', LATCHED)
+    latched.publish(String(data='<robot/>'))
+    publisher = graph.publisher(Float64MultiArray, 'muscle_states')
+    sent, begin = [], time.monotonic()
+    while time.monotonic() - begin < 2.5:
+        sent.append(time.time_ns())
+        publisher.publish(Float64MultiArray(data=array('d', [1.0] * 18)))
+        graph.spin(0.01)
+    recorder.end(signal.SIGKILL)
+    with pytest.raises(UnfinishedBagError):
+        Bag.open(tmp_path / 'bag')
+    bag = Bag.open(tmp_path / 'bag', unfinished=True)
+    found = list(bag.messages([f'{graph.namespace}/muscle_states']))
+    assert sent[-1] - found[-1].publish_time < 1e9
+    assert bag.topics[f'{graph.namespace}/robot_description'].message_count == 1
+
+    kept = [(message.topic, message.data) for message in bag.messages()]
+
+    check = tool('replay', '--check', tmp_path / 'bag')
+    assert 'fault: unfinished: metadata.yaml was not completed' in check.output()
+    assert check.process.returncode == 1
+    recovery = tool('record', '--recover', tmp_path / 'bag')
+    assert f'{bag.message_count} messages recovered to {tmp_path / "bag"}' in recovery.output()
+    assert messages(tmp_path / 'bag', '') == kept
+
+
+def test_the_end_is_recorded_too_and_duration_ends_it(tool, graph, tmp_path):
+    recorder = record(tool, graph, tmp_path / 'bag', '--duration', '2', '--topics', 'anomaly')
+    assert '0 messages recorded' in recorder.output()
+    assert recorder.process.returncode == 0
+    assert Bag.open(tmp_path / 'bag').message_count == 0
+
+
+def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path):
+    content = [s for s in samples.samples(1200, '/l') if s.topic == '/l/muscle_states'][:30]
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    received = graph.listen(Float64MultiArray, 'muscle_states')
+    clock = graph.listen(Clock, '/clock')
+    replay = tool(
+        'replay', tmp_path / 'bag', '--paused', '--clock', '--rate', '20', '--loop', *ros(graph)
+    )
+
+    def now():
+        return clock[-1].clock.sec * 10**9 + clock[-1].clock.nanosec
+
+    graph.wait(lambda: clock, 'a clock')
+    assert not received
+    assert graph.call(Trigger, 'replay/step').success
+    graph.wait(lambda: received, 'the first step')
+    answer = graph.call(Trigger, 'replay/step')
+    assert (answer.success, answer.message) == (True, 'stepped at 0.210000 s')
+    graph.wait(lambda: len(received) == 2, 'the second step')
+    graph.wait(lambda: now() == content[1].log_time, 'the time of the second step')
+    assert graph.call(Trigger, 'replay/resume').success
+    graph.wait(lambda: len(received) > len(content), 'the second lap')
+    assert not graph.call(Trigger, 'replay/step').success
+    times = [c.clock.sec * 10**9 + c.clock.nanosec for c in clock]
+    steps = np.diff(times)
+    assert steps.min() < -0.9 * (content[-1].log_time - content[0].log_time)
+    output = replay.end(signal.SIGINT)
+    assert replay.process.returncode == 0
+    assert 'Traceback' not in output
+
+
+def test_the_clock_ticks_a_hundred_times_in_a_recorded_second(tool, graph, tmp_path):
+    content = samples.samples(200, '/l')
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    clock = graph.listen(Clock, '/clock', 1000)
+    replay = tool('replay', tmp_path / 'bag', '--clock', '--wait', '1', *ros(graph))
+    graph.wait(lambda: replay.process.poll() is not None, 'the end')
+    times = np.array([c.clock.sec * 10**9 + c.clock.nanosec for c in clock])
+    assert np.median(np.diff(times)) <= 1e7
+    assert times[0] < content[5].log_time
+    assert times[-1] > content[-5].log_time
+
+
+def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
+    received = graph.listen(Float64MultiArray, 'muscle_states')
+    replay = tool('replay', bag, '--loop', '--wait', '0', *ros(graph))
+    graph.wait(lambda: received, 'a message')
+    output = replay.end(signal.SIGTERM)
+    assert replay.process.returncode == 0
+    assert 'Traceback' not in output
+    assert 'without --clock' in output
+
+
+def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
+    cases = [
+        (('replay', tmp_path / 'nothing'), 1, 'does not exist'),
+        (('record', bag), 1, 'is not empty; name a new directory'),
+        (('record', '--recover', bag), 1, 'there is nothing to recover'),
+        (('replay', bag, '--rate', '2'), 2, '--rate other than 1 needs --clock'),
+        (('replay', bag, '--start', '100'), 1, 'is 0.620 s long; give a smaller --start'),
+        (('replay', bag, '--ros-args', '-r', 'bad'), 2, "Couldn't parse remap rule"),
+    ]
+    started = [(tool(*arguments), *rest) for arguments, *rest in cases]
+    for one, status, problem in started:
+        lines = [line for line in one.output().splitlines() if '[rcl]' not in line]
+        assert one.process.returncode == status
+        assert len(lines) == 1, lines
+        assert problem in lines[0]
