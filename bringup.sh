@@ -44,6 +44,9 @@ explore=true
 preset=default
 seed=0
 namespace=
+learner=true
+bag=
+recording=
 duration= # until Ctrl-C
 
 while [ $# -gt 0 ]; do
@@ -57,10 +60,11 @@ while [ $# -gt 0 ]; do
   case $1 in
     --robot) robot=$2 && shift ;;
     --checkpoint) checkpoint=$2 && shift ;;
-    --bag | --record) refuse "$1 is not yet available" ;;
+    --bag) bag=$2 && shift ;;
+    --record) recording=$2 && shift ;;
     --explore) explore=true ;;
     --no-explore) explore=false ;;
-    --no-learner) ;; # there is no learner yet
+    --no-learner) learner=false ;;
     --preset) preset=$2 && shift ;;
     --seed) seed=$2 && shift ;;
     --namespace) namespace=$2 && shift ;;
@@ -89,6 +93,14 @@ if [ -n "$checkpoint" ]; then
     refuse "--checkpoint '$checkpoint' is not a file that can be read"
   fi
   checkpoint=$(cd "$(dirname "$checkpoint")" && pwd -P)/$(basename "$checkpoint")
+fi
+if [ -n "$bag" ]; then
+  [ -e "$bag" ] || refuse "--bag '$bag' is neither a bag directory nor an .mcap file"
+  bag=$(cd "$(dirname "$bag")" && pwd -P)/$(basename "$bag")
+fi
+if [ -n "$recording" ]; then
+  [ ! -e "$recording" ] || refuse "--record '$recording' is there already; name a new directory"
+  recording=$(realpath -m "$recording")
 fi
 case $preset in
   default | paper) ;;
@@ -172,7 +184,8 @@ died() { # NAME STATUS
   finish 1
 }
 
-# Watches everything until NAME has ended, and returns its status; any other end is a failure.
+# Watches everything until NAME (or the replayed bag) has ended, and returns its status; any other end
+# is a failure.
 watch_until_ended() { # NAME [SECONDS]
   local name status deadline=${2:+$((SECONDS + $2))}
   while true; do
@@ -186,7 +199,7 @@ watch_until_ended() { # NAME [SECONDS]
         status=0
         wait "${pid_of[$name]}" || status=$?
         unset "pid_of[$name]"
-        [ "$name" = "$1" ] || died "$name" "$status"
+        [ "$name" = "$1" ] || [ "$name $status" = 'replay 0' ] || died "$name" "$status"
         return "$status"
       fi
     done
@@ -236,15 +249,29 @@ quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
 common=(--ros-args --params-file "$repository/config/nodes.yaml"
   -p "robot:=$(quoted "$robot")" -p "preset:=$preset"
   -p "seed:=$seed")
+remap=()
+[ -z "$namespace" ] || remap=(--ros-args -r "__ns:=/$namespace")
 [ -z "$namespace" ] || common+=(-r "__ns:=/$namespace")
 
-start hardware_emulator hardware_emulator "${common[@]}"
+# A recording brings its own time and its own commands: no emulator and no controller.
+if [ -n "$bag" ]; then
+  common+=(-p use_sim_time:=true)
+else
+  start hardware_emulator hardware_emulator "${common[@]}"
+fi
 
 [ -n "$checkpoint" ] || train_once
 common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
 start estimator estimator "${common[@]}"
-start controller controller "${common[@]}" -p "explore:=$explore"
+start sim sim "${common[@]}"
+[ $learner = false ] || start learner learner "${common[@]}"
+[ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"
+if [ -n "$bag" ]; then
+  start replay replay "$bag" --clock "${remap[@]}"
+else
+  start controller controller "${common[@]}" -p "explore:=$explore"
+fi
 
 # The status line. It counts --duration from when estimates arrive, and ends after it.
 seconds=${duration:-0} # 0: without end
@@ -255,6 +282,6 @@ pid_of[bringup_status]=$!
 
 status=0
 watch_until_ended bringup_status ${duration:+$((10#${duration%.*} + 60))} || status=$?
-if [ $status -ne 0 ] || [ -z "$duration" ]; then died bringup_status $status; fi
-say "stopping after $duration s"
+if [ $status -ne 0 ] || [ -z "$duration$bag" ]; then died bringup_status $status; fi
+say stopping
 finish 0

@@ -9,7 +9,17 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
-NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'render', 'sim']
+NODES = [
+    'bringup_status',
+    'controller',
+    'estimator',
+    'hardware_emulator',
+    'learner',
+    'record',
+    'render',
+    'replay',
+    'sim',
+]
 TOOLS = ['calibrate_emulator', 'check_robot', 'fit_series_elastic', 'train']
 
 

@@ -47,3 +47,7 @@ class BagError(MusculoskeletalError):
 
 class UnfinishedBagError(BagError):
     """A recording whose recorder was stopped before it could end the file."""
+
+
+class StateError(MusculoskeletalError):
+    """What a learner keeps on disk cannot be used or written."""

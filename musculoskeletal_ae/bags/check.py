@@ -90,11 +90,13 @@ def _contents(bag: Bag, check: BagCheck) -> None:
     summarised = all(found.summarised for found in bag.scans)
     backward = sum(found.backward for found in bag.scans)
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
+    checked = all(found.checked for found in bag.scans)
     summary = 'as in the summary' if summarised else 'no summary to compare with'
     metadata = 'as in' if bag.metadata and not bag.unfinished else 'no final'
     check.lines += [
         f'{bag.path}: {bag.message_count} messages, {length}',
         f'counts: {summary}, {metadata} metadata.yaml',
+        f'checksums: {"of everything" if checked else "none, or not of everything"}',
         f'order: {backward or "no"} messages in the file are earlier than the one before',
         '',
         f'{"topic":<44} {"messages":>9} {"Hz":>9} {"gap s":>8}  type',

@@ -20,13 +20,14 @@ COMPRESSIONS = ('', 'zstd', 'lz4')
 
 
 class Chunk(NamedTuple):
-    """Content of a chunk and what its head says of it."""
+    """Content of a chunk and what its head says of it; `checked`: it has a checksum."""
 
     start: int
     end: int
     compression: str
     compressed_size: int
     content: bytes
+    checked: bool
 
 
 def read_chunk(record: bytes) -> Chunk:
@@ -56,7 +57,7 @@ def read_chunk(record: bytes) -> Chunk:
     # A CRC of 0 says that the recorder computed none.
     if crc and zlib.crc32(content) != crc:
         raise ValueError('the checksum of the chunk does not fit')
-    return Chunk(start, end, compression, length, content)
+    return Chunk(start, end, compression, length, content, crc != 0)
 
 
 def _decompress(data: bytes, compression: str, size: int) -> bytes:

@@ -10,7 +10,8 @@ import math
 from collections.abc import Collection, Iterator
 from itertools import chain
 
-from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.order import BagMessage
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import TOPICS, interface_name
 from musculoskeletal_ae.exceptions import BagError
 

@@ -21,6 +21,8 @@ from musculoskeletal_ae.bags.records import DAMAGED
 from musculoskeletal_ae.bags.scan import Scan, scan
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 
+# Recorders may write checksums at the end only, or none.
+UNCHECKED = 'no checksum protects what is left'
 # Recorders differ in whether the first message or the earliest one starts the bag.
 _TIME_TOLERANCE = 1_000_000_000  # [ns]
 
@@ -163,6 +165,8 @@ class Bag:
     def _add(self, found: Scan) -> None:
         self.scans.append(found)
         if found.cut is not None:
+            if not found.checked:
+                self.unfinished.append(f'{found.path.name}: {UNCHECKED}')
             self.unfinished.append(
                 f'{found.path.name} ends at byte {found.size}, within or before the record that '
                 f'begins at byte {found.cut}'

@@ -35,6 +35,7 @@ class Scan:
         blocks: Where the messages are.
         backward: How many messages have an earlier log time than the one before them.
         cut: Where the incomplete last record begins; None in a file that was ended properly.
+        checked: Whether checksums cover all messages.
         summarised: Whether the counts were compared with the file's own statistics.
     """
 
@@ -45,6 +46,7 @@ class Scan:
     blocks: list[Block]
     backward: int
     cut: int | None
+    checked: bool
     summarised: bool
 
 
@@ -67,6 +69,7 @@ class _Scanner:
         self._records = records
         self._channels = Channels()
         self._blocks = Blocks(self._channels)
+        self._checked = True
         self._summary = Summary(records.path, self._channels, self._blocks.counts)
 
     def run(self) -> Scan:
@@ -93,6 +96,7 @@ class _Scanner:
             self._blocks.found,
             self._blocks.backward,
             cut,
+            self._checked,
             summarised,
         )
 
@@ -117,6 +121,7 @@ class _Scanner:
                 # A checksum of 0 says that the recorder computed none.
                 if claimed not in (0, crc):
                     raise self._damaged(record, 'the checksum of all data before does not fit')
+                self._checked |= claimed != 0
                 return
             if record.opcode == Opcode.ATTACHMENT:
                 self._summary.attachments += 1
@@ -131,9 +136,11 @@ class _Scanner:
     def _take(self, record: Record, content: bytes) -> None:
         if record.opcode == Opcode.CHUNK:
             chunk, length = read_chunk(content), self._records.offset - record.offset
+            self._checked &= chunk.checked
             self._blocks.add_chunk(record.offset, length, chunk)
             self._summary.add_chunk(record.offset, length, chunk)
         elif record.opcode == Opcode.MESSAGE:
+            self._checked = False
             self._blocks.add_message(record, content, self._records.offset)
         elif record.opcode == Opcode.MESSAGE_INDEX:
             self._blocks.compare_index(content)

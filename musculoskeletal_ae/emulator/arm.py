@@ -18,11 +18,12 @@ Array = NDArray[np.float64]
 
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
 
-# Sensors; chosen: noise is one standard deviation, then rounded to the resolution.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0 * np.pi / 2**14  # [rad]
-LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 5.0e-5  # [m]
-TENSION_NOISE, TENSION_RESOLUTION = 1.0, 0.1  # [N]
-TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 0.1  # [°C]
+# Sensors; chosen: noise is one standard deviation, then rounded to the
+# resolution, a power of two as a converter's counts are.
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
 
 

@@ -55,9 +55,9 @@ class ControlLoop:
             self.core.estimated(theta, self.now)
             self.command = self.core.step(self.now)
             if self.command is not None:
-                follow = self.arm.command_length
-                if self.command.kind != LENGTH:
-                    follow = self.arm.command_tension
-                follow(self.command.value)
+                if self.command.kind == LENGTH:
+                    self.arm.command_length(self.command.value)
+                else:
+                    self.arm.command_tension(self.command.value)
             self.arm.step(PERIOD)
             self.now += PERIOD

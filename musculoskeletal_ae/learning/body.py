@@ -60,12 +60,12 @@ class Layout:
 
     @property
     def offset(self) -> int:
-        """o [m]."""
+        """O [m]."""
         return 3 * len(self.points) + 4
 
     @property
     def rest(self) -> slice:
-        """v [m]."""
+        """V [m]."""
         return slice(3 * len(self.points) + 5, self.size)
 
 

@@ -24,6 +24,8 @@ FREEDOM = 4.0  # of the Student distribution
 ROUNDS = 6  # of Gauss–Newton per fit
 SHORTEST = 0.05  # share of a Gauss–Newton step that is still tried
 FIRST_NOISE = 0.002  # [m], before anything is known
+#: samples from before a muscle changed that are enough to start from what they said
+LEAST_ANCHOR = 8
 #: residuals beyond this many σ say that a sample does not fit the body
 OUTLIER = 6.0
 
@@ -67,6 +69,10 @@ class Prior:
         return mean
 
 
+#: of a muscle that was replaced or re-wired, around what it was before
+REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
+
+
 @dataclass(frozen=True)
 class Observations:
     """N samples at rest.
@@ -105,32 +111,41 @@ class Fit:
     weight: Array
 
 
-def fit_body(
-    body: CorrectedBody, seen: Observations, prior: Prior, rounds: int = ROUNDS
-) -> Fit:
+def fit_body(body: CorrectedBody, seen: Observations, prior: Prior, rounds: int = ROUNDS) -> Fit:
     """Fit the parameters of a body in place.
 
     Args:
         body: Starts from its present parameters.
         seen: The samples.
-        prior: What is known without any.
+        prior: What is known without any. A muscle with samples that say nothing about it any more
+            was changed: what they said is where its new parameters are looked for.
         rounds: Gauss–Newton steps.
     """
     poses = body.poses(seen.theta)
-    parts = [
-        _fit_muscle(body, poses, seen, prior, rounds, m) for m in range(body.robot.muscle_count)
-    ]
+    parts = []
+    for m, layout in enumerate(body.layouts):
+        known, mean, spread = seen.known[:, m], prior.mean(layout), prior.spread(layout)
+        if (~known).sum() >= LEAST_ANCHOR:
+            _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, rounds, m)
+            mean, spread = body.parameters[m], REOPENED.spread(layout)
+        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, prior.noise, rounds, m))
     residual, noise, weight = zip(*parts, strict=True)
     return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
 
 
 def _fit_muscle(
-    body: CorrectedBody, poses: JointPoses, seen: Observations, prior: Prior, rounds: int, m: int
+    body: CorrectedBody,
+    poses: JointPoses,
+    seen: Observations,
+    used: NDArray[np.bool_],
+    mean: Array,
+    spread: Array,
+    least_noise: float,
+    rounds: int,
+    m: int,
 ) -> tuple[Array, float, Array]:
-    layout = body.layouts[m]
-    precision = 1.0 / prior.spread(layout) ** 2
-    mean = prior.mean(layout)
-    known = seen.known[:, m].astype(float)
+    precision = 1.0 / spread**2
+    known = used.astype(float)
     noise, weight = FIRST_NOISE, known
     data = poses, seen.theta, seen.tension[:, m], seen.sliding[:, m]
     length, jacobian = body.linearised(*data, m)
@@ -143,10 +158,10 @@ def _fit_muscle(
             curvature = weighted.T @ jacobian
             normal = curvature + np.diag(precision)
             found = np.linalg.solve(normal, weighted.T @ target + precision * mean)
-            used = np.trace(np.linalg.solve(normal, curvature))
-            freedom = max(1.0, float(known.sum() - used))
+            determined = np.trace(np.linalg.solve(normal, curvature))
+            freedom = max(1.0, float(known.sum() - determined))
             residual = target - jacobian @ found
-            noise, weight = _noise_and_weight(residual, known, noise, freedom, prior.noise)
+            noise, weight = _noise_and_weight(residual, known, noise, freedom, least_noise)
 
         def cost(values: Array, length: Array) -> float:
             misfit = weight @ (seen.length[:, m] - length) ** 2 / noise**2
@@ -164,7 +179,7 @@ def _fit_muscle(
             length, jacobian = body.linearised(*data, m)
             break
     residual = seen.length[:, m] - length
-    noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), prior.noise)
+    noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
     return residual, noise, weight
 
 
@@ -173,5 +188,5 @@ def _noise_and_weight(
 ) -> tuple[float, Array]:
     """One step of the EM algorithm for the scale and weights of a Student distribution."""
     weight = known * (FREEDOM + 1.0) / (FREEDOM + (residual / noise) ** 2)
-    variance = (weight @ residual**2 + 4*least**2) / (freedom+4)
+    variance = (weight @ residual**2 + 4.0 * least**2) / (freedom + 4.0)
     return max(least, float(np.sqrt(variance))), weight

@@ -119,6 +119,17 @@ class Collector:
             self._closed_until = self._time + MARGIN
         self._anomaly = detected
 
+    def relearn(self, muscle: int, newest: int = 0) -> None:
+        """Let older samples say nothing about a muscle; its healthy residuals are unknown again."""
+        self.store.forget(muscle, newest)
+        self.reservoir.clear()
+
+    def clear(self) -> None:
+        """Forget everything learned."""
+        self.store.clear()
+        self.reservoir.clear()
+        self.reset()
+
     def reset(self) -> None:
         """Forget what is not a sample yet, as after a backward jump of the clock."""
         self._rest.reset()

@@ -95,6 +95,25 @@ def calibrate(
     )
 
 
+def recalibrate(
+    mae: Mae,
+    before: AnomalyStatistics | None,
+    messages: NDArray[np.float32],
+    time: float,
+    samples: int,
+) -> AnomalyStatistics | None:
+    """Return statistics of a network's residuals that are at least as trusted as those before.
+
+    After a restart the messages are few, and the calibrated statistics of the network that was
+    saved serve its successors until there are enough. Arguments as `calibrate`.
+    """
+    found = calibrate(mae, messages, time, samples)
+    keep = before is not None and before.calibrated
+    if found is None or (keep and not found.calibrated):
+        return before
+    return found
+
+
 def distances(statistics: AnomalyStatistics, error: Array) -> Array:
     """Return d of residuals (N, 2M)."""
     centred = error - statistics.mean

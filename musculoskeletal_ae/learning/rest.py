@@ -117,7 +117,7 @@ def _unmoved(halves: list[Array], allowed: float) -> bool:
     difference = np.abs(second.mean(axis=0) - first.mean(axis=0))
     if (difference <= allowed).all():
         return True
-    # The scatter about each half's own slope would be better still; neighbours' differences will do.
+    # Taken from neighbours' differences, which a slow drift hardly enters.
     error = sum(
         np.square(np.diff(half, axis=0)).mean(axis=0) / (2.0 * len(half))
         for half in halves

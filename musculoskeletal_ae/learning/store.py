@@ -74,10 +74,16 @@ class SampleStore:
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
 
+    def clear(self) -> None:
+        """Forget all samples."""
+        self.samples.clear()
+        self.known.clear()
+        self.accepted = 0
+
     def observations(self) -> Observations:
         """Return all samples as arrays."""
-        columns = (np.array(column) for column in zip(*self.samples, strict=True))
-        return Observations(*columns, known=np.array(self.known))
+        theta, tension, length, sliding = map(np.array, zip(*self.samples, strict=True))
+        return Observations(theta, tension, length, sliding, np.array(self.known))
 
     def _scaled(self, sample: Sample) -> Array:
         return np.concatenate(

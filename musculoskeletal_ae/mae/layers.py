@@ -16,7 +16,7 @@ Layer = tuple[Array, Array]
 
 
 class Activation(NamedTuple):
-    """An activation h(x), which may overwrite x, and (h, h') together, which does not."""
+    """An activation h(x), and (h, h') together; both may overwrite x."""
 
     value: Callable[[Array], Array]
     with_slope: Callable[[Array], tuple[Array, Array]]
@@ -28,8 +28,9 @@ def _tanh(x: Array) -> Array:
 
 
 def _tanh_slope(x: Array) -> tuple[Array, Array]:
-    h = np.tanh(x)
-    return h, 1.0 - h * h
+    h = np.tanh(x, out=x)
+    slope = h * h
+    return h, np.subtract(1.0, slope, out=slope)
 
 
 def _silu(x: Array) -> Array:
@@ -42,9 +43,16 @@ def _silu(x: Array) -> Array:
 
 
 def _silu_slope(x: Array) -> tuple[Array, Array]:
-    sigmoid = 0.5 * (1.0 + np.tanh(0.5 * x))
+    # h = x σ and h' = σ + h − h σ, in three arrays: a batch then stays in the cache.
+    sigmoid = 0.5 * x
+    np.tanh(sigmoid, out=sigmoid)
+    sigmoid *= 0.5
+    sigmoid += 0.5
     h = x * sigmoid
-    return h, sigmoid + h * (1.0 - sigmoid)
+    np.multiply(h, sigmoid, out=x)
+    sigmoid += h
+    sigmoid -= x
+    return h, sigmoid
 
 
 ACTIVATIONS = {
@@ -78,14 +86,17 @@ def run_with_pullback(
     """Return the output and the function that maps a gradient by it to one by x."""
     slopes = []
     for weight, bias in layers[:-1]:
-        x, slope = activation.with_slope(x @ weight + bias)
+        x = x @ weight
+        x += bias
+        x, slope = activation.with_slope(x)
         slopes.append(slope)
     last, last_bias = layers[-1]
 
     def pullback(gradient: Array) -> Array:
         gradient = gradient @ last.T
         for (weight, _), slope in zip(layers[-2::-1], slopes[::-1], strict=True):
-            gradient = (gradient * slope) @ weight.T
+            gradient *= slope
+            gradient = gradient @ weight.T
         return gradient
 
     return x @ last + last_bias, pullback

@@ -18,12 +18,13 @@ class RecordedClock:
     """Publishes the recorded time on /clock at a steady rate.
 
     Attributes:
+        publisher: Of /clock.
         next_tick: When the steady clock [s] calls for the next message.
     """
 
     def __init__(self, node: Node, rate: float) -> None:
         """Advertise /clock for a replay at a rate."""
-        self._publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
+        self.publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
         self._period = max(PERIOD / max(rate, 1.0), SHORTEST_PERIOD)
         self.next_tick = -math.inf
 
@@ -32,4 +33,4 @@ class RecordedClock:
         if now >= self.next_tick:
             self.next_tick = now + self._period
             seconds, nanoseconds = divmod(recorded, 1_000_000_000)
-            self._publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+            self.publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
-muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected.
+muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected;
+marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import math
 import time
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.nodes.messages import QUANTITIES, array_message, read_array
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.nodes.messages import QUANTITIES, array_message, read_array, read_pose
 from musculoskeletal_ae.nodes.shell import (
     ERROR,
     LATCHED,
@@ -26,12 +29,15 @@ from musculoskeletal_ae.nodes.shell import (
     number,
     run,
 )
+from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.tasks.anomaly import AnomalyDetector, Verdict
 
 # Commands older than this no longer say what the modules do.
 COMMAND_AGE = 0.5  # [s]
 # A pause in the messages counts as at most this much of a muscle's time without tension.
 LONGEST_PERIOD = 0.1  # [s]
+# A marker that the arm cannot reach to within these is another one, or its calibration is off.
+MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 
 
 class Estimator(Shell):
@@ -64,6 +70,9 @@ class Estimator(Shell):
         self.listen(Float64MultiArray, 'muscle_states', self._estimate, SENSOR)
         self.listen(Float64MultiArray, 'muscle_length_command', self._length_command, RELIABLE)
         self.listen(Float64MultiArray, 'muscle_tension_command', self._tension_command, RELIABLE)
+        self.theta = 0.5 * (self.robot.lower + self.robot.upper)
+        self.vision_publisher = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
+        self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
         self.create_service(Trigger, 'estimator/reset', self._reset)
 
     def _set_threshold(self, value: float) -> None:
@@ -86,6 +95,7 @@ class Estimator(Shell):
         if now - self.command_arrival > COMMAND_AGE:
             self.detector.commanded_length(None)
         state = self.mae.estimate(tension, length)
+        self.theta = state.theta
         self.verdict = self.detector.step(state, tension, length, dt)
         joints = JointState(name=self.robot.joints, position=state.theta.tolist())
         joints.header.stamp = self.get_clock().now().to_msg()
@@ -98,6 +108,17 @@ class Estimator(Shell):
             self.cause = f'{suspect}: {self.verdict.cause}'
             self.get_logger().warning(f'anomaly detected: {self.cause}')
             self.detected_publisher.publish(Bool(data=True))
+
+    def _see(self, message: PoseStamped) -> None:
+        pose = read_pose(message, self.robot.root_link)
+        found = inverse_kinematics(self.robot, pose, self.theta)
+        if found.distance > MARKER_DISTANCE or found.angle > MARKER_ANGLE:
+            raise MessageError(
+                'out of reach', f'{found.distance:.3f} m and {found.angle:.2f} rad are left'
+            )
+        joints = JointState(name=self.robot.joints, position=found.theta.tolist())
+        joints.header.stamp = message.header.stamp
+        self.vision_publisher.publish(joints)
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True

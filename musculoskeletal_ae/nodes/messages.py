@@ -11,7 +11,8 @@ from array import array
 from collections.abc import Sequence
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000
+
+UNIT_TOLERANCE = 0.01  # of a quaternion's length
 
 QUANTITIES = ('length', 'tension', 'temperature')
 
@@ -131,3 +134,20 @@ def read_wrench(message: WrenchStamped, root_link: str) -> Array:
     if not np.isfinite(wrench).all():
         raise MessageError('not finite', 'a force or torque')
     return wrench
+
+
+def read_pose(message: PoseStamped, frame: str) -> pin.SE3:
+    """Return the pose of a message that is given in `frame`.
+
+    Raises:
+        MessageError: If it is given in another frame, not finite, or without an orientation.
+    """
+    if message.header.frame_id != frame:
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
+    position, turn = message.pose.position, message.pose.orientation
+    values = np.array([turn.x, turn.y, turn.z, turn.w, position.x, position.y, position.z])
+    if not np.isfinite(values).all():
+        raise MessageError('not finite', 'a position or orientation')
+    if abs(np.linalg.norm(values[:4]) - 1.0) > UNIT_TOLERANCE:
+        raise MessageError('not a unit quaternion', str(values[:4]))
+    return pin.XYZQUATToSE3(np.concatenate([values[4:], values[:4]]))

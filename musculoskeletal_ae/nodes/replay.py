@@ -10,7 +10,7 @@ from argparse import Namespace
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
@@ -29,11 +29,7 @@ SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Replay(Node):
@@ -65,19 +61,20 @@ class Replay(Node):
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
             self._timeline.pause(time.monotonic())
-        self.create_service(Trigger, 'replay/pause', self._pause)
-        self.create_service(Trigger, 'replay/resume', self._resume)
-        self.create_service(Trigger, 'replay/step', self._step)
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
 
-    def wait_for_subscribers(self, longest: float) -> None:
-        """Wait until every topic has a subscriber, at most so long [s]."""
+    def get_ready(self, longest: float) -> None:
+        """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
         end = time.monotonic() + longest
-        topics = self._publisher.values()
+        topics = list(self._publisher.values())
+        if self._recorded_clock:
+            topics.append(self._recorded_clock.publisher)
         while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)
+        for name, serve in (('pause', self._pause), ('resume', self._resume), ('step', self._step)):
+            self.create_service(Trigger, f'replay/{name}', serve)
 
     def play(self, progress: tqdm) -> None:
         """Publish everything once, from start to stop."""
@@ -133,7 +130,6 @@ class Replay(Node):
         return self._answer(response, 'playing')
 
     def _step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Publish all messages of the next recorded time."""
         if not self._timeline.paused:
             response.success, response.message = False, 'not paused: call replay/pause first'
             return response
@@ -159,24 +155,20 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     node = Replay(bag, names, options)
     bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
     with tqdm(total=(stop - start) / 1e9, bar_format=bar, disable=None, leave=False) as progress:
-        node.wait_for_subscribers(options.wait)
+        node.get_ready(options.wait)
         (node.play_again_and_again if options.loop else node.play)(progress)
     node.acknowledge()
     return 0
 
 
-def _check(options: Namespace) -> int:
-    # The robot's model takes a second to load, which playing does not need.
-    from musculoskeletal_ae.bags.check import check_bag
-
-    check = check_bag(options.bag, options.robot, options.from_namespace)
-    print(check)
-    return 1 if check.faults else 0
-
-
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.check:
-        return _check(options)
+        # The robot's model takes a second to load, which playing does not need.
+        from musculoskeletal_ae.bags.check import check_bag
+
+        check = check_bag(options.bag, options.robot, options.from_namespace)
+        print(check)
+        return 1 if check.faults else 0
     try:
         return _replay(options, arguments)
     except KeyboardInterrupt:

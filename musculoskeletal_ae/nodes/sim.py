@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `sim`: the learnt body as an arm that follows the same command as the real one.
 
-muscle_length_command → sim/joint_states, sim/muscle_states, sim/markers; with as_robot:=true
-joint_states, muscle_states and robot_description instead, so that it takes the robot's place. Pushed
-by sim/external_wrench, held by sim/fixed_joint_states. The last command holds until the next one;
-before the first, muscles are at T_bias. It does not follow muscle_tension_command and knows no heat:
-modules are at 25 °C.
+muscle_length_command → sim/joint_states, sim/muscle_states, sim/markers; with as_robot:=true it
+takes the robot's place: joint_states, muscle_states, robot_description, sim/markers. It is pushed by
+sim/external_wrench and held by sim/fixed_joint_states. A command holds until the next one; before
+the first, muscles are at T_bias. muscle_tension_command is not followed, and modules stay at 25 °C.
 """
 
 from __future__ import annotations

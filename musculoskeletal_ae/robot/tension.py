@@ -111,7 +111,7 @@ def _solve(
     quadratic: Array, linear: Array, constraints: Array, bounds: Array, equalities: int
 ) -> Array:
     # quadprog answers a NaN with zeros, as if all were well.
-    if not (np.isfinite(constraints).all() and np.isfinite(bounds).all()):
+    if not all(np.isfinite(part).all() for part in (linear, constraints, bounds)):
         raise InfeasibleError('a muscle Jacobian or torque is not finite')
     try:
         solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)

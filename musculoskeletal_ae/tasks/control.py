@@ -79,16 +79,23 @@ def proposed_paper(robot: Robot, mae: Mae, theta: Array, torque: Array, tension:
 
     It knows no limits; what it leaves of the torque is its own choice and not reported as missing.
     """
+    terms = paper_terms(robot, mae, theta, torque, tension)
+    z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
+    state = mae.decode(z)
+    length = state.length + msc_compensation(robot, state.tension)
+    return Solution(length, state.tension, np.zeros(robot.joint_count))
+
+
+def paper_terms(
+    robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
+) -> tuple[Term, ...]:
+    """Return the three terms of L_control, with G at (θ_target, T_current)."""
     joints, muscles = robot.joint_count, robot.muscle_count
     jacobian = mae.muscle_jacobian_difference(theta, tension)
     rows = np.eye(joints + 2 * muscles)
     pull = rows[joints : joints + muscles]
-    terms = (
+    return (
         Term(TENSION_WEIGHT, pull, np.zeros(muscles)),
         Term(POSTURE_WEIGHT, rows[:joints], theta),
         Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque),
     )
-    z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
-    state = mae.decode(z)
-    length = state.length + msc_compensation(robot, state.tension)
-    return Solution(length, state.tension, np.zeros(joints))

@@ -147,7 +147,8 @@ class Controller:
 
     def step(self, now: float) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded."""
-        dt = min(max(now - self.stepped_at, 0.0), LONGEST_STEP)
+        since = now - self.stepped_at if self.stepped_at > -math.inf else 0.0
+        dt = min(max(since, 0.0), LONGEST_STEP)
         self.stepped_at = now
         muscles, cause = self._muscles, self.present_cause(now)
         if muscles is None:

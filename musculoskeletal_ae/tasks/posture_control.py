@@ -6,11 +6,7 @@ ramped to and then held. A new target, method or network starts a new ramp from 
 moment, so that nothing jumps. T_current is read once, when a method starts: read again and again,
 `second` would raise the tension without end.
 
-While the arm rests under `proposed`, a slow integral of the estimated error corrects what friction
-and errors of the body image leave (LINEAGE, hysteresis feedback):
-
-    dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
-    l_target = ①(θ_target + c, T) + l_comp(T)
+While the arm rests under `proposed`, `feedback` corrects what friction leaves.
 """
 
 from __future__ import annotations
@@ -25,6 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks import control
 from musculoskeletal_ae.tasks.control import Solution
 from musculoskeletal_ae.tasks.exploration import RAMP_SHARE, Exploration
+from musculoskeletal_ae.tasks.feedback import RestFeedback
 from musculoskeletal_ae.tasks.length_command import first_command, geometric_command
 from musculoskeletal_ae.tasks.ramp import Ramp
 from musculoskeletal_ae.tasks.settings import Settings
@@ -32,8 +29,6 @@ from musculoskeletal_ae.tasks.stiffness_control import StiffnessSolution, stiffn
 
 Array = NDArray[np.float64]
 
-CORRECTION = 0.3  # [rad] at most, by feedback
-SETTLING = 0.5  # [s] after a ramp until feedback takes the arm for resting
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
 
 
@@ -52,7 +47,9 @@ class PostureControl:
         theta: θ_target [rad], shape (D,), or None before the first target.
         effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
         missing_torque: What the last goal cannot deliver [N·m], shape (D,).
+        solution: Lengths and tensions of the last goal of `proposed` or `stiffness`, or None.
         stiffness: What the last goal of `stiffness` expects, or None.
+        feedback: Correction of the error at rest.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -72,9 +69,8 @@ class PostureControl:
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
-        self._solution: Solution | None = None
-        self._correction: Array = np.zeros(robot.joint_count)
-        self._rested = 0.0
+        self.solution: Solution | None = None
+        self.feedback = RestFeedback(robot.joint_count)
 
     @property
     def exploring(self) -> bool:
@@ -105,7 +101,7 @@ class PostureControl:
         constant = max(chosen.constant_tension, self._robot.tension.bias)
         self._constant = np.full(self._robot.muscle_count, constant)
         self._remaining = 0.0
-        self._correction = np.zeros(self._robot.joint_count)
+        self.feedback.reset()
         self._goals = [Goal(chosen.method, chosen.first_duration)]
         if chosen.method == 'second':
             self._goals = [
@@ -138,14 +134,14 @@ class PostureControl:
         if not self._ramp.done:
             self._command = self._ramp.step(dt)
         else:
-            self._rested += dt
-            if self._rested > SETTLING:
-                self._correct(theta, dt)
+            self._correct(theta, dt)
         return self._command.copy()
 
     def _solve_again(self) -> None:
         if self._ramp is not None and not self._goals and self._exploration is None:
             self._goals = [Goal(self._method, self._settings.second_duration, reads=False)]
+            if self._ramp.done:
+                self._remaining = 0.0
 
     def _next_goal(self, tension: Array, limit: Array) -> None:
         if self._exploration is not None and not self._goals:
@@ -159,13 +155,16 @@ class PostureControl:
             self._current = tension
         self._limit = limit
         goal = self._solve(self._mae, self.theta, self._current, limit)
+        if self.solution is not None:
+            goal = goal + self.feedback.shift(self._mae, self.theta, self.solution.tension)
         self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self._settings.rate_limit)
-        self._remaining, self._rested = max(duration, self._ramp.duration), 0.0
+        self._remaining = max(duration, self._ramp.duration)
+        self.feedback.moving()
 
     def _solve(self, mae: Mae, theta: Array, current: Array, limit: Array) -> Array:
         robot, method = self._robot, self._method
         self.missing_torque = np.zeros(robot.joint_count)
-        self._solution = self.stiffness = None
+        self.solution = self.stiffness = None
         if method == 'geometric':
             return geometric_command(robot, theta)
         if method in ('first', 'second'):
@@ -177,25 +176,21 @@ class PostureControl:
             wish = np.zeros(robot.joint_count)
             wish[: len(self._settings.joint_stiffness)] = self._settings.joint_stiffness
             self.stiffness = stiffness_command(robot, mae, theta, torque, wish, limit)
-            self._solution = self.stiffness.command
+            self.solution = self.stiffness.command
         elif self._settings.preset == 'paper':
-            self._solution = control.proposed_paper(robot, mae, theta, torque, current)
+            self.solution = control.proposed_paper(robot, mae, theta, torque, current)
         else:
-            self._solution = control.proposed(robot, mae, theta, torque, current, limit)
-        self.missing_torque = self._solution.missing_torque
-        return self._solution.length
+            self.solution = control.proposed(robot, mae, theta, torque, current, limit)
+        self.missing_torque = self.solution.missing_torque
+        return self.solution.length
 
     def _correct(self, theta: Array, dt: float) -> None:
         """Shift the commanded lengths so that the estimate comes nearer to the target."""
-        chosen = self._settings
-        gain = chosen.feedback_gain if self._method == 'proposed' else 0.0
+        chosen, solution = self._settings, self.solution
         # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
-        if self._solution is None or gain == 0.0 or chosen.preset == 'paper':
+        if self._method != 'proposed' or chosen.preset == 'paper' or solution is None:
             return
         assert self._mae is not None and self.theta is not None  # they gave the solution
-        correction = self._correction + gain * dt * (self.theta - theta)
-        self._correction = np.clip(correction, -CORRECTION, CORRECTION)
-        tension, robot = self._solution.tension, self._robot
-        shifted = first_command(robot, self._mae, self.theta + self._correction, tension)
-        centred = first_command(robot, self._mae, self.theta, tension)
-        self._command = self._solution.length + shifted - centred
+        if self.feedback.step(self.theta - theta, chosen.feedback_gain, dt):
+            shift = self.feedback.shift(self._mae, self.theta, solution.tension)
+            self._command = solution.length + shift

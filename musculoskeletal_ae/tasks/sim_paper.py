@@ -51,6 +51,9 @@ class PaperDescent:
         length = command - msc_compensation(self._robot, np.maximum(state.tension, bias))
         slack = (state.tension <= bias) | (command == PAID_OUT)
         length = np.where(slack, np.minimum(length, state.length), length)
+        # A bound that no command in its senses meets: no muscle is wound in by its whole length.
+        whole = self._robot.routes.length_at_zero
+        length = np.clip(length, -whole, whole)
         rows = [
             self._descend(
                 state.theta[i],

@@ -31,6 +31,7 @@ MARGIN = 20.0  # [N] above T_bias that a push may take from a muscle before it g
 ITERATIONS = 6
 # Of the least tension against the wish; a reachable wish is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
+SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to a corner; K bends down in every tension
 FAR = 1e5  # [N²] turns a quadratic programme into a linear one: its gradient outweighs distance
 
 
@@ -129,19 +130,29 @@ def _approach(model: StiffnessModel, tensions: _Polytope, start: Array, wish: Ar
 
 def _reachable(model: StiffnessModel, tensions: _Polytope, start: Array) -> tuple[Array, Array]:
     """Return the least and the greatest diagonal entries, each joint alone."""
-    eye = np.eye(len(start))
-    ends = []
-    for sign in (-1.0, 1.0):
-        values = []
-        for joint in range(model.jacobian.shape[1]):
-            tension = start
-            for _ in range(ITERATIONS):
-                slope = model.slope(tension)[joint]
-                direction = sign * slope / max(float(np.abs(slope).max()), 1e-12)
-                before, tension = tension, tensions.minimum(eye, tension + FAR * direction)
-                if np.abs(tension - before).max() < 1.0:
-                    break
-            values.append(model.joint_stiffness(tension)[joint, joint])
-        ends.append(np.array(values))
-    lowest, highest = ends
-    return lowest, highest
+    joints = range(model.jacobian.shape[1])
+    lowest = [_extreme(model, tensions, start, joint, -1.0) for joint in joints]
+    highest = [_extreme(model, tensions, start, joint, 1.0) for joint in joints]
+    return np.array(lowest), np.array(highest)
+
+
+def _extreme(
+    model: StiffnessModel, tensions: _Polytope, start: Array, joint: int, sign: float
+) -> float:
+    """Climb to the corner that the slope points to, as far as it improves (Frank and Wolfe)."""
+
+    def value(tension: Array) -> float:
+        return sign * float(model.joint_stiffness(tension)[joint, joint])
+
+    best, tension, eye = value(start), start, np.eye(len(start))
+    for _ in range(ITERATIONS):
+        slope = sign * model.slope(tension)[joint]
+        pull = FAR / max(float(np.abs(slope).max()), 1e-12) * slope
+        corner = tensions.minimum(eye, tension + pull)
+        steps = [tension + share * (corner - tension) for share in SHARES]
+        values = [value(step) for step in steps]
+        k = int(np.argmax(values))
+        if values[k] <= best + 1e-3 * abs(best):
+            break
+        best, tension = values[k], steps[k]
+    return sign * best

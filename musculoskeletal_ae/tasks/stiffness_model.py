@@ -101,4 +101,5 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
         wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
     """
     torque = robot.kinematics.end_effector_jacobian(theta).T @ wrench
-    return np.linalg.solve(stiffness + gravity_gradient(robot, theta), torque)
+    turn: Array = np.linalg.inv(stiffness + gravity_gradient(robot, theta)) @ torque
+    return turn

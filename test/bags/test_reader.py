@@ -66,6 +66,16 @@ def test_topics_and_times_can_be_chosen(bag, content):
     )
 
 
+def test_a_cut_file_says_when_nothing_protects_what_is_left(tmp_path, content):
+    for kind, protected in (('zstd chunks', True), ('no chunks', False)):
+        file = tmp_path / 'a.mcap'
+        samples.write_mcap(file, content, **samples.BARE[kind])
+        assert Bag.open(file).scans[0].checked
+        file.write_bytes(file.read_bytes()[:5000])
+        reasons = ''.join(Bag.open(file, unfinished=True).unfinished)
+        assert ('no checksum' not in reasons) == protected
+
+
 @settings(max_examples=60, suppress_health_check=list(HealthCheck), deadline=None)
 @given(data=st.data())
 def test_a_file_cut_anywhere_is_unfinished_and_its_beginning_is_read(tmp_path, content, data):

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Preset `default`: find out the body from the samples, then dream of it.
+
+1. Fit the corrected body to the samples (`body_fit`).
+2. Draw synthetic samples of it (`dream`), a tenth of them in the place of real ones.
+3. Train the network on them for a bounded number of steps (`trainer`).
+4. Take the residuals' statistics of healthy messages (`healthy`).
+
+The body needs few samples because the geometric model and its tolerances are known; the network
+needs many, and gets them from the body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, Observations, Prior, fit_body
+from musculoskeletal_ae.learning.dream import Dream, dream
+from musculoskeletal_ae.learning.trainer import BATCH, Trainer
+from musculoskeletal_ae.learning.update import (
+    Job,
+    Update,
+    history,
+    newest_error,
+    with_statistics,
+)
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import from_mae, to_mae
+from musculoskeletal_ae.mae.units import scale_vector
+from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+REAL_SHARE = 0.1
+#: how often a dream is used before it is forgotten
+USES = 3
+#: a real sample that fits the body worse than this weight is not shown to the network
+TRUSTED = 0.3
+#: so many newest samples in a row that contradict the body mean that a muscle has changed …
+IN_A_ROW = 4
+#: … by more than this [m], provided that there were this many before
+LEAST_CHANGE, LEAST_BEFORE = 0.004, 8
+
+
+class BodyUpdater:
+    """Learns by the corrected body.
+
+    Attributes:
+        body: As it was fitted last.
+    """
+
+    least_samples = 2
+
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0, prior: Prior | None = None) -> None:
+        """Go on from a network; the body is found out from the samples of the first job."""
+        self._robot, self._origin, self._mae = robot, mae, mae
+        self._prior = prior or Prior()
+        self.body = CorrectedBody(robot, seed=seed)
+        self._trainer = Trainer(from_mae(mae), seed)
+        self._rng = np.random.default_rng([seed, 0xD2])
+
+    def update(self, job: Job) -> Update:
+        """Learn a little; bounded time for a bounded store."""
+        seen, robot = job.seen, self._robot
+        error = newest_error(self._mae, seen)
+        fit = fit_body(self.body, seen, self._prior)
+        changed = _changed(seen, fit)
+        data = dream(self.body, fit.noise, max(BATCH, job.steps * BATCH // USES), self._rng)
+        loss = self._trainer.train(self._with_real(data, seen, fit), job.steps)
+        mae = to_mae(
+            self._trainer.network,
+            robot.joints,
+            robot.muscles,
+            self._origin.preset,
+            history(self._origin, len(seen), 'default'),
+            job.version,
+        )
+        self._mae = with_statistics(mae, self._mae, job)
+        return Update(self._mae, loss, error, fit.noise, changed)
+
+    def _with_real(self, data: Dream, seen: Observations, fit: Fit) -> Dream:
+        """Put real samples, freed of friction as the body knows it, in the place of some dreams."""
+        trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
+        if len(trusted) == 0:
+            return data
+        rows = trusted[self._rng.integers(len(trusted), size=int(REAL_SHARE * len(data.seen)))]
+        theta, tension, sliding = seen.theta[rows], seen.tension[rows], seen.sliding[rows]
+        slid, free = self.body.lengths(theta, tension, sliding, np.zeros_like(sliding))
+        scale = scale_vector(self._robot.joint_count, self._robot.muscle_count)
+        for values, length in (
+            (data.seen, seen.length[rows]),
+            (data.true, seen.length[rows] + free - slid),
+        ):
+            values[: len(rows)] = np.concatenate([theta, tension, length], axis=1) * scale
+        return data
+
+
+def _changed(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
+    """Return muscles whose newest samples contradict the body in one direction, and how many."""
+    found = []
+    for m, noise in enumerate(fit.noise):
+        residual = fit.residual[seen.known[:, m], m]
+        odd = np.abs(residual) > max(OUTLIER * noise, LEAST_CHANGE)
+        same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
+        fits = np.flatnonzero(~same)
+        run = len(same) - 1 - fits[-1] if len(fits) else 0
+        if run >= IN_A_ROW and len(same) - run >= LEAST_BEFORE:
+            found.append((m, int(run)))
+    return tuple(found)

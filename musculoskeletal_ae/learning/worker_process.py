@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's side of the training process: hand over a job, ask later, never wait."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+from musculoskeletal_ae.learning.update import Job
+from musculoskeletal_ae.learning.worker import Answer, Start
+
+ENDING = 2.0  # [s] that the process has to end by itself
+
+
+class WorkerProcess:
+    """One training process and the thread that talks to it.
+
+    Attributes:
+        busy: Whether a job is under way.
+        dead: Why the process can do no more, or ''.
+        least_samples: From how many samples on it learns; None until it is up.
+    """
+
+    def __init__(self, start: Start) -> None:
+        """Start the process."""
+        ours, theirs = socket.socketpair()
+        with theirs:
+            # Its own module, on the interpreter that runs this.
+            self._process = subprocess.Popen(  # noqa: S603
+                [sys.executable, '-m', 'musculoskeletal_ae.learning.worker', str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+            )
+        self._connection = Connection(ours.detach())
+        self.busy = False
+        self.dead = ''
+        self.least_samples: int | None = None
+        self._jobs: queue.SimpleQueue[Job | Start | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Answer | int | Exception] = queue.SimpleQueue()
+        self._jobs.put(start)
+        self._thread = threading.Thread(target=self._talk, daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
+
+    def submit(self, job: Job) -> None:
+        """Hand over a job; only when not busy."""
+        self.busy = True
+        self._jobs.put(job)
+
+    def poll(self) -> Answer | None:
+        """Return the answer to the job, if it has come."""
+        try:
+            answer = self._answers.get_nowait()
+        except queue.Empty:
+            return None
+        if isinstance(answer, int):
+            self.least_samples = answer
+            return None
+        self.busy = False
+        if isinstance(answer, Exception):
+            self.dead = f'{type(answer).__name__} {answer}'.strip()
+            with suppress(subprocess.TimeoutExpired):
+                _, text = self._process.communicate(timeout=ENDING)
+                lines = text.decode(errors='replace').strip().splitlines()
+                self.dead = f'status {self._process.returncode} {lines[-1] if lines else ""}'
+            return None
+        return answer
+
+    def close(self) -> None:
+        """End the process; within `ENDING` by itself, else by force."""
+        self._jobs.put(None)
+        with suppress(OSError):
+            self._process.terminate()
+        try:
+            self._process.wait(ENDING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(ENDING)
+        if self._process.stderr:
+            self._process.stderr.close()
+
+    def _talk(self) -> None:
+        with self._connection as connection:
+            while (job := self._jobs.get()) is not None:
+                try:
+                    connection.send(job)
+                    self._answers.put(connection.recv())
+                except (EOFError, OSError) as error:
+                    self._answers.put(error)
+                    return

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint angles from the pose of the end effector, started from an estimate.
+
+    min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R² + ‖θ − θ_est‖²/σ_θ²,   lower ≤ θ ≤ upper
+
+by damped least squares (Levenberg–Marquardt) over pinocchio's Jacobian. Where the pose says little
+about a joint (near a singular posture), a camera's noise would turn it anywhere; the estimate,
+taken as known to σ_θ, keeps it. A robot without joint sensors is watched by a camera
+(paper, section "Musculoskeletal Humanoids"): this is how its θ gets into online learning.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+# How far a camera's marker pose can be trusted: of a usual one, and only their ratio matters.
+POSITION_SPREAD, TURN_SPREAD = 0.002, 0.01  # [m], [rad]
+ESTIMATE_SPREAD = 0.2  # [rad]
+ITERATIONS = 30
+LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
+SMALL_STEP = 1e-6  # [rad]
+
+
+class Posture(NamedTuple):
+    """A solution.
+
+    Attributes:
+        theta: θ [rad], shape (D,).
+        distance: What is left of the position [m].
+        angle: What is left of the orientation [rad].
+    """
+
+    theta: Array
+    distance: float
+    angle: float
+
+
+def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
+    """Return the joint angles that bring the end effector nearest to a pose.
+
+    Args:
+        robot: The arm.
+        pose: Of the end effector in the root link's frame.
+        start: θ to start from [rad], shape (D,).
+    """
+    kin = robot.kinematics
+    theta = np.clip(start, robot.lower, robot.upper)
+    damping = 1e-2
+    error = _error(robot, pose, theta, start)
+    prior = np.eye(len(theta)) / ESTIMATE_SPREAD
+    for _ in range(ITERATIONS):
+        by_pose = kin.end_effector_jacobian(theta) / _SPREADS[:, None]
+        jacobian = np.vstack([by_pose, prior])
+        # At a limit, a joint that wants to go beyond is held.
+        gradient = jacobian.T @ error
+        held = ((theta <= robot.lower) & (gradient < 0.0)) | (
+            (theta >= robot.upper) & (gradient > 0.0)
+        )
+        jacobian[:, held] = 0.0
+        normal = jacobian.T @ jacobian
+        scale = damping * np.maximum(np.diag(normal), 1e-3 * np.diag(normal).max() + 1e-12)
+        step = np.linalg.solve(normal + np.diag(scale), jacobian.T @ error)
+        tried = np.clip(theta + step, robot.lower, robot.upper)
+        tried_error = _error(robot, pose, tried, start)
+        if tried_error @ tried_error < error @ error:
+            moved = np.abs(tried - theta).max()
+            theta, error, damping = tried, tried_error, max(0.2 * damping, LEAST_DAMPING)
+            if moved < SMALL_STEP:
+                break
+        else:
+            damping *= 8.0
+            if damping > MOST_DAMPING:
+                break
+    left = error[:6] * _SPREADS
+    return Posture(theta, float(np.linalg.norm(left[:3])), float(np.linalg.norm(left[3:])))
+
+
+_SPREADS = np.repeat([POSITION_SPREAD, TURN_SPREAD], 3)
+
+
+def _error(robot: Robot, pose: pin.SE3, theta: Array, start: Array) -> Array:
+    """Return what is missing in position, orientation and to the estimate, weighted, (6+D,)."""
+    here = robot.kinematics.end_effector_pose(theta)
+    turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
+    missing = np.concatenate([pose.translation - here.translation, turn]) / _SPREADS
+    return np.concatenate([missing, (start - theta) / ESTIMATE_SPREAD])

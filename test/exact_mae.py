@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A body image without error, as of a network that had learnt the geometric model perfectly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class ExactMae:
+    """What control asks of a `Mae`, given by the geometric model; `fail` makes it faulty."""
+
+    def __init__(self, robot: Any) -> None:
+        self.robot = robot
+        self.offset = 0.0  # [m] on every length, to tell two networks apart
+        self.fail: Exception | None = None
+
+    def lengths(self, theta, tension):
+        if self.fail:
+            raise self.fail
+        return self.robot.muscle_lengths(theta, tension) + self.offset
+
+    def muscle_jacobian(self, theta, tension):
+        slope = self.robot.series_elastic.length_slope(tension)[..., None]
+        return self.robot.routes.muscle_jacobian(theta) * (1.0 - slope)
+
+
+def rest_readings(robot, theta, tension=None):
+    """Return noiseless (l, T, temperature) of the geometric model at rest."""
+    tension = np.full(robot.muscle_count, robot.tension.bias) if tension is None else tension
+    return robot.muscle_lengths(theta, tension), tension, np.full(robot.muscle_count, 30.0)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every cause of a safe stop on a real graph, and what lets the arm go on."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+from controlled_arm import ControlledArm
+from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from musculoskeletal_ae.nodes.shell import LATCHED, bytes_message
+
+HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
+
+
+@pytest.fixture
+def arm(graph, arm26, trained):
+    arm = ControlledArm(graph, arm26, trained)
+    arm.target(HERE)
+    graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+    return arm
+
+
+def reset(arm):
+    return arm.graph.call(Trigger, 'controller/reset')
+
+
+def test_stop_pays_out_keeps_commanding_and_only_reset_ends_it(arm):
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    before = len(arm.sent())
+    arm.pays_out()
+    assert len(arm.sent()) > before
+    request = SetBool.Request(data=True)
+    refused = arm.graph.call(SetBool, 'controller/explore', request)
+    assert not refused.success
+    assert 'stopped' in refused.message
+    assert reset(arm).success
+    arm.goes_to(HERE)
+
+
+def test_stop_under_tension_commands_lets_go_to_the_bias(arm):
+    assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
+    arm.graph.wait(lambda: len(arm.sent('tension')) > 50, 'tension commands')
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    bias = arm.robot.tension.bias
+    arm.graph.wait(lambda: (arm.sent('tension')[-1] == bias).all(), 'T_bias')
+    arm.pays_out()
+
+
+def test_a_killed_estimator_stops_it_and_a_new_one_lets_it_resume(arm):
+    arm.kill(arm.estimator, signal.SIGKILL)
+    arm.says('estimated_joint_states older')
+    answer = reset(arm)
+    assert not answer.success
+    assert 'estimated_joint_states' in answer.message
+    arm.pays_out()
+    arm.start_estimator()
+    arm.graph.next('estimated_joint_states', 5)
+    arm.graph.wait(lambda: reset(arm).success, 'the reset')
+    arm.goes_to(HERE)
+    arm.target(THERE)
+    arm.goes_to(THERE)
+
+
+def test_a_killed_emulator_stops_it_and_a_new_one_lets_it_resume(arm):
+    arm.kill(arm.hardware, signal.SIGKILL)
+    arm.says('muscle_states older')
+    assert 'muscle_states' in reset(arm).message
+    before = len(arm.sent())
+    arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'commands to nobody')
+    arm.start_hardware()
+    arm.graph.next('estimated_joint_states', 5)
+    arm.graph.wait(lambda: reset(arm).success, 'the reset')
+    arm.goes_to(HERE)
+
+
+def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_takes_over(arm):
+    arm.kill(arm.controller, signal.SIGKILL)
+    arm.pays_out()
+    arm.start_controller()
+    arm.graph.wait(lambda: arm.targets.get_subscription_count() == 1, 'the new controller')
+
+    def moved():
+        arm.target(THERE)
+        return np.linalg.norm(arm.posture() - THERE) < 0.3
+
+    arm.graph.wait(moved, 'the posture')
+
+
+def test_an_anomaly_stops_it_until_both_are_reset(arm):
+    muscle = arm.robot.muscles[0]
+    assert arm.graph.set_parameter('hardware_emulator', 'ruptured_muscles', [muscle])[0]
+    arm.says('anomaly_detected')
+    answer = reset(arm)
+    assert not answer.success
+    assert 'anomaly' in answer.message
+    assert arm.graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    arm.graph.wait(lambda: arm.tension()[0] > 15.0, 'tension in the mended muscle')
+    assert arm.graph.call(Trigger, 'estimator/reset').success
+    arm.graph.wait(lambda: reset(arm).success, 'the reset')
+
+
+def test_an_unfit_checkpoint_stops_it_and_the_one_in_use_stays(arm):
+    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    publisher.publish(bytes_message(b'not a checkpoint'))
+    arm.says('unfit checkpoint')
+    assert reset(arm).success
+    arm.goes_to(HERE)
+
+
+def test_an_unfit_checkpoint_file_is_refused_and_nothing_stops(arm):
+    done, reason = arm.graph.set_parameter('controller', 'checkpoint', '/nowhere.safetensors')
+    assert not done
+    assert 'nowhere' in reason
+    arm.goes_to(HERE)
+    assert 'stopped' not in arm.state().message
+
+
+def test_without_joint_sensors_and_without_a_learner_it_moves(graph, arm26, trained):
+    arm = ControlledArm(graph, arm26, trained, joint_sensors=False)
+    arm.target(HERE)
+    graph.wait(lambda: len(arm.sent()) > 200, 'commands')
+    assert 'stopped' not in arm.state().message
+    assert len(graph.received['joint_states']) == 0

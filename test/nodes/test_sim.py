@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated arm on the graph: beside a robot, and in its place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
+from visualization_msgs.msg import MarkerArray
+
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.messages import array_message, read_array
+from musculoskeletal_ae.nodes.shell import LATCHED, bytes_message
+from musculoskeletal_ae.tasks.length_command import first_command
+from musculoskeletal_ae.tasks.simulation import Simulation
+
+
+@pytest.fixture
+def arm(graph, trained):
+    graph.listen(JointState, 'sim/joint_states')
+    graph.listen(Float64MultiArray, 'sim/muscle_states')
+    graph.listen(DiagnosticArray, '/diagnostics')
+    graph.simulator = graph.start('sim', robot='arm26', checkpoint=trained)
+    graph.next('sim/muscle_states')
+    return graph
+
+
+@pytest.fixture
+def mae(arm26, trained):
+    return checkpoint.load(trained, arm26)
+
+
+@pytest.fixture
+def core(arm26, mae):
+    """Return the same simulated arm without ROS."""
+    core = Simulation(arm26, mae)
+    core.settle()
+    return core
+
+
+def posture(graph, topic='sim/joint_states'):
+    return np.array(graph.next(topic).position)
+
+
+def state(graph):
+    name = f'{graph.namespace}/sim: state'
+    found = [s for m in graph.received['/diagnostics'] for s in m.status if s.name == name]
+    return found[-1] if found else DiagnosticStatus()
+
+
+def wait_for_posture(graph, theta, what):
+    graph.wait(lambda: np.abs(posture(graph) - theta).max() < 0.01, what)
+
+
+def held_command(mae, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    return first_command(arm26, mae, theta, np.full(arm26.muscle_count, 60.0))
+
+
+def test_before_a_command_it_rests_at_the_bias(arm, arm26, core):
+    message = arm.next('sim/muscle_states')
+    assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
+        ('quantity', 3, 18),
+        ('muscle', 6, 6),
+    ]
+    _, tension, temperature = read_array(message, 3, 6)
+    np.testing.assert_array_equal(tension, arm26.tension.bias)
+    np.testing.assert_array_equal(temperature, 25.0)
+    assert tuple(arm.next('sim/joint_states').name) == arm26.joints
+    np.testing.assert_allclose(posture(arm), core.state.theta[0], atol=1e-3)
+    markers = arm.listen(MarkerArray, 'sim/markers')
+    arm.wait(lambda: markers, 'markers')
+    muscles = [m for m in markers[-1].markers if m.ns == 'muscles']
+    assert len(muscles) == 6
+    assert all((m.color.r, m.color.g) == (0.0, 1.0) for m in muscles)  # green at bias
+    assert {m.header.frame_id for m in markers[-1].markers} == {arm26.root_link}
+    assert arm.node.count_publishers('joint_states') == 0
+
+
+def test_it_follows_the_command_of_the_hardware(arm, arm26, mae, core):
+    command = held_command(mae, arm26)
+    core.command = command[None]
+    arm.publisher(Float64MultiArray, 'muscle_length_command').publish(
+        array_message(command, 'muscle')
+    )
+    wait_for_posture(arm, core.settle().theta[0], 'the posture of the core')
+    arm.wait(lambda: state(arm).message == 'following commands', 'the report')
+
+
+def test_a_push_acts_until_it_is_zero(arm, arm26, core):
+    rest = posture(arm)
+    push = arm.publisher(WrenchStamped, 'sim/external_wrench')
+    message = WrenchStamped()
+    message.wrench.force.x = 8.0
+    push.publish(message)
+    core.wrench[0, 0] = 8.0
+    pushed = core.settle().theta[0]
+    assert np.abs(pushed - rest).max() > 0.1
+    wait_for_posture(arm, pushed, 'the push')
+    message.header.frame_id = 'camera'
+    message.wrench.force.x = 0.0
+    push.publish(message)
+    arm.wait(lambda: 'wrong frame' in str(state(arm).values), 'the rejection')
+    message.header.frame_id = arm26.root_link
+    push.publish(message)
+    wait_for_posture(arm, rest, 'the release')
+
+
+def test_joints_are_forced_and_released(arm, core):
+    rest = posture(arm)
+    force = arm.publisher(JointState, 'sim/fixed_joint_states')
+    force.publish(JointState(name=['elbow'], position=[-0.8]))
+    core.fixed[0] = [np.nan, -0.8]
+    wait_for_posture(arm, core.settle().theta[0], 'the forced posture')
+    arm.wait(lambda: 'forced joints' in str(state(arm).values), 'the report')
+    for names, reason in ((['knee'], 'unknown joint'), (['elbow'] * 2, 'duplicate joint')):
+        force.publish(JointState(name=names, position=[0.0] * len(names)))
+        arm.wait(lambda reason=reason: reason in str(state(arm).values), reason)
+    assert abs(posture(arm)[1] + 0.8) < 0.01
+    force.publish(JointState())
+    wait_for_posture(arm, rest, 'the release')
+
+
+def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm26):
+    commands = arm.publisher(Float64MultiArray, 'muscle_length_command')
+    before = posture(arm)
+    for data in ([float('nan')] * 6, [-0.05] * 5, [], [0.0] * 1_300_000):
+        commands.publish(Float64MultiArray(data=data))
+    arm.next('sim/joint_states', 30)
+    np.testing.assert_allclose(posture(arm), before, atol=1e-3)
+    commands.publish(array_message(np.full(6, -1.0), 'muscle'))
+    arm.wait(lambda: 'at the limit: ' in state(arm).message, 'the report')
+    _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
+    assert tension.max() <= arm26.tension.max
+    theta = posture(arm)
+    assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
+
+
+def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, mae, trained):
+    graph.listen(JointState, 'sim/joint_states')
+    graph.listen(DiagnosticArray, '/diagnostics')
+    graph.start('sim', robot='arm26')
+    graph.wait(lambda: 'waiting for a checkpoint' in state(graph).message, 'the report')
+    assert not graph.received['sim/joint_states']
+    sender = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    sender.publish(bytes_message(b'not a network'))
+    graph.wait(lambda: 'rejected mae_checkpoint' in str(state(graph).values), 'the refusal')
+    for version in (41, 42):
+        sender.publish(bytes_message(checkpoint.to_bytes(replace(mae, version=version))))
+        graph.wait(lambda v=version: f"value='{v}'" in str(state(graph).values), f'{version}')
+    graph.next('sim/joint_states', 3)
+    assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
+    assert graph.set_parameter('sim', 'checkpoint', trained)[0]
+
+
+def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, arm26, trained):
+    graph.listen(JointState, 'joint_states')
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.listen(String, 'robot_description', LATCHED)
+    graph.start('sim', robot='arm26', checkpoint=trained, as_robot=True)
+    graph.start('estimator', robot='arm26', checkpoint=trained)
+    graph.start('controller', robot='arm26', checkpoint=trained, first_duration=1.0)
+    graph.next('muscle_states')
+    graph.wait(lambda: graph.received['robot_description'], 'the description')
+    assert graph.received['robot_description'][0].data == arm26.description.urdf
+    target = graph.publisher(JointState, 'target_joint_states')
+    for theta in (np.array([-0.5, -1.2]), np.array([0.1, -0.5])):
+        target.publish(JointState(name=arm26.joints, position=theta.tolist()))
+        graph.wait(
+            lambda theta=theta: np.abs(posture(graph, 'joint_states') - theta).max() < 0.15,
+            f'{theta}',
+        )
+    assert graph.node.count_publishers('sim/joint_states') == 0
+
+
+def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained):
+    graph.listen(JointState, 'sim/joint_states')
+    graph.start('sim', robot='arm26', checkpoint=trained, preset='paper')
+    theta = np.array(graph.next('sim/joint_states', 20).position)
+    assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
+    refused = graph.start('sim', robot='arm26', checkpoint=trained, preset='magic')
+    graph.processes.remove(refused)
+    refused.process.wait(timeout=60.0)
+    status, output = refused.end()
+    assert status == 1
+    assert 'legal: default, paper' in output
