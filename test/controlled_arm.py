@@ -89,6 +89,14 @@ class ControlledArm:
                     return status
         return DiagnosticStatus()
 
+    def reachable(self, joint):
+        """Return the range of a joint's stiffness that the controller reports."""
+        key = f'joint stiffness {joint}'
+        self.says(key)
+        said = {pair.key: pair.value for pair in self.state().values}[key]
+        low, high = said.split('reachable ')[1].split(',')[0].split(' to ')
+        return float(low), float(high)
+
     def says(self, words, node='controller'):
         """Wait until the node's diagnostics contain words."""
         self.graph.wait(

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.experiments.benchmark_control import control_rows
 from musculoskeletal_ae.mae.evaluation import unseen_states
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
@@ -97,6 +98,7 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
         Row(
             'the same by forward difference', lambda: mae.muscle_jacobian_difference(theta, tension)
         ),
+        *(Row(*row) for row in control_rows(robot, mae, eager)),
     ]
 
 

@@ -84,10 +84,13 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
     return {name: np.array(values) for name, values in rows.items()}
 
 
-def stiffness_ratios(robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None) -> Array:
+def stiffness_ratios(
+    robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None, push: float = PUSH
+) -> Array:
     """Return (measured, predicted) ratio of deflection, lower over upper quarter, (N, 2).
 
-    Each posture wishes for one joint, in turn; the push is a wrench that turns that joint most.
+    Each posture wishes for one joint, in turn; the push is the wrench that comes nearest to a
+    torque [N·m] on that joint alone.
     """
     arm = arm or nominal_arm(robot)
     ratios = []
@@ -100,7 +103,7 @@ def stiffness_ratios(robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None
         free = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
         low, high = free.lowest[joint], free.highest[joint]
         jacobian = robot.kinematics.end_effector_jacobian(theta)
-        wrench: Array = PUSH * np.linalg.pinv(jacobian.T)[:, joint]
+        wrench = np.asarray(push * np.linalg.pinv(jacobian.T)[:, joint], dtype=np.float64)
         deflections = []
         for quarter in QUARTERS:
             wish[joint] = low + quarter * (high - low)

@@ -48,7 +48,7 @@ def save_picture(lines: Sequence[Line], path: str | Path, title: str = '') -> No
         axes.set_xlim(middle[0] - reach, middle[0] + reach)
         axes.set_ylim(middle[1] - reach, middle[1] + reach)
         axes.set_zlim(middle[2] - reach, middle[2] + reach)
-        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.05)
+        axes.set_box_aspect((1.0, 1.0, 1.0))
         axes.locator_params(nbins=5)
         axes.set_xlabel('x [m]')
         axes.set_ylabel('y [m]')

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.experiments.nominal_rest import nominal_rest
+from musculoskeletal_ae.experiments.sim_responses import FLEXED, FORCED, print_responses
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -35,8 +35,6 @@ Array = NDArray[np.float64]
 STEP = 0.01  # [s]
 STILL = 1e-4  # [rad/s]
 LONGEST_WAIT = 20.0  # [s]
-#: a joint has to move this far in the body before its direction and size are judged
-NOTICEABLE = 0.05  # [rad]
 
 
 class Distance(NamedTuple):
@@ -44,24 +42,6 @@ class Distance(NamedTuple):
 
     theta: float
     tension: float
-
-
-class Response(NamedTuple):
-    """How body and simulator answer a push or a forced joint, from the same rest.
-
-    Attributes:
-        name: What was done.
-        body: Δθ of the body [rad], shape (D,).
-        simulated: Δθ of the simulator [rad], shape (D,).
-        body_tension: ΔT of the body [N], shape (M,).
-        simulated_tension: ΔT of the simulator [N], shape (M,).
-    """
-
-    name: str
-    body: Array
-    simulated: Array
-    body_tension: Array
-    simulated_tension: Array
 
 
 def random_commands(robot: Robot, count: int, seed: int) -> Array:
@@ -120,50 +100,6 @@ def rest_errors(
     return np.abs(rest.theta - theta), np.abs(rest.tension - tension), drift, tension_drift
 
 
-def responses(robot: Robot, mae: Mae, preset: str, theta: Array, joint: str) -> list[Response]:
-    """Return the answers to −50 N in z and 50 N in y at the hand, and to a joint forced to 30°.
-
-    Args:
-        robot: The nominal body.
-        mae: A network of it.
-        preset: Of the simulator.
-        theta: Posture to start from [rad], shape (D,).
-        joint: Name of the joint to force.
-    """
-    jacobian = robot.routes.muscle_jacobian(theta)
-    torque = robot.kinematics.holding_torque(theta)
-    limits = robot.tension
-    tension = holding_tension(jacobian, torque, limits.bias, limits.limit, 2.0 * limits.bias)
-    command = robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension)
-    simulated = Simulation(robot, mae, preset)
-    simulated.start_from(theta[None])
-    simulated.command = command[None]
-    start = simulated.settle()
-    result = []
-    forced = np.full(robot.joint_count, np.nan)
-    forced[robot.joints.index(joint)] = np.radians(30.0)
-    free, none = np.full(robot.joint_count, np.nan), np.zeros(6)
-    for name, wrench, fixed in (
-        ('-50 N in z', np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0]), free),
-        ('50 N in y', np.array([0.0, 50.0, 0.0, 0.0, 0.0, 0.0]), free),
-        (f'{joint} forced to 30°', none, forced),
-    ):
-        simulated.state = start
-        simulated.wrench, simulated.fixed = wrench[None], fixed[None]
-        after = simulated.settle()
-        body = nominal_rest(robot, command, theta, tension, wrench, fixed)
-        result.append(
-            Response(
-                name,
-                body.theta - theta,
-                (after.theta - start.theta)[0],
-                body.tension - tension,
-                (after.tension - start.tension)[0],
-            )
-        )
-    return result
-
-
 def compare(
     arm: EmulatedArm, simulated: Simulation, commands: Sequence[Array], duration: float
 ) -> Distance:
@@ -199,20 +135,8 @@ def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:
         f'tension {tension.mean():.2f} N mean, {tension.max():.1f} N max'
     )
     print(f'  held for 1000 steps: {drift.max():.2e} rad, {tension_drift.max():.2e} N at most')
-    if robot.joint_count != 5:
-        return
-    bent = np.array([0.0, 0.0, 0.0, -0.5 * np.pi, 0.0])
-    for answer in responses(robot, mae, preset, bent, 'shoulder_pitch'):
-        print(f'{answer.name}, elbow flexed to 90°: Δθ [rad] of body and simulator')
-        for name, body, simulated in zip(robot.joints, answer.body, answer.simulated):
-            note = ''
-            if abs(body) > NOTICEABLE:
-                share = simulated / body
-                note = f'  {share:.0%}' + ('' if 0.7 <= share <= 1.3 else '  beyond 30 %')
-            print(f'  {name:<16}{body:>8.3f}{simulated:>8.3f}{note}')
-        body_size = np.linalg.norm(answer.body_tension)
-        apart = np.linalg.norm(answer.simulated_tension - answer.body_tension)
-        print(f'  ‖ΔT‖ {body_size:.1f} N, {apart:.1f} N apart')
+    if {FLEXED, FORCED} <= set(robot.joints):
+        print_responses(robot, mae, preset)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -163,15 +163,14 @@ def _fit_muscle(
             residual = target - jacobian @ found
             noise, weight = _noise_and_weight(residual, known, noise, freedom, least_noise)
 
-        def cost(values: Array, length: Array) -> float:
-            misfit = weight @ (seen.length[:, m] - length) ** 2 / noise**2
-            return float(misfit + precision @ (values - mean) ** 2)
-
-        before, share = cost(at, length), 1.0
+        share = 1.0
+        before = _cost(seen.length[:, m] - length, weight / noise**2, at - mean, precision)
         while share > SHORTEST:
             body.parameters[m] = at + share * (found - at)
             length, jacobian = body.linearised(*data, m)
-            if cost(body.parameters[m], length) <= before:
+            deviation = body.parameters[m] - mean
+            residual = seen.length[:, m] - length
+            if _cost(residual, weight / noise**2, deviation, precision) <= before:
                 break
             share *= 0.5
         else:
@@ -181,6 +180,10 @@ def _fit_muscle(
     residual = seen.length[:, m] - length
     noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
     return residual, noise, weight
+
+
+def _cost(residual: Array, weight: Array, deviation: Array, precision: Array) -> float:
+    return float(weight @ residual**2 + precision @ deviation**2)
 
 
 def _noise_and_weight(

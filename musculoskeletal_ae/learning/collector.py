@@ -32,6 +32,7 @@ class Waiting(NamedTuple):
     """Something that counts once no anomaly has followed it for MARGIN."""
 
     time: float
+    dt: float
     tension: Array
     length: Array
     sample: Sample | None
@@ -85,11 +86,11 @@ class Collector:
             if rest is not None:
                 self.rejected['anomaly'] += 1
             return None
-        self._waiting.append(Waiting(self._time, tension, length, rest))
+        self._waiting.append(Waiting(self._time, dt, tension, length, rest))
         accepted = None
         while self._waiting and self._time - self._waiting[0].time >= MARGIN:
             passed = self._waiting.popleft()
-            self.reservoir.step(passed.tension, passed.length, dt)
+            self.reservoir.step(passed.tension, passed.length, passed.dt)
             if passed.sample is not None and self._accept(passed.sample):
                 accepted = passed.sample
         return accepted

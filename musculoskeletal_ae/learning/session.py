@@ -18,8 +18,7 @@ from musculoskeletal_ae.learning.journal import Journal
 from musculoskeletal_ae.learning.online import PRESETS
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.update import Job
-from musculoskeletal_ae.learning.worker import Answer, Start
-from musculoskeletal_ae.learning.worker_process import WorkerProcess
+from musculoskeletal_ae.learning.worker_process import Answer, Start, WorkerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -147,7 +146,8 @@ class Session:
             except OSError as error:
                 self.trouble = f'samples cannot be saved: {error}'
             else:
-                self.trouble = ''
+                if self.trouble.startswith('samples'):
+                    self.trouble = ''
 
     def relearn(self, muscle: int, newest: int = 0) -> None:
         """Learn a muscle's constants anew from its newest samples and what comes.

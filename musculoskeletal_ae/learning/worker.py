@@ -15,45 +15,11 @@ import sys
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.learning.worker_process import Answer, Start
 
 NICENESS = 5
-
-
-class Start(NamedTuple):
-    """What a worker is told first.
-
-    Attributes:
-        robot: Directory of the robot.
-        checkpoint: The network to go on from.
-        preset: How to learn.
-        seed: Of everything random.
-        file: Where to keep the network; None for nowhere.
-    """
-
-    robot: Path
-    checkpoint: bytes
-    preset: str
-    seed: int
-    file: Path | None
-
-
-class Answer(NamedTuple):
-    """What came of a job: `Update` in a form that crosses processes, and the time it took [s]."""
-
-    checkpoint: bytes
-    version: int
-    loss: float
-    error: float
-    noise: Array
-    changed: tuple[tuple[int, int], ...]
-    calibrated: bool
-    seconds: float
 
 
 def serve(connection: Connection) -> None:

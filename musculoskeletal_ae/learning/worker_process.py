@@ -10,11 +10,48 @@ import sys
 import threading
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from musculoskeletal_ae.learning.update import Job
-from musculoskeletal_ae.learning.worker import Answer, Start
+
+Array = NDArray[np.float64]
 
 ENDING = 2.0  # [s] that the process has to end by itself
+
+
+class Start(NamedTuple):
+    """What a worker is told first.
+
+    Attributes:
+        robot: Directory of the robot.
+        checkpoint: The network to go on from.
+        preset: How to learn.
+        seed: Of everything random.
+        file: Where to keep the network; None for nowhere.
+    """
+
+    robot: Path
+    checkpoint: bytes
+    preset: str
+    seed: int
+    file: Path | None
+
+
+class Answer(NamedTuple):
+    """What came of a job: `Update` in a form that crosses processes, and the time it took [s]."""
+
+    checkpoint: bytes
+    version: int
+    loss: float
+    error: float
+    noise: Array
+    changed: tuple[tuple[int, int], ...]
+    calibrated: bool
+    seconds: float
 
 
 class WorkerProcess:

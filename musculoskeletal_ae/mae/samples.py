@@ -20,10 +20,17 @@ Array = NDArray[np.float64]
 
 # Share of samples, in preset default, with tensions beyond what is planned.
 OVERLOAD_SHARE = 0.2
+# Reach of θ beyond each joint limit in preset default, as a share of the range: a network is least
+# accurate at the edge of what it saw, and arms do rest at their limits.
+POSTURE_MARGIN = 0.05
 
 
 def geometric_samples(
-    robot: Robot, count: int, rng: np.random.Generator, highest_tension: Array | float
+    robot: Robot,
+    count: int,
+    rng: np.random.Generator,
+    highest_tension: Array | float,
+    margin: float = 0.0,
 ) -> Array:
     """Return scaled (θ, T, l) of random states, shape (count, D+2M).
 
@@ -32,8 +39,9 @@ def geometric_samples(
         count: Number of samples.
         rng: Source of randomness.
         highest_tension: T_r is uniform in [0, this] [N]; a scalar or shape (count, 1).
+        margin: Reach of θ_r beyond each joint limit, as a share of the range.
     """
-    theta = robot.random_postures(count, rng)
+    theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(0.0, 1.0, (count, robot.muscle_count)) * highest_tension
     length = robot.muscle_lengths(theta, tension)
     values = np.concatenate([theta, tension, length], axis=1)
@@ -50,7 +58,7 @@ def overload_samples(robot: Robot, count: int, rng: np.random.Generator) -> Arra
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
     highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
-    return geometric_samples(robot, count, rng, highest)
+    return geometric_samples(robot, count, rng, highest, POSTURE_MARGIN)
 
 
 def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:

@@ -2,8 +2,8 @@
 """The node `sim`: the learnt body as an arm that follows the same command as the real one.
 
 muscle_length_command → sim/joint_states, sim/muscle_states, sim/markers; with as_robot:=true it
-takes the robot's place: joint_states, muscle_states, robot_description, sim/markers. It is pushed by
-sim/external_wrench and held by sim/fixed_joint_states. A command holds until the next one; before
+takes the robot's place: joint_states, muscle_states, robot_description, sim/markers. Pushed by
+sim/external_wrench, held by sim/fixed_joint_states. A command holds until the next one; before
 the first, muscles are at T_bias. muscle_tension_command is not followed, and modules stay at 25 °C.
 """
 

@@ -67,6 +67,14 @@ class Robot:
         lengths: Array = relative - self.series_elastic.elongation(absolute, tension)
         return lengths
 
-    def random_postures(self, count: int, rng: np.random.Generator) -> Array:
-        """Return θ uniform in the joint limits [rad], shape (count, D)."""
-        return rng.uniform(self.lower, self.upper, (count, self.joint_count))
+    def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
+        """Return θ uniform in the joint limits [rad], shape (count, D).
+
+        Args:
+            count: How many.
+            rng: Source of randomness.
+            margin: Reach beyond each limit, as a share of the joint's range.
+        """
+        beyond = margin * (self.upper - self.lower)
+        shape = count, self.joint_count
+        return rng.uniform(self.lower - beyond, self.upper + beyond, shape)

@@ -8,9 +8,11 @@
 The paper descends on a sum of norms (section "Simulation"); its weights let ‖T‖ outweigh torque and
 length, so that the arm settles elsewhere. Here both are equations, and what is searched is the
 sheet z = ①(θ, T) of the latent space, where they have D+M unknowns for D+M equations. Their root is
-the posture of rest. The arm creeps towards it through a viscous medium B, by linearly implicit
-Euler steps: Newton steps on those equations with B/h on the diagonal. B stands for what joints and
-geared modules resist, so that speeds look right; it has no say in where the arm comes to rest.
+the posture of rest. (Solved for z itself, with decoded θ and T instead of exact ones, the root is
+no nearer to the body's and each step dearer.) The arm creeps towards it through a viscous medium B,
+by linearly implicit Euler steps: Newton steps on those equations with B/h on the diagonal. B stands
+for what joints and geared modules resist, so that speeds look right; it has no say in where the arm
+comes to rest. A joint limit is a hard stop that gives whatever torque it takes.
 """
 
 from __future__ import annotations

@@ -27,7 +27,8 @@ from musculoskeletal_ae.tasks.stiffness_model import StiffnessModel, stiffness_m
 
 Array = NDArray[np.float64]
 
-MARGIN = 20.0  # [N] above T_bias that a push may take from a muscle before it gives way
+# [N] above T_bias that a push may take from a muscle before it gives way; the widest that is held.
+MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6
 # Of the least tension against the wish; a reachable wish is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
@@ -90,8 +91,8 @@ def stiffness_command(
         limit: Highest tension planned [N], scalar or shape (M,).
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
-    jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGIN, high))
-    for margin in (MARGIN, 0.0):
+    jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
+    for margin in MARGINS:
         low = np.minimum(robot.tension.bias + margin, high)
         tension, missing = least_tension(jacobian, torque, low, high)
         if not missing.any():

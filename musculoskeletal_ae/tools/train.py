@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`train`: initial training of the Musculoskeletal AutoEncoder from a robot description."""
+"""`train`: initial training from a robot description, or learning from recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.evaluation import OUTPUTS, PairError, pair_errors, unseen_states
 from musculoskeletal_ae.mae.initial import Trained, initial_mae
@@ -20,6 +20,7 @@ from musculoskeletal_ae.mae.training import TRAINING_PRESETS
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.train_from_bag import train_from_bags
 
 Array = NDArray[np.float64]
 
@@ -44,6 +45,8 @@ def main(argv: list[str] | None = None) -> int:
     except RobotDescriptionError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
+    if args.from_bag:
+        return _from_bags(robot, args)
     steps = TRAINING_PRESETS[args.preset].steps // (10 if args.quick else 1)
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
@@ -80,6 +83,22 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def _from_bags(robot: Robot, args: argparse.Namespace) -> int:
+    try:
+        if args.checkpoint is not None:
+            mae = checkpoint.load(args.checkpoint, robot)
+        else:
+            print(f'training the network of {robot.description.directory.name} to start from')
+            mae = initial_mae(robot, args.preset, args.seed).mae
+        learned = train_from_bags(robot, mae, args.preset, args.from_bag, args.hold_out, args.seed)
+        checkpoint.save(learned, args.out)
+    except (MusculoskeletalError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    print(f'checkpoint: {args.out}')
+    return 0
+
+
 def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='train',
@@ -103,9 +122,34 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--seed', type=_seed, default=0, help='of data and weights (0)')
     parser.add_argument('--plot', type=Path, metavar='FILE.png', help='loss and errors')
     parser.add_argument(
+        '--from-bag',
+        nargs='+',
+        type=Path,
+        default=[],
+        metavar='BAG',
+        help='learn the real arm from recordings: bag directories or .mcap files',
+    )
+    parser.add_argument(
+        '--hold-out',
+        nargs='+',
+        type=Path,
+        default=[],
+        metavar='BAG',
+        help='with --from-bag: recordings that are only judged, before and after',
+    )
+    parser.add_argument(
+        '--checkpoint',
+        type=Path,
+        metavar='FILE',
+        help='with --from-bag: network to start from (default: train one on the geometric model)',
+    )
+    parser.add_argument(
         '--quick', action='store_true', help='a tenth of the training, to try things out'
     )
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if not args.from_bag and (args.hold_out or args.checkpoint):
+        parser.error('--hold-out and --checkpoint go with --from-bag')
+    return args
 
 
 def _seed(text: str) -> int:

@@ -11,7 +11,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.shell import LATCHED, bytes_message
+from musculoskeletal_ae.tasks.stiffness_control import stiffness_command
+from musculoskeletal_ae.tasks.stiffness_model import push_deflection
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
@@ -58,35 +61,38 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     arm.goes_to(THERE)
 
 
-def test_stiffness_reports_its_range_and_a_stiffer_joint_gives_way_less(arm):
-    def values():
-        return {v.key: v.value for v in arm.state().values}
-
-    joint = arm.robot.joints[1]
+def test_a_push_measures_the_stiffness_that_was_wished_within_the_reported_range(arm, trained):
+    theta, robot = np.array([0.3, -0.8]), arm.robot
+    mae = checkpoint.load(trained, robot)
+    # A torque on the shoulder alone, large against friction.
+    wrench = 3.0 * np.linalg.pinv(robot.kinematics.end_effector_jacobian(theta).T)[:, 0]
     assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
     assert not arm.graph.set_parameter('controller', 'joint_stiffness', [1.0, 2.0, 3.0])[0]
-    arm.target(HERE)
-    said = arm.graph.wait(lambda: values().get(f'joint stiffness {joint}'), 'the range')
-    low, high = (float(word) for word in said.split('reachable ')[1].split(' to '))
-    assert low < high
+    arm.target(theta)
+    low, high = arm.reachable(robot.joints[0])
     push = arm.graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
-    turned = []
+    turned, expected = [], []
     for share in (0.125, 0.875):
-        wish = low + share * (high - low)
-        assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0, wish])[0]
-        arm.says(f'{wish:.1f}'[:-2])
-        arm.graph.spin(2.5)
+        wish = np.array([low + share * (high - low), 0.0])
+        done, _ = arm.graph.set_parameter('controller', 'joint_stiffness', wish.tolist())
+        assert done
+        arm.graph.spin(3.0)
         ends = []
-        for force in (40.0, -40.0):
+        for sign in (1.0, -1.0):
             message = WrenchStamped()
-            message.wrench.force.x = force
+            force, torque = message.wrench.force, message.wrench.torque
+            force.x, force.y, force.z = sign * wrench[:3]
+            torque.x, torque.y, torque.z = sign * wrench[3:]
             push.publish(message)
             arm.graph.spin(1.5)
-            ends.append(arm.posture()[1])
+            ends.append(np.mean([arm.posture()[0] for _ in range(10)]))
         push.publish(WrenchStamped())
-        turned.append(abs(ends[0] - ends[1]))
-    assert turned[0] > turned[1]
-    assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0, 1e4])[0]
+        turned.append(ends[0] - ends[1])
+        weight = robot.kinematics.holding_torque(theta)
+        found = stiffness_command(robot, mae, theta, weight, wish, robot.tension.limit)
+        expected.append(push_deflection(robot, theta, found.stiffness, wrench)[0])
+    assert turned[0] / turned[1] == pytest.approx(expected[0] / expected[1], rel=0.2)
+    assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e4, 0.0])[0]
     arm.says('clamped')
 
 

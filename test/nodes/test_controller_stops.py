@@ -93,7 +93,7 @@ def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_takes_over(ar
 def test_an_anomaly_stops_it_until_both_are_reset(arm):
     muscle = arm.robot.muscles[0]
     assert arm.graph.set_parameter('hardware_emulator', 'ruptured_muscles', [muscle])[0]
-    arm.says('anomaly_detected')
+    arm.says('stopped: anomaly_detected')
     answer = reset(arm)
     assert not answer.success
     assert 'anomaly' in answer.message

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph import Process
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -19,7 +19,8 @@ from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.shell import LATCHED
 
 # Faster than on a robot, so that a test takes seconds.
-QUICK = {'rest_time': 0.1, 'update_steps': 20}
+QUICK = {'rest_time': 0.4, 'update_steps': 20}
+REST = 0.8  # [s] in one posture
 
 
 class Arm:
@@ -35,12 +36,11 @@ class Arm:
     def move(self):
         self.theta = self.robot.random_postures(1, self.rng)[0]
         self.tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
-        self.ticks = 0
+        self.since = time.monotonic()
 
     def publish(self):
-        """Publish one message of each kind; every 0.3 s the arm is somewhere else."""
-        self.ticks += 1
-        if self.ticks > 30:
+        """Publish one message of each kind, of a new posture now and then."""
+        if time.monotonic() - self.since > REST:
             self.move()
         length = self.robot.muscle_lengths(self.theta, self.tension) + 0.005
         rows = np.stack([length, self.tension, np.full(self.robot.muscle_count, 25.0)])
@@ -227,9 +227,8 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
 def test_two_learners_do_not_share_a_directory(graph, arm26, trained, state):
     start(graph, arm26, checkpoint=trained, state_directory=state)
     graph.wait(lambda: graph.received['mae_checkpoint'], 'the first one')
-    second = Process(
-        'learner', '--ros-args', '-p', 'robot:=arm26', '-p', f"state_directory:='{state}'"
-    )
+    second = graph.start('learner', robot='arm26', state_directory=state)
+    graph.processes.remove(second)
     output, _ = second.process.communicate(timeout=60)
     assert second.process.returncode == 1
     assert 'another learner' in output

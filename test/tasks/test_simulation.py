@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.experiments.nominal_rest import nominal_rest
+from musculoskeletal_ae.experiments.sim_responses import NOTICEABLE, responses
 from musculoskeletal_ae.experiments.simulation import random_commands
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks import simulation
@@ -40,7 +41,7 @@ def body(robot):
 
 @pytest.fixture(scope='module')
 def commands(robot):
-    return random_commands(robot, 12, seed=4)
+    return random_commands(robot, 6, seed=4)
 
 
 def settled(robot, body, commands):
@@ -119,6 +120,14 @@ def test_forced_joints_go_there_and_the_others_follow(robot, body, commands):
         if not arms.limits(i):
             rest = rest_of_body(robot, state, command, i, fixed=forced)
             np.testing.assert_allclose(state.theta[i], rest.theta, atol=1e-4)
+
+
+def test_it_gives_way_to_the_paper_s_pushes_and_forced_joint_as_the_body_does(robot, body):
+    for answer in responses(robot, body, 'default'):
+        moved = np.abs(answer.body) > NOTICEABLE
+        assert moved.any()
+        np.testing.assert_allclose(answer.simulated[moved], answer.body[moved], rtol=0.1)
+        assert np.linalg.norm(answer.simulated_tension - answer.body_tension) < 10.0
 
 
 def test_without_a_command_every_muscle_is_at_the_bias(robot, body):

@@ -23,7 +23,7 @@ def robot():
 
 @pytest.fixture(scope='module')
 def mae(robot):
-    return initial_mae(robot, 'default', seed=0, steps=1000).mae
+    return initial_mae(robot, 'default', seed=0, steps=700).mae
 
 
 def test_it_rests_where_the_nominal_body_rests_and_stays_there(robot, mae):

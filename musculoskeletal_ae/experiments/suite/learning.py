@@ -54,6 +54,8 @@ def learn_individual(study: Study, seed: int, progress: Progress) -> Measured:
             'running': _by_second(curve.running),
             'curve_samples': np.array(curve.samples),
             'curve_errors': np.array(curve.errors),
+            'fit_start_rad': found['fit_start_rad'],
+            'fit_end_rad': found['fit_end_rad'],
         }
         progress(share)
     numbers.update(oracle_errors(robot, seed, streams.held_out))
@@ -92,7 +94,7 @@ def rest_samples(study: Study, seed: int) -> tuple[Array, Array, Array]:
 
 def _numbers(initial: Mae, curve: protocol.Curve, streams: protocol.Streams) -> dict[str, float]:
     halved = protocol.samples_to_halve(curve)
-    times = SAMPLE_TIME * np.arange(len(curve.running))
+    times = np.asarray(SAMPLE_TIME * np.arange(len(curve.running)), dtype=np.float64)
     start, end = protocol.exponential_fit(times, curve.running)
     return {
         'before_rad': protocol.held_out_error(initial, streams.held_out),

@@ -19,6 +19,7 @@ from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import LeastSquares, mean_error, oracle
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -67,16 +68,17 @@ def oracle_errors(robot: Robot, seed: int, recording: Recording) -> dict[str, fl
     frictionless = individual.muscle_lengths(theta, true) + individual.length_bias
     frictionless = frictionless + rng.normal(0.0, LENGTH_NOISE, frictionless.shape)
     return {
-        'oracle_rad': mean_error(
-            estimator.estimate(tension, recording.length[::STRIDE]), theta
-        ),
+        'oracle_rad': mean_error(estimator.estimate(tension, recording.length[::STRIDE]), theta),
         'sensor_rad': mean_error(estimator.estimate(tension, frictionless), theta),
     }
 
 
 def body_error(robot: Robot, learner: OnlineLearner, recording: Recording) -> float:
     """Return the error of least squares on the body that a learner of preset default fitted."""
-    body = getattr(learner._updater, 'body')  # noqa: B009, SLF001 (preset paper has none)
+    updater = learner._updater
+    if not isinstance(updater, BodyUpdater):
+        raise TypeError('only preset default fits a body')
+    body = updater.body
     theta, tension = recording.theta[::STRIDE], recording.tension[::STRIDE]
     estimate = LearntLeastSquares(robot, body).estimate(tension, recording.length[::STRIDE])
     return mean_error(estimate, theta)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the recordings of this folder on the emulated arm, in real time.
+
+    . .ci/environment.sh … (see README.md), then: python bags/make.py exploration|rupture|faults
+
+Runs emulator, estimator and controller at 20 Hz on a graph of its own and records what hardware and
+controller send.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# A graph of its own, before rclpy reads it.
+os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+import rclpy
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from std_msgs.msg import Float64MultiArray
+
+ROBOT = 'musashi_left_arm'
+# One individual in all bags, so that what is learnt from one can be tried on another.
+INDIVIDUAL = 1
+RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
+TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
+
+
+class Arm:
+    """The running nodes, ended by pid."""
+
+    def __init__(self, bag: Path, checkpoint: Path, exploration: int) -> None:
+        """Start emulator, estimator, controller and recorder."""
+        self._processes: list[subprocess.Popen[bytes]] = []
+        common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={RATE}']
+        network = ['-p', f'checkpoint:={checkpoint}']
+        explore = ['-p', 'explore:=true', '-p', f'seed:={exploration}']
+        self._start('hardware_emulator', *common, '-p', f'seed:={INDIVIDUAL}')
+        self._start('estimator', *common, *network)
+        self._start('record', '-o', str(bag), '--topics', TOPICS)
+        self._start('controller', *common, *network, *explore, '-p', 'max_age:=0.5')
+        rclpy.init()
+        self.node = rclpy.create_node('make_bag')
+        self._emulator = AsyncParameterClient(self.node, 'hardware_emulator')
+        if not self._emulator.wait_for_services(timeout_sec=60.0):
+            raise TimeoutError('the emulator did not start within 60 s')
+
+    def _start(self, name: str, *arguments: str) -> None:
+        for prefix in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep):
+            file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
+            if file.exists():
+                self._processes.append(subprocess.Popen([sys.executable, str(file), *arguments]))
+                return
+        raise FileNotFoundError(f'{name}: not installed; run ./bringup.sh once')
+
+    def spend(self, seconds: float) -> None:
+        """Let the arm move."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+
+    def set(self, name: str, value: Any) -> None:
+        """Set a parameter of the emulator."""
+        print(f'{name}: {value}')
+        future = self._emulator.set_parameters([Parameter(name, value=value)])
+        rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
+
+    def close(self) -> None:
+        """End all processes, the recorder last but one so that the bag is complete."""
+        rclpy.shutdown()
+        for process in reversed(self._processes):
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=30)
+
+
+def exploration(arm: Arm) -> None:
+    """Ten minutes of the three steps of exploration."""
+    arm.spend(600.0)
+
+
+def rupture(arm: Arm) -> None:
+    """Two minutes of motion, from the first with a 3.6 kg dumbbell, then muscle #2 is cut."""
+    arm.spend(60.0)
+    arm.set('payload', 3.6)
+    arm.spend(60.0)
+    arm.set('ruptured_muscles', ['deltoid_anterior'])
+    arm.spend(20.0)
+
+
+def faults(arm: Arm) -> None:
+    """Two minutes of motion with faults of the sensors: a shifted length, broken messages."""
+    arm.spend(40.0)
+    offset = [0.0] * 10
+    offset[4] = 0.010
+    arm.set('length_offset', offset)
+    arm.spend(40.0)
+    arm.set('length_offset', [0.0])
+    broken = arm.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
+    for data in ([float('nan')] * 30, [0.0] * 29, [], [float('inf')] + [0.0] * 29):
+        arm.spend(10.0)
+        print(f'broken message of {len(data)} values')
+        broken.publish(Float64MultiArray(data=array('d', data)))
+
+
+RECORDINGS: dict[str, tuple[Callable[[Arm], None], int]] = {
+    'exploration': (exploration, 101),
+    'rupture': (rupture, 102),
+    'faults': (faults, 103),
+}
+
+
+def main() -> None:
+    """Record one bag into this folder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('name', choices=RECORDINGS)
+    name = parser.parse_args().name
+    bag = Path(__file__).resolve().parent / name
+    if bag.exists():
+        parser.error(f'{bag} is there already; remove it first')
+    with tempfile.TemporaryDirectory() as scratch:
+        checkpoint = Path(scratch) / 'initial.safetensors'
+        train = [sys.executable, '-c', 'from musculoskeletal_ae.tools.train import main; main()']
+        subprocess.run([*train, '--robot', ROBOT, '--out', str(checkpoint)], check=True)
+        drive, seed = RECORDINGS[name]
+        arm = Arm(bag, checkpoint, seed)
+        try:
+            drive(arm)
+        finally:
+            arm.close()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`experiment`: the paper's experiments on emulated arms, with numbers, plots and a report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tqdm import tqdm
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
+from musculoskeletal_ae.experiments.report.publish import publish
+from musculoskeletal_ae.experiments.report.readme import update_readme
+from musculoskeletal_ae.experiments.suite.registry import NAMES
+from musculoskeletal_ae.experiments.suite.run import run, total_weight
+from musculoskeletal_ae.experiments.suite.study import PRESETS, Study
+from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.robot import Robot
+
+MOST_MINUTES = 600.0
+# In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
+QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
+MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure; exit status 1 if a robot or folder is not usable, 2 for bad options."""
+    args = _parse(argv)
+    names = NAMES if args.name == 'all' else (args.name,)
+    start = time.perf_counter()
+    try:
+        Robot.load(args.robot)
+        args.out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
+            study = Study(
+                args.robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder)
+            )
+            with tqdm(
+                total=round(total_weight(study, names), 1), disable=None, bar_format=_BAR
+            ) as bar:
+
+                def report(done: float, running: str) -> None:
+                    bar.n = round(min(done, bar.total), 1)
+                    bar.set_description_str(running)
+
+                found = run(study, names, args.jobs, report)
+            if 'online_learning' not in names:
+                del found['online_learning']
+            files = publish(study, found, args.out)
+        if args.readme:
+            files += update_readme(args.out, args.readme)
+    except RobotDescriptionError as error:
+        return _failed(str(error))
+    except (MusculoskeletalError, OSError) as error:
+        return _failed(str(error))
+    except KeyboardInterrupt:
+        return 130
+    for file in files:
+        print(file)
+    print(f'{time.perf_counter() - start:.0f} s')
+    return 0
+
+
+_BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
+
+
+def _failed(message: str) -> int:
+    print(f'error: {message}', file=sys.stderr)
+    return 1
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog='experiment',
+        description='Runs an experiment of the paper on emulated arms, faster than real time and '
+        'without ROS, and writes DIR/NAME/result.json, plots, and DIR/report.html with the '
+        "paper's numbers beside. Exit status 1: the robot or a file is not usable, "
+        '2: bad options.',
+    )
+    robots = ', '.join(sorted(shipped_robots()))
+    parser.add_argument('name', metavar='NAME', choices=(*NAMES, 'all'), help=', '.join(NAMES))
+    parser.add_argument(
+        '--robot',
+        default='musashi_left_arm',
+        metavar='NAME|DIR',
+        help=f'a directory, or one of: {robots} (musashi_left_arm)',
+    )
+    parser.add_argument(
+        '--preset',
+        choices=PRESETS,
+        default='default',
+        help='whose networks are shown before and after; the other is shown beside (default)',
+    )
+    parser.add_argument(
+        '--seeds', type=_seeds, help='individual arms, e.g. 0,1,2 (0,1,2,3,4; quick: 0)'
+    )
+    parser.add_argument('--minutes', type=_minutes, help='of exploration (10; quick: 2)')
+    parser.add_argument('--quick', action='store_true', help='a taste of everything, in minutes')
+    parser.add_argument(
+        '--out', type=Path, default=Path('experiments'), metavar='DIR', help='(experiments)'
+    )
+    parser.add_argument('--jobs', type=_jobs, default=None, help='processes (one per core)')
+    parser.add_argument(
+        '--readme',
+        type=Path,
+        metavar='FILE',
+        help='also write the results table between the markers of this README',
+    )
+    args = parser.parse_args(argv)
+    args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
+    args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
+    args.jobs = args.jobs or len(os.sched_getaffinity(0))
+    return args
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        seeds = tuple(int(part) for part in text.split(','))
+    except ValueError:
+        seeds = (-1,)
+    if min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise argparse.ArgumentTypeError(f'{text!r}: expected different whole numbers, as in 0,1,2')
+    return seeds
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = -1.0
+    if not 0.2 <= minutes <= MOST_MINUTES:
+        raise argparse.ArgumentTypeError(f'{text!r}: expected 0.2 to {MOST_MINUTES:g}')
+    return minutes
+
+
+def _jobs(text: str) -> int:
+    try:
+        jobs = int(text)
+    except ValueError:
+        jobs = 0
+    if not 1 <= jobs <= 256:
+        raise argparse.ArgumentTypeError(f'{text!r}: expected 1 to 256')
+    return jobs
+
+
+if __name__ == '__main__':
+    sys.exit(main())
