@@ -20,7 +20,7 @@ NODES = [
     'replay',
     'sim',
 ]
-TOOLS = ['calibrate_emulator', 'check_robot', 'fit_series_elastic', 'train']
+TOOLS = ['calibrate_emulator', 'check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 
 def config_files() -> list[tuple[str, list[str]]]:

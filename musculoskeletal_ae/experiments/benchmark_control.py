@@ -8,6 +8,7 @@ and its gradients come from autograd.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -73,16 +74,16 @@ def eager_proposed(
     muscles = network.muscles
     posture, bias = _tensor(theta), robot.tension.bias
 
-    def lengths(at: Tensor, pull: Tensor) -> Tensor:
+    def lengths(pull: Tensor, at: Tensor) -> Tensor:
         return network.decode(_enter(network, at[None], pull[None]))[0, -muscles:]
 
     for _ in range(control.SOLVES):
-        pull = _tensor(TENSION_SCALE * tension)
-        slope = torch.autograd.functional.jacobian(lambda at: lengths(at, pull), posture)
+        at_posture = partial(lengths, _tensor(TENSION_SCALE * tension))
+        slope = torch.autograd.functional.jacobian(at_posture, posture)
         jacobian = slope.numpy().astype(float) / LENGTH_SCALE
         tension = least_tension(jacobian, torque, bias, robot.tension.limit).tension
     with torch.no_grad():
-        length = lengths(posture, _tensor(TENSION_SCALE * tension)).numpy() / LENGTH_SCALE
+        length = lengths(_tensor(TENSION_SCALE * tension), posture).numpy() / LENGTH_SCALE
     command: Array = length + msc_compensation(robot, tension)
     return command
 

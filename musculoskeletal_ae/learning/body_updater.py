@@ -60,6 +60,7 @@ class BodyUpdater:
         self.body = CorrectedBody(robot, seed=seed)
         self._trainer = Trainer(from_mae(mae), seed)
         self._rng = np.random.default_rng([seed, 0xD2])
+        self._statistics_held = True
 
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
@@ -67,6 +68,9 @@ class BodyUpdater:
         error = newest_error(self._mae, seen)
         fit = fit_body(self.body, seen, self._prior)
         changed = _changed(seen, fit)
+        if self._statistics_held and not job.statistics_hold:
+            self._trainer.hurry()
+        self._statistics_held = job.statistics_hold
         data = dream(self.body, fit.noise, max(BATCH, job.steps * BATCH // USES), self._rng)
         loss = self._trainer.train(self._with_real(data, seen, fit), job.steps)
         mae = to_mae(

@@ -124,6 +124,8 @@ class Collector:
         """Let older samples say nothing about a muscle; its healthy residuals are unknown again."""
         self.store.forget(muscle, newest)
         self.reservoir.clear()
+        if newest == 0:
+            self.reset()
 
     def clear(self) -> None:
         """Forget everything learned."""

@@ -60,6 +60,10 @@ class Trainer:
             losses.append(value.item())
         return float(np.mean(losses[len(losses) // 2 :]))
 
+    def hurry(self) -> None:
+        """Forget how long the weights were averaged: the body has changed."""
+        self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
+
     def _average(self) -> None:
         span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
         with torch.no_grad():

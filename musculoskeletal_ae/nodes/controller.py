@@ -64,7 +64,9 @@ class Controller(Shell):
             LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
             TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
         }
-        self.follow_checkpoints(self.core.use, self._unfit)
+        self.follow_checkpoints(
+            self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
+        )
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
@@ -76,8 +78,6 @@ class Controller(Shell):
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.get_parameter('explore').value:
             self.core.explore(True)
-
-    # -- parameters -----------------------------------------------------------------------------
 
     def _declare_settings(self) -> None:
         for setting in fields(Settings):
@@ -117,8 +117,6 @@ class Controller(Shell):
         self.core.posture.start()
         return None
 
-    # -- messages -------------------------------------------------------------------------------
-
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
         self.core.muscles(Muscles(*rows), time.monotonic())
@@ -133,11 +131,6 @@ class Controller(Shell):
         if self.core.clamped:
             clamped = ', '.join(self.core.clamped)
             self.get_logger().warning(f'target clamped to the joint limits: {clamped}')
-
-    def _unfit(self, reason: str) -> None:
-        self.core.stop(f'unfit checkpoint: {reason}')
-
-    # -- services -------------------------------------------------------------------------------
 
     def _explore(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         reason = self.core.explore(request.data)
@@ -155,8 +148,6 @@ class Controller(Shell):
         response.success = not reason
         response.message = f'refused: {reason}' if reason else 'going on to the last target, if any'
         return response
-
-    # -- time -----------------------------------------------------------------------------------
 
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:

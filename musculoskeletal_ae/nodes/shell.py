@@ -242,6 +242,10 @@ def run(make: Callable[[], Node]) -> None:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except rclpy_implementation.RCLError:
+        # A callback that publishes while a signal shuts the context down is no failure.
+        if rclpy.ok():
+            raise
     except (MusculoskeletalError, *PARAMETER_ERRORS) as error:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(1)

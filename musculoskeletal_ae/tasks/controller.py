@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.exploration import Exploration
@@ -91,9 +92,15 @@ class Controller:
             self.stop('anomaly_detected')
 
     def target(self, found: Mapping[str, tuple[float, float]]) -> None:
-        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs."""
+        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs.
+
+        Raises:
+            MessageError: If it leaves joints out of whose posture nothing is known yet.
+        """
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
+        if kept is None and len(found) < robot.joint_count:
+            raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
         theta = np.zeros(robot.joint_count) if kept is None else kept.copy()
         effort = self.posture.effort.copy()
         for i, name in enumerate(robot.joints):
@@ -112,6 +119,7 @@ class Controller:
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = self._exploration or Exploration(self._robot, self._seed)
         if wanted != self.posture.exploring:
+            self._exploration.begin_cycle()
             self.posture.explore(self._exploration if wanted else None)
             self.posture.theta = None
         return ''

@@ -46,30 +46,61 @@ class StepSearch(NamedTuple):
     epochs: int
 
 
+class _Stacked(NamedTuple):
+    """All terms as one affine map, since many small products cost more than a large one."""
+
+    weights: Array
+    matrix: Array
+    target: Array
+    first_rows: NDArray[np.int_]
+    term_of_row: NDArray[np.int_]
+
+    @classmethod
+    def of(cls, terms: Sequence[Term]) -> _Stacked:
+        rows = np.array([len(term.target) for term in terms])
+        return cls(
+            np.array([term.weight for term in terms]),
+            np.concatenate([term.matrix for term in terms]),
+            np.concatenate([term.target for term in terms]),
+            np.concatenate([[0], np.cumsum(rows)[:-1]]),
+            np.repeat(np.arange(len(terms)), rows),
+        )
+
+    def norms(self, y: Array) -> tuple[Array, Array]:
+        """Return all residuals (..., rows) and the norm of each term (..., K)."""
+        residual = y @ self.matrix.T
+        residual -= self.target
+        squares = np.add.reduceat(residual * residual, self.first_rows, axis=-1)
+        return residual, np.sqrt(squares)
+
+    def loss(self, y: Array) -> Array:
+        total: Array = self.norms(y)[1] @ self.weights
+        return total
+
+    def gradient(self, y: Array) -> Array:
+        residual, norms = self.norms(y)
+        slope: Array = (residual * (self.weights / (norms + TINY))[self.term_of_row]) @ self.matrix
+        return slope
+
+
 def loss(terms: Sequence[Term], y: Array) -> Array:
     """Return L for outputs y of shape (..., D+2M)."""
-    total = np.zeros(y.shape[:-1])
-    for weight, matrix, target in terms:
-        total += weight * np.sqrt(np.square(y @ matrix.T - target).sum(axis=-1))
-    return total
+    return _Stacked.of(terms).loss(y)
 
 
 def loss_gradient(terms: Sequence[Term], y: Array) -> Array:
     """Return dL/dy for one output y of shape (D+2M,)."""
-    gradient = np.zeros_like(y)
-    for weight, matrix, target in terms:
-        residual = matrix @ y - target
-        gradient += (weight / (np.sqrt(residual @ residual) + TINY)) * (residual @ matrix)
-    return gradient
+    return _Stacked.of(terms).gradient(y)
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
     """Return z after the paper's descent, from z of shape (D+M,)."""
+    stacked = _Stacked.of(terms)
     # γ = 0 is a candidate, so that the loss never rises.
     steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]
     for _ in range(search.epochs):
         y, pullback = mae.decode_pullback(z)
-        gradient = pullback(loss_gradient(terms, y))
+        gradient = pullback(stacked.gradient(y))
         candidates = z - steps * (gradient / (np.sqrt(gradient @ gradient) + TINY))
-        z = candidates[np.argmin(loss(terms, mae.decode_scaled(candidates)))]
+        z = candidates[np.argmin(stacked.loss(mae.decode_scaled(candidates)))]
     return z

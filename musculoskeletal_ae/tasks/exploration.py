@@ -55,6 +55,10 @@ class Exploration:
         self._rng = np.random.default_rng([seed, 0xE8])
         self._pending: list[Step] = []
 
+    def begin_cycle(self) -> None:
+        """Go on with a new posture, as after a pause; the stream itself goes on."""
+        self._pending = []
+
     def next_step(self) -> Step:
         """Return the next of the three steps; a new random posture starts each cycle."""
         if not self._pending:

@@ -98,7 +98,8 @@ class PostureControl:
         if self.theta is None or self._exploration is not None:
             return
         chosen = self._settings
-        constant = max(chosen.constant_tension, self._robot.tension.bias)
+        tension = self._robot.tension
+        constant = np.clip(chosen.constant_tension, tension.bias, tension.limit)
         self._constant = np.full(self._robot.muscle_count, constant)
         self._remaining = 0.0
         self.feedback.reset()

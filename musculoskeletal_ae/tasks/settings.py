@@ -42,7 +42,9 @@ class Settings:
     second_duration: float = quantity(
         2.0, 0.1, 60.0, 'of the second movement of second, and after a new checkpoint [s]'
     )
-    constant_tension: float = quantity(0.0, 0.0, 1000.0, 'T_const of first [N]; 0: T_bias')
+    constant_tension: float = quantity(
+        0.0, 0.0, 1000.0, 'T_const of first [N], within [T_bias, T_limit]'
+    )
     rate_limit: float = quantity(
         0.1, 0.001, 1.0, 'fastest change of a commanded length [m/s]; of a tension K_stiff times it'
     )

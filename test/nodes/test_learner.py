@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_it_learns_and_publishes_whole_checkpoints_that_count_up(graph, arm26, t
     learn(graph, arm, lambda: len(graph.received['mae_checkpoint']) >= 4, 'three updates')
     learn(graph, arm, lambda: samples(graph) >= 3, 'samples')
     assert versions(graph, arm26) == sorted(set(versions(graph, arm26)))
-    assert os.path.exists(os.path.join(state, 'samples.log'))
+    assert (Path(state) / 'samples.log').exists()
     assert graph.call(Trigger, 'learner/save').success
 
 
@@ -167,7 +168,7 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
     assert graph.set_parameter('learner', 'checkpoint', trained) == (True, '')
     graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
     graph.wait(lambda: samples(graph) == 0, 'an empty store')
-    assert os.path.exists(os.path.join(state, 'backup-1', 'samples.log'))
+    assert (Path(state) / 'backup-1' / 'samples.log').exists()
     assert graph.set_parameter('learner', 'fresh', True) == (True, '')
 
 

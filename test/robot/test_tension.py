@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot.tension import holding_tension
+from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
 LOW, HIGH = 30.0, 200.0
 
@@ -45,3 +45,25 @@ def test_limits_may_differ_between_muscles():
     high = np.array([200.0, 200.0, 0.0])  # the third is ruptured
     tension = holding_tension(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high, 60.0)
     np.testing.assert_allclose(tension, [70.0, 50.0, 0.0], atol=1e-9)
+
+
+def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
+    jacobian = np.array([[0.05, 0.0], [-0.05, 0.01], [0.0, -0.04]])
+    torque = np.array([40.0, 0.5])
+    found = least_tension(jacobian, torque, LOW, HIGH)
+    np.testing.assert_allclose(found.missing_torque, torque + jacobian.T @ found.tension)
+    for other in np.random.default_rng(0).uniform(LOW, HIGH, (200, 3)):
+        assert (
+            np.linalg.norm(found.missing_torque)
+            <= np.linalg.norm(torque + jacobian.T @ other) + 1e-6
+        )
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+def test_what_is_not_finite_is_refused_instead_of_solved(bad):
+    jacobian = np.array([[0.05], [-0.05]])
+    with pytest.raises(InfeasibleError, match='finite'):
+        least_tension(jacobian, np.array([bad]), LOW, HIGH)
+    jacobian[0, 0] = bad
+    with pytest.raises(InfeasibleError, match='finite'):
+        least_tension(jacobian, np.array([0.0]), LOW, HIGH)

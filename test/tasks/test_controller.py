@@ -9,6 +9,7 @@ from exact_mae import ExactMae, rest_readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.control_report import control_report
 from musculoskeletal_ae.tasks.controller import Controller
@@ -258,6 +259,28 @@ def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
     assert 'asked' in bench.core.explore(True)
     assert bench.core.reset(bench.now) == ''
     assert bench.core.posture.theta is None  # exploration is not resumed
+
+
+def test_exploration_goes_on_with_its_stream_instead_of_repeating_it():
+    bench = Bench()
+    seen = []
+    for _ in range(3):
+        bench.core.explore(True)
+        bench.core.explore(True)  # asking twice starts nothing anew
+        bench.step(5)
+        seen.append(bench.core.posture.theta)
+        bench.core.explore(False)
+        bench.step(5)
+    assert len({tuple(theta) for theta in seen}) == 3
+
+
+def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
+    bench = Bench()
+    with pytest.raises(MessageError, match='no posture yet'):
+        bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
+    bench.step()
+    bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
+    np.testing.assert_allclose(bench.core.posture.theta, [0.1, REST[1]])
 
 
 def test_heat_moves_the_load_to_other_muscles_and_is_said():

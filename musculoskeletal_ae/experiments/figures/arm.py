@@ -15,6 +15,7 @@ from musculoskeletal_ae.robot.robot import Robot
 Array = NDArray[np.float64]
 
 MARGIN = 0.03  # [m]
+HEADER = 0.9  # [inch] for the titles
 VIEW = (12.0, -35.0)  # [deg] elevation, azimuth: from the front, a little from the side
 
 
@@ -34,7 +35,10 @@ def picture_rows(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 2.7 * len(rows) + 0.6), layout='constrained')
+    height = 2.6 * len(rows) + HEADER
+    figure = Figure(figsize=(2.5 * len(columns) + 0.4, height))
+    # A layout engine would make room for the empty corners of the boxes that arms stand in.
+    figure.subplots_adjust(0.04, 0.02, 1.0, 1.0 - HEADER / height, 0.0, 0.05)
     every = np.concatenate([np.stack(thetas) for _, thetas, _ in rows])
     low, high = _reach(robot, every)
     for r, (name, thetas, tensions) in enumerate(rows):
@@ -45,11 +49,11 @@ def picture_rows(
             _draw(axes, robot, theta, tension)
             _frame(axes, low, high)
             if r == 0:
-                axes.set_title(columns[c], fontsize=10)
+                axes.set_title(columns[c], fontsize=10, pad=2)
             if c == 0:
-                axes.text2D(-0.08, 0.5, name, transform=axes.transAxes, rotation=90, va='center')
+                axes.text2D(0.0, 0.5, name, transform=axes.transAxes, rotation=90, va='center')
             note = f'‖T‖ {np.linalg.norm(tension):.0f} N'
-            axes.text2D(0.5, -0.02, note, transform=axes.transAxes, ha='center', fontsize=9)
+            axes.text2D(0.5, 0.02, note, transform=axes.transAxes, ha='center', fontsize=9)
     figure.suptitle(
         f'{title}\nmuscles: green at {robot.tension.bias:g} N, '
         f'red at {robot.tension.limit:g} N and above',
@@ -61,9 +65,11 @@ def picture_rows(
 def _draw(axes: Any, robot: Robot, theta: Array, tension: Array) -> None:
     drawing = draw_arm(robot, theta, tension)
     for bone in drawing.bones:
-        axes.plot(*bone.T, color='#B8B8AE', linewidth=6.0, solid_capstyle='round', zorder=1)
+        axes.plot(
+            *bone.T, color='#B8B8AE', linewidth=6.0, solid_capstyle='round', zorder=1, clip_on=False
+        )
     for line, colour in zip(drawing.muscles, drawing.colours, strict=True):
-        axes.plot(*line.T, color=tuple(0.85 * colour), linewidth=2.0, zorder=2)
+        axes.plot(*line.T, color=tuple(0.85 * colour), linewidth=2.0, zorder=2, clip_on=False)
 
 
 def _reach(robot: Robot, postures: Array) -> tuple[Array, Array]:
@@ -77,6 +83,6 @@ def _reach(robot: Robot, postures: Array) -> tuple[Array, Array]:
 
 def _frame(axes: Any, low: Array, high: Array) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(tuple(high - low), zoom=1.35)
+    axes.set_box_aspect(tuple(high - low), zoom=1.5)
     axes.view_init(elev=VIEW[0], azim=VIEW[1])
     axes.set_axis_off()

@@ -71,27 +71,19 @@ def _course(robot: Robot, seed: int, row: Measured, folder: Path) -> Plot:
             values = thinned(time, seen[key][rows])
             panel.semilogy(*values, color=colour, lw=1, label=f'{when} learning')
     d_axes.axhline(trace['threshold'], color=TRUE, ls=':', label="detector's threshold")
-    for panel in axes[:, 0]:
-        _events(panel, trace)
-    top = error_axes.get_ylim()[1]
-    error_axes.set_ylim(0.0, top)
+    error_axes.set_yscale('log')
     name = robot.muscles[trace['first_cut']]
     cut = float(trace['cut'][trace['first_cut']])
-    error_axes.annotate(
-        f'grasps {PAYLOAD:g} kg',
-        (trace['grasp'], 0.92 * top),
-        ha='left',
-        xytext=(4, 0),
-        textcoords='offset points',
-    )
-    error_axes.annotate(
-        f'{name} cut', (cut, 0.92 * top), ha='right', xytext=(-4, 0), textcoords='offset points'
-    )
-    tidy(error_axes, '', '‖θ_est − θ‖ [rad]', f'individual {seed}, 0.5 s running mean')
+    above = error_axes.get_xaxis_transform()
+    error_axes.text(trace['grasp'], 1.02, f'grasps {PAYLOAD:g} kg', transform=above, ha='center')
+    error_axes.text(cut, 1.02, f'{name} cut', transform=above, ha='center')
+    tidy(error_axes, '', '‖θ_est − θ‖ [rad], 0.5 s mean')
     tidy(a_axes, '', 'A [scaled units]')
     tidy(d_axes, 'time [s]', 'd [healthy std. dev.]')
     for panel in axes[:, 0]:
+        _events(panel, trace)
         panel.legend(loc='upper left', fontsize=9)
+    figure.suptitle(f'individual {seed}')
     return save(
         figure,
         folder,

@@ -38,8 +38,8 @@ def plot(study: Study, robot: Robot, rows: Mapping[int, Measured], folder: Path)
 def _pictures(robot: Robot, seed: int, row: Measured, folder: Path) -> Plot:
     trace = row.traces
     count = len(trace['theta'])
-    # The ends of the first steps of as many cycles: at rest.
-    ends = (np.arange(count * SAMPLE_TIME // CYCLE) * CYCLE + 4.9) / SAMPLE_TIME
+    # The ends of as many cycles: at rest, with the random tensions of the third step.
+    ends = (np.arange(count * SAMPLE_TIME // CYCLE) * CYCLE + 9.9) / SAMPLE_TIME
     chosen = ends[np.linspace(0, len(ends) - 1, min(MOMENTS, len(ends))).round().astype(int)]
     moments = [int(at) for at in chosen]
     rows = [

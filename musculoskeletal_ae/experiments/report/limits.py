@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,11 +25,9 @@ def limits_section(results: Results) -> str:
     if not parts:
         return ''
     missed = [row.quantity for row in ROWS if (missed_by(results, row) or 0.0) > 0.0]
-    said = (
-        'Every aim that was measured is met.'
-        if not missed
-        else f'Aims missed: {len(missed)}, see the table.'
-    )
+    said = 'Every aim that was measured is met.'
+    if missed:
+        said = f'Aims missed: {html.escape("; ".join(missed)).replace("`", "")}.'
     return f'<h2>What limits it</h2><p>{said}</p>' + ''.join(parts)
 
 
@@ -58,12 +57,20 @@ def _anomaly(found: Mapping[str, Any]) -> str:
     slow = [name for name, cut in cuts.items() if cut['detected'] < 1.0]
     misnamed = [name for name, cut in cuts.items() if cut['named'] < 1.0]
     rows = ''.join(
-        f'<tr><td>{text}</td><td>{found[f"{letter}_before_auroc"]:.4f}</td>'
-        f'<td>{found[f"{letter}_auroc"]:.4f}</td></tr>'
-        for text, letter in (('A of the paper', 'a'), ('d of the detector', 'd'))
+        f'<tr><td>{text}</td><td>{_auroc(found, letter, "before_"):.4f}</td>'
+        f'<td>{_auroc(found, letter, ""):.4f}</td></tr>'
+        for text, letter in (
+            ('cut, the module winds in: A of the paper', 'a'),
+            ('cut, the module winds in: d of the detector', 'd'),
+            ('switched off, l as it was: A of the paper', 'a_slack'),
+        )
     )
     return (
-        '<h3>Anomaly</h3><p>How well cut messages can be told from healthy ones (AUROC): </p>'
+        '<h3>Anomaly</h3><p>How well messages of a faulty muscle can be told from healthy ones '
+        '(AUROC). Here a cut wire lets its module wind in to the end, which even an untaught '
+        'network notices; the paper’s muscle was switched off, and A hardly rose before learning. '
+        'The last line is that case: messages of the loaded motion with the tension of one '
+        'carrying muscle taken for none.</p>'
         '<div class="wide"><table><thead><tr><th></th><th>before learning</th>'
         f'<th>after learning</th></tr></thead><tbody>{rows}</tbody></table></div>'
         f'<p>Largest healthy A {found["a_before_healthy_max"]:.2f} before and '
@@ -72,6 +79,11 @@ def _anomaly(found: Mapping[str, Any]) -> str:
         f'Not found on some individual: {", ".join(slow) or "none"}. Not always named: '
         f'{", ".join(misnamed) or "none"}.</p>'
     )
+
+
+def _auroc(found: Mapping[str, Any], letter: str, when: str) -> float:
+    kind, _, case = letter.partition('_')
+    return float(found[f'{kind}_{when}{case}_auroc' if case else f'{kind}_{when}auroc'])
 
 
 def _control(found: Mapping[str, Any]) -> str:

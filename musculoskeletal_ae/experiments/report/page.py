@@ -38,6 +38,7 @@ thead th { border-bottom: 2px solid #888; }
 .met { color: #00703c; } .missed { color: #b3261e; } .ours { font-weight: 600; }
 figure { margin: 1rem 0; } figure img { max-width: 100%; height: auto; border: 1px solid #eee; }
 figcaption { font-size: .9rem; color: #444; }
+@media (max-width: 50rem) { figure img { max-width: none; width: 46rem; } }
 pre { background: #f4f4f4; padding: .6rem; overflow-x: auto; } code { font-size: .9em; }
 .note { background: #fff4ce; padding: .5rem .8rem; max-width: 46rem; }
 """
@@ -95,8 +96,8 @@ def _head(results: Results) -> str:
         'Musashi does from its own: attachments millimetres off, wires round bones, other elastic '
         'units, friction, noisy sensors. The emulator was calibrated once, so that preset paper '
         'starts with the paper’s error before learning; nothing else was fitted to it. '
-        f'Robot {html.escape(about["robot"])}, individuals '
-        f'{", ".join(map(str, about["seeds"]))}; means over them.</p>'
+        f'Robot {html.escape(about["robot"])}; means over the individuals with seeds '
+        f'{", ".join(map(str, about["seeds"]))}.</p>'
         f'<p>To repeat it:</p><pre>{html.escape(command(name, about))}</pre>{quick}{mixed}'
     )
 
@@ -134,7 +135,8 @@ def _summary(results: Results) -> str:
 def _section(name: str, result: Mapping[str, Any], folder: Path) -> str:
     text = TEXTS[name]
     plots = ''.join(
-        f'<figure><img alt="{html.escape(plot["caption"])}" src="{_inline(folder / plot["file"])}">'
+        f'<figure><div class="wide"><img alt="{html.escape(plot["caption"])}" '
+        f'src="{_inline(folder / plot["file"])}"></div>'
         f'<figcaption>{_code(plot["caption"])}</figcaption></figure>'
         for plot in result['plots']
         if (folder / plot['file']).is_file()

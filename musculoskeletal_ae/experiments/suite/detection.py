@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
+from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae, State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.anomaly import AnomalyDetector
@@ -49,6 +50,13 @@ def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
         anomaly[n], distance[n], suspect[n] = verdict.anomaly, verdict.distance, verdict.suspect
         alarm[n] = bool(verdict.cause)
     return Watched(estimated.theta, anomaly, distance, suspect, alarm)
+
+
+def anomaly(mae: Mae, tension: Array, length: Array) -> Array:
+    """Return A of messages (N, M), scaled units, shape (N,)."""
+    halves = np.split(residuals(mae, tension, length), 2, axis=1)
+    total: Array = sum((np.linalg.norm(half, axis=1) for half in halves), np.zeros(len(tension)))
+    return total
 
 
 def alarms_begun(alarm: NDArray[np.bool_]) -> int:

@@ -6,16 +6,27 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.robot.robot import Robot
+
+Array = NDArray[np.float64]
 
 PAYLOAD = 3.6  # [kg], the paper's dumbbell
 #: a muscle carries tension if it pulls this much more than T_bias, far beyond the sensor's noise
 CARRYING = 10.0  # [N]
 SLOT = 20.0  # [s] for each muscle: wait until it carries tension, cut, mend, recover
 LATEST_CUT, CUT_TIME = 14.0, 3.0  # [s]
+FALLEN = 0.1  # [s] after a cut, when no tension is left
+RECOVERED = 2.0  # [s] after the mending, while the arm swings back
 EARLIEST_CUT = 5.0  # [s] drawn uniformly up to it, so that cuts fall into motion and into rest
+
+
+def message_rows(start: float, end: float) -> slice:
+    """Return the rows of a recording between two times [s]."""
+    return slice(round(start / SAMPLE_TIME), round(end / SAMPLE_TIME))
 
 
 class ScriptedArm(EmulatedArm):
@@ -67,6 +78,18 @@ class GraspAndCut:
     def duration(self) -> float:
         """Of everything [s]."""
         return self._motion + SLOT * len(self.order)
+
+    def while_cut(self, values: Array, muscle: int) -> Array:
+        """Return the rows of values (N, …) of the messages while a muscle was cut."""
+        cut = float(self.cut[muscle])
+        return values[message_rows(cut + FALLEN, cut + CUT_TIME)]
+
+    def disturbed(self, count: int) -> NDArray[np.bool_]:
+        """Return in which of so many messages a muscle is cut, or was until a moment ago."""
+        disturbed = np.zeros(count, dtype=bool)
+        for cut in self.cut:
+            disturbed[message_rows(float(cut), float(cut) + CUT_TIME + RECOVERED)] = True
+        return disturbed
 
     def __call__(self, arm: ScriptedArm) -> None:
         """Act."""

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The older estimators find the posture of a noise-free nominal arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.experiments.baselines.estimator import unstretched
+from musculoskeletal_ae.experiments.baselines.geometric import GeometricLeastSquares
+from musculoskeletal_ae.experiments.baselines.mapping import PolynomialFilter
+from musculoskeletal_ae.experiments.baselines.table import TableSearch
+from musculoskeletal_ae.robot.robot import Robot
+
+DT = 0.02
+
+
+@pytest.fixture(scope='module', params=['arm26', 'musashi_left_arm'])
+def robot(request):
+    return Robot.load(request.param)
+
+
+@pytest.fixture(scope='module')
+def motion(robot):
+    """A slow wave through the joint range, with tensions that change on the way."""
+    phase = np.linspace(0.0, 2.0 * np.pi, 300)[:, None]
+    middle, half = 0.5 * (robot.lower + robot.upper), 0.35 * (robot.upper - robot.lower)
+    theta = middle + half * np.sin(phase * np.arange(1, robot.joint_count + 1) / 2.0)
+    share = 0.5 + 0.5 * np.cos(phase * np.arange(1, robot.muscle_count + 1) / 3.0)
+    tension = robot.tension.bias + 100.0 * share
+    return theta, tension, robot.muscle_lengths(theta, tension)
+
+
+def errors(estimate, theta):
+    return np.linalg.norm(estimate - theta, axis=1)
+
+
+def test_elongation_is_taken_off_exactly(robot, motion):
+    theta, tension, length = motion
+    off = unstretched(robot, tension, length) - robot.routes.relative_lengths(theta)
+    assert np.abs(off).max() < 1e-5  # second order in wire stretch times elongation
+
+
+def test_least_squares_on_the_model_is_exact(robot, motion):
+    theta, tension, length = (part[::10] for part in motion)
+    estimate = GeometricLeastSquares(robot).estimate(tension, length, DT)
+    assert errors(estimate, theta).max() < 1e-3
+
+
+def test_the_filter_on_a_polynomial_mapping_follows_the_motion(robot, motion):
+    theta, tension, length = motion
+    estimate = PolynomialFilter(robot).estimate(tension, length, DT)
+    # What polynomials of degree 3 leave of these muscles is a few hundredths of a radian.
+    assert errors(estimate, theta)[20:].mean() < 0.05
+
+
+def test_table_search_is_as_fine_as_its_table(robot, motion):
+    theta, tension, length = motion
+    estimate = TableSearch(robot).estimate(tension, length, DT)
+    spacing = (robot.upper - robot.lower) / 100_000 ** (1.0 / robot.joint_count)
+    assert errors(estimate, theta).mean() < np.linalg.norm(spacing)
+
+
+@pytest.mark.parametrize('kind', [PolynomialFilter, TableSearch])
+def test_what_can_learn_follows_a_body_with_other_lengths(robot, motion, kind):
+    rng = np.random.default_rng(0)
+
+    def other(theta, tension):
+        """A body whose wires turn round thicker joints: lengths 20 % longer in the first joint."""
+        lengths = robot.muscle_lengths(theta, tension)
+        middle = np.repeat(theta[:, :1], robot.joint_count, axis=1)
+        middle[:, 1:] = 0.5 * (robot.lower + robot.upper)[1:]
+        return lengths + 0.2 * robot.routes.relative_lengths(middle)
+
+    seen = robot.random_postures(3000, rng)
+    pull = rng.uniform(30.0, 130.0, (3000, robot.muscle_count))
+    theta, tension, _ = motion
+    untaught, taught = kind(robot), kind(robot)
+    taught.learn(seen, pull, other(seen, pull))
+    length = other(theta, tension)
+    before, after = (
+        errors(each.estimate(tension, length, DT), theta)[20:].mean() for each in (untaught, taught)
+    )
+    assert after < before

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The corrected body and its fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_fit import Observations, Prior, fit_body
+
+
+def rms(body, theta, tension, length):
+    return float(np.sqrt(np.mean((body.lengths(theta, tension, 0 * tension)[0] - length) ** 2)))
+
+
+def test_without_corrections_it_is_the_geometric_model(arm26):
+    rng = np.random.default_rng(0)
+    theta, tension = arm26.random_postures(50, rng), rng.uniform(0.0, 300.0, (50, 6))
+    (length,) = CorrectedBody(arm26).lengths(theta, tension, np.zeros((50, 6)))
+    np.testing.assert_allclose(length, arm26.muscle_lengths(theta, tension), atol=1e-12)
+
+
+@pytest.mark.parametrize('m', range(6))
+def test_the_linearisation_is_the_derivative(other_body, arm26, m):
+    rng = np.random.default_rng(m)
+    theta, tension = arm26.random_postures(5, rng), rng.uniform(20.0, 200.0, 5)
+    sliding = rng.uniform(-1.0, 1.0, 5)
+    body = CorrectedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
+    poses = body.poses(theta)
+    _, jacobian = body.linearised(poses, theta, tension, sliding, m)
+    step = 1e-6
+    for k in range(body.layouts[m].size):
+        at = body.parameters[m][k]
+        values = []
+        for sign in (1.0, -1.0):
+            body.parameters[m][k] = at + sign * step
+            values.append(body.linearised(poses, theta, tension, sliding, m)[0])
+        body.parameters[m][k] = at
+        slope = (values[0] - values[1]) / (2.0 * step)
+        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6)
+
+
+def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):
+    states = stage.states(300)
+    nominal, body = CorrectedBody(arm26), CorrectedBody(arm26)
+    fit_body(body, stage.store(20).observations(), Prior())
+    assert rms(body, *states) < rms(nominal, *states) / 3.0
+
+
+def test_bad_samples_do_not_poison_the_fit(arm26, stage):
+    store = stage.store(60)
+    clean = CorrectedBody(arm26)
+    fit_body(clean, store.observations(), Prior())
+    for n in range(0, 60, 10):
+        store.samples[n] = store.samples[n]._replace(length=store.samples[n].length + 0.05)
+    poisoned = CorrectedBody(arm26)
+    fit = fit_body(poisoned, store.observations(), Prior())
+    states = stage.states(300)
+    assert rms(poisoned, *states) < 1.5 * rms(clean, *states)
+    assert (fit.weight[::10] < 0.1).all()
+
+
+def test_samples_that_say_nothing_change_nothing(arm26, stage):
+    observations = stage.store(1).observations()
+    nothing = Observations(*observations.__dict__.values())
+    nothing.known[:] = False
+    body = CorrectedBody(arm26)
+    fit_body(body, nothing, Prior())
+    states = stage.states(50)
+    np.testing.assert_allclose(
+        body.lengths(states[0], states[1], np.zeros((50, 6)))[0],
+        arm26.muscle_lengths(states[0], states[1]),
+        atol=1e-12,
+    )
+
+
+def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_know(arm26, stage):
+    store = stage.store(60)
+    body = CorrectedBody(arm26)
+    fit_body(body, store.observations(), Prior())
+    before = [p.copy() for p in body.parameters]
+    states = stage.states(100)
+    (known,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
+    store.forget(2)
+    for _ in range(3):
+        sample = stage.sample()
+        shift = 0.01 * (np.arange(6) == 2)
+        store.add(sample._replace(length=sample.length + shift))
+    fit_body(body, store.observations(), Prior())
+    offset = body.layouts[2].offset
+    assert abs(body.parameters[2][offset] - before[2][offset] - 0.01) < 0.001
+    (found,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
+    np.testing.assert_allclose(found[:, 0], known[:, 0], atol=5e-4)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rest, novelty, the budgeted store, the gate, the pairing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.learning.collector import MARGIN, Collector
+from musculoskeletal_ae.learning.pairing import Pairing
+from musculoskeletal_ae.learning.rest import RestDetector, RestSettings
+from musculoskeletal_ae.learning.sample import Sample
+from musculoskeletal_ae.learning.sliding import SlidingTracker
+from musculoskeletal_ae.learning.store import SampleStore
+
+DT = 0.01
+
+
+def reading(theta, length, tension=50.0):
+    return Sample(np.full(2, theta), np.full(6, tension), np.full(6, length), np.zeros(6))
+
+
+def run(detector, seconds, theta=lambda t: 0.0, length=lambda t: 0.0, measured=lambda n: True):
+    found = []
+    for n in range(round(seconds / DT)):
+        rest = detector.step(reading(theta(n * DT), length(n * DT)), measured(n), DT)
+        if rest is not None:
+            found.append(rest)
+    return found
+
+
+def test_a_still_arm_gives_its_mean_once_a_second():
+    found = run(RestDetector(RestSettings()), 3.5, lambda t: 0.3, lambda t: 0.01)
+    assert len(found) == 3
+    np.testing.assert_allclose(found[0].theta, 0.3)
+    np.testing.assert_allclose(found[0].length, 0.01)
+
+
+def test_a_moving_joint_or_wire_is_no_rest():
+    assert run(RestDetector(RestSettings()), 3.0, theta=lambda t: 0.05 * t) == []
+    assert run(RestDetector(RestSettings()), 3.0, length=lambda t: 0.01 * t) == []
+
+
+def test_rest_that_ends_early_still_counts():
+    found = run(RestDetector(RestSettings()), 2.0, theta=lambda t: max(0.0, t - 0.6))
+    assert len(found) == 1
+    np.testing.assert_allclose(found[0].theta, 0.0, atol=0.01)
+
+
+def test_sparse_noisy_angles_of_a_camera_are_averaged():
+    rng = np.random.default_rng(0)
+    found = run(
+        RestDetector(RestSettings()),
+        10.0,
+        theta=lambda t: 0.5 + 0.02 * rng.standard_normal(),
+        measured=lambda n: n % 3 == 0,
+    )
+    assert len(found) >= 5
+    errors = [f.theta[0] - 0.5 for f in found]
+    assert np.std(errors) < 0.01
+
+
+def test_no_rest_without_joint_angles():
+    assert run(RestDetector(RestSettings()), 3.0, measured=lambda n: False) == []
+
+
+def test_sliding_follows_the_last_direction_and_ignores_noise():
+    tracker, rng = SlidingTracker(1), np.random.default_rng(0)
+    length = 0.0
+    for speed, expected in ((-0.02, 1.0), (0.0, 1.0), (0.02, -1.0), (0.0, -1.0)):
+        for _ in range(100):
+            length += speed * DT
+            sliding = tracker.step(np.array([length]) + 1e-4 * rng.standard_normal(1), DT)
+        assert sliding[0] * expected > 0.6
+
+
+@given(st.lists(st.floats(-0.1, 0.1), min_size=1, max_size=50))
+def test_sliding_stays_within_one(lengths):
+    tracker = SlidingTracker(1)
+    for length in lengths:
+        assert np.abs(tracker.step(np.array([length]), DT)).max() <= 1.0 + 1e-9
+
+
+def at(*theta):
+    return Sample(np.array(theta, dtype=float), np.full(1, 50.0), np.zeros(1), np.zeros(1))
+
+
+def test_the_store_takes_only_what_is_new():
+    store = SampleStore()
+    store.add(at(0.0, 0.0))
+    assert not store.is_new(at(0.04, -0.04))
+    assert store.is_new(at(0.06, 0.0))
+    assert store.is_new(at(0.0, 0.0)._replace(tension=np.array([61.0])))
+
+
+def test_a_full_store_keeps_the_newest_and_its_coverage():
+    store, rng = SampleStore(capacity=20), np.random.default_rng(0)
+    corners = [at(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+    for corner in corners:
+        store.add(corner)
+    for _ in range(500):
+        newest = at(*rng.uniform(-0.2, 0.2, 2))
+        store.add(newest)
+        assert len(store) <= 20
+        assert store.samples[-1] is newest
+    kept = [tuple(s.theta) for s in store.samples]
+    assert all(tuple(c.theta) in kept for c in corners)
+    assert store.accepted == 504
+
+
+@pytest.fixture
+def collector(arm26):
+    return Collector(arm26)
+
+
+def rest_at(collector, arm26, theta, seconds, tension=60.0):
+    pull = np.full(6, tension)
+    length = arm26.muscle_lengths(theta, pull)
+    accepted = [collector.step(pull, length, DT, theta) for _ in range(round(seconds / DT))]
+    return [sample for sample in accepted if sample is not None]
+
+
+def test_a_rest_becomes_one_sample_after_the_margin(collector, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    assert len(rest_at(collector, arm26, theta, 1.0 + MARGIN + 0.5)) == 1
+    assert rest_at(collector, arm26, theta, 5.0) == []
+    assert collector.rejected['like a stored one'] > 0
+
+
+def test_what_comes_shortly_before_an_anomaly_is_not_learned(collector, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    rest_at(collector, arm26, theta, 2.0)
+    collector.set_anomaly(True)
+    rest_at(collector, arm26, theta, 10.0)
+    assert len(collector.store) == 0
+    healthy = collector.reservoir.time
+    collector.set_anomaly(False)
+    rest_at(collector, arm26, theta, 2.0 * MARGIN + 1.5)
+    assert len(collector.store) == 1
+    assert collector.reservoir.time > healthy
+
+
+def test_what_no_arm_can_measure_is_refused_with_a_reason(collector, arm26):
+    rest_at(collector, arm26, arm26.upper + 1.0, 5.0)
+    rest_at(collector, arm26, arm26.upper, 5.0, tension=1000.0)
+    assert len(collector.store) == 0
+    assert set(collector.rejected) == {
+        'θ far outside the joint limits',
+        'tension beyond the maximum',
+    }
+
+
+def test_the_nearest_angle_within_half_a_period_is_paired():
+    pairing = Pairing(0.01)
+    pairing.joints(0.0, np.array([0.0]))
+    assert pairing.muscles(0.001, np.ones(1), np.ones(1)) is None
+    pairing.joints(0.0115, np.array([1.0]))
+    first = pairing.muscles(0.012, np.ones(1), np.ones(1))
+    second = pairing.muscles(0.022, np.ones(1), np.ones(1))
+    third = pairing.muscles(0.032, np.ones(1), np.ones(1))
+    assert first.theta == [0.0]
+    assert second.theta == [1.0]
+    assert second.dt == pytest.approx(0.011)
+    assert third.theta is None
