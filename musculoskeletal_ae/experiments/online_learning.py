@@ -154,7 +154,7 @@ def individual(
         result[f'{prefix}after_rad'] = held_out_error(curve.learner.mae, recorded.held_out)
         result[f'{prefix}samples_to_halve'] = samples_to_halve(curve)
         if preset == 'default':
-            times = SAMPLE_TIME * np.arange(len(curve.running))
+            times = SAMPLE_TIME * np.arange(len(curve.running), dtype=float)
             result['fit_start_rad'], result['fit_end_rad'] = exponential_fit(times, curve.running)
             result['samples'] = curve.samples[-1]
             result['updates'] = curve.learner.updates

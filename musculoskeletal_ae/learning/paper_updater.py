@@ -26,7 +26,7 @@ from musculoskeletal_ae.learning.update import (
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae, to_mae
 from musculoskeletal_ae.mae.optimisers import Adam
-from musculoskeletal_ae.mae.training import TRAINING_PRESETS, loss
+from musculoskeletal_ae.mae.training import TRAINING_PRESETS, loss, one_thread
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -62,8 +62,8 @@ class PaperUpdater:
             rows = np.vstack([values[-1], np.zeros(values.shape[1]), values[stored]])
             batches.append(torch.as_tensor(np.tile(rows, (3, 1)), dtype=torch.float32))
         losses = []
-        for _ in range(EPOCHS):
-            for batch in batches:
+        with one_thread():
+            for batch in EPOCHS * batches:
                 value = loss(self._network, batch, mask, self._settings)
                 value.backward()
                 self._optimiser.step(1.0)

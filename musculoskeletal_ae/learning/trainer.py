@@ -18,7 +18,7 @@ from torch import Tensor
 from musculoskeletal_ae.learning.dream import Dream
 from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimisers import Muon
-from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY
+from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY, one_thread
 
 Array = NDArray[np.float64]
 
@@ -50,14 +50,15 @@ class Trainer:
         true = torch.as_tensor(data.true, dtype=torch.float32)
         mask = torch.arange(3).repeat_interleave(BATCH)
         losses = []
-        for _ in range(steps):
-            rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
-            value = _loss(self._restless, seen[rows], true[rows], mask)
-            value.backward()
-            self._optimiser.step(1.0)
-            self.steps += 1
-            self._average()
-            losses.append(value.item())
+        with one_thread():
+            for _ in range(steps):
+                rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
+                value = _loss(self._restless, seen[rows], true[rows], mask)
+                value.backward()
+                self._optimiser.step(1.0)
+                self.steps += 1
+                self._average()
+                losses.append(value.item())
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def hurry(self) -> None:

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ OVERLOAD_SHARE = 0.2
 # Reach of θ beyond each joint limit in preset default, as a share of the range: a network is least
 # accurate at the edge of what it saw, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
+# Between twins, in units of the spread of θ: small against the bends of a route, and large enough
+# that float32 resolves the difference.
+TWIN_DISTANCE = 0.1
 
 
 def geometric_samples(
@@ -59,6 +62,36 @@ def overload_samples(robot: Robot, count: int, rng: np.random.Generator) -> Arra
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
     highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
     return geometric_samples(robot, count, rng, highest, POSTURE_MARGIN)
+
+
+def with_twins(
+    drawn: Array,
+    std: Array,
+    joints: int,
+    muscle_lengths: Callable[[Array, Array], Array],
+    rng: np.random.Generator,
+) -> Array:
+    """Return each sample with a neighbour in posture: same T, θ off by TWIN_DISTANCE.
+
+    Args:
+        drawn: Scaled (θ, T, l), shape (N, D+2M).
+        std: Spread of the data, shape (D+2M,); directions are uniform in units of it.
+        joints: D.
+        muscle_lengths: The body's l [m] of (θ [rad], T [N]).
+        rng: Source of randomness.
+
+    Returns:
+        Samples and neighbours, shape (N, 2, D+2M).
+    """
+    muscles = (drawn.shape[1] - joints) // 2
+    direction = rng.normal(size=(len(drawn), joints))
+    direction *= TWIN_DISTANCE / np.linalg.norm(direction, axis=1, keepdims=True)
+    scale = scale_vector(joints, muscles)
+    theta, tension = np.split(drawn[:, : joints + muscles], [joints], axis=1)
+    theta = theta + direction * std[:joints]
+    length = muscle_lengths(theta / scale[:joints], tension / scale[joints : joints + muscles])
+    twin = np.concatenate([theta, tension, length * scale[-muscles:]], axis=1)
+    return np.stack([drawn, twin], axis=1)
 
 
 def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:

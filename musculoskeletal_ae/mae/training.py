@@ -48,6 +48,7 @@ class TrainingSettings:
         every_mask: Enter each sample by all three masks instead of one at random.
         weights: w_θ, w_T, w_l.
         standard_norms: Take each norm in units of the spread of the data.
+        slope_weight: w_G of the slope ∂l/∂θ through ① (`slope_loss`); needs samples in twins.
     """
 
     steps: int
@@ -59,6 +60,7 @@ class TrainingSettings:
     every_mask: bool
     weights: tuple[float, float, float]
     standard_norms: bool
+    slope_weight: float = 0.0
 
 
 # The paper prints 30 epochs and w = (1, 10, 10). Its "number of batches 100" is read as the size
@@ -85,6 +87,7 @@ TRAINING_PRESETS = {
         every_mask=True,
         weights=(1.0, 1.0, 1.0),
         standard_norms=True,
+        slope_weight=1.0,
     ),
 }
 
@@ -92,16 +95,36 @@ TRAINING_PRESETS = {
 Progress = Callable[[int, float], None]
 
 
-def loss(network: Network, values: Tensor, mask: Tensor, settings: TrainingSettings) -> Tensor:
-    """Return the mean of L_initial over a mini-batch of scaled (θ, T, l) and mask indices."""
+def loss(
+    network: Network,
+    values: Tensor,
+    mask: Tensor,
+    settings: TrainingSettings,
+    twins: int = 0,
+) -> Tensor:
+    """Return the mean of L_initial over a mini-batch of scaled (θ, T, l) and mask indices.
+
+    Args:
+        network: The network.
+        values: Scaled (θ, T, l), shape (N, D+2M).
+        mask: Indices of masks, shape (N,).
+        settings: Weights.
+        twins: The last so many rows are neighbours of the first so many, all entered by ①.
+    """
     joints, muscles = network.joints, network.muscles
     error = network.decode_standard(network.encode(values, mask))
     error = error - (values - network.mean) / network.std  # (N, D+2M)
+    result = error.new_zeros(())
+    if twins:
+        # The slope of the error between neighbours is the error of the slope.
+        between = (error[-twins:] - error[:twins])[:, -muscles:] / samples.TWIN_DISTANCE
+        result = settings.slope_weight * (between.square().sum(dim=1) + TINY).sqrt().mean()
+        error = error[:-twins]
     if not settings.standard_norms:
         error = error * network.std
     parts = error.square().split([joints, muscles, muscles], dim=1)
     norms = torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts])  # (3,)
-    return norms @ norms.new_tensor(settings.weights)
+    return result + norms @ norms.new_tensor(settings.weights)
 
 
 def fit(
@@ -131,15 +154,23 @@ def fit(
     else:
         optimiser = Adam(network, settings.step_size)
     losses = []
-    with _one_thread():
+    with one_thread():
         for step in range(settings.steps):
-            values = torch.as_tensor(next(batches), dtype=torch.float32)  # (N, D+2M)
+            values = torch.as_tensor(
+                next(batches), dtype=torch.float32
+            )  # (N, D+2M) or (N, 2, D+2M)
+            twins = len(values) if settings.slope_weight > 0.0 and values.ndim == 3 else 0
+            own = values[:, 0] if values.ndim == 3 else values  # (N, D+2M)
             if settings.every_mask:
-                mask = torch.arange(3).repeat_interleave(len(values))
-                values = values.repeat(3, 1)  # (3N, D+2M)
+                mask = torch.arange(3).repeat_interleave(len(own))
+                rows = own.repeat(3, 1)  # (3N, D+2M)
             else:
-                mask = torch.randint(3, (len(values),), generator=generator)
-            value = loss(network, values, mask, settings)
+                mask = torch.randint(3, (len(own),), generator=generator)
+                rows = own
+            if twins:
+                mask = torch.cat([mask, mask.new_zeros(twins)])
+                rows = torch.cat([rows, values[:, 1]])  # (4N, D+2M)
+            value = loss(network, rows, mask, settings, twins)
             value.backward()
             optimiser.step(annealing(step / settings.steps) if settings.annealed else 1.0)
             losses.append(value.item())
@@ -183,6 +214,8 @@ def initial_training(
     if PRESETS[preset].standardise:
         drawn = samples.overload_samples(robot, settings.samples, rng)
         mean, std = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), LEAST_SPREAD)
+        if settings.slope_weight > 0.0:
+            drawn = samples.with_twins(drawn, std, robot.joint_count, robot.muscle_lengths, rng)
     else:
         drawn = samples.geometric_samples(robot, settings.samples, rng, robot.tension.max)
     with torch.random.fork_rng(devices=[]):
@@ -193,7 +226,7 @@ def initial_training(
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Use one core: matrices this small gain little from two, and lose much if one is busy."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -42,12 +42,12 @@ def test_committed_results_are_of_full_runs():
 
 def test_a_run_is_kept_and_its_table_written(quick, tmp_path):
     readme = tmp_path / 'README.md'
-    readme.write_text(f'before\n{BEGIN}\nold\n{END}\nafter\n', encoding='utf-8')
+    readme.write_text(f'before\n{BEGIN}\nlast year\n{END}\nafter\n', encoding='utf-8')
     files = update_readme(quick, readme)
     assert (tmp_path / KEPT / 'control' / 'result.json') in files
     text = readme.read_text(encoding='utf-8')
     assert text.startswith('before\n') and text.endswith('\nafter\n')
-    assert 'old' not in text
+    assert 'last year' not in text
     assert text.count('\n| ') == 1 + len(ROWS)
     assert main([str(readme)]) == 0
     assert readme.read_text(encoding='utf-8') == text

@@ -22,7 +22,7 @@ def reading(theta, length, tension=50.0):
     return Sample(np.full(2, theta), np.full(6, tension), np.full(6, length), np.zeros(6))
 
 
-def run(detector, seconds, theta=lambda t: 0.0, length=lambda t: 0.0, measured=lambda n: True):
+def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=lambda _: True):
     found = []
     for n in range(round(seconds / DT)):
         rest = detector.step(reading(theta(n * DT), length(n * DT)), measured(n), DT)
@@ -32,7 +32,7 @@ def run(detector, seconds, theta=lambda t: 0.0, length=lambda t: 0.0, measured=l
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
-    found = run(RestDetector(RestSettings()), 3.5, lambda t: 0.3, lambda t: 0.01)
+    found = run(RestDetector(RestSettings()), 3.5, lambda _: 0.3, lambda _: 0.01)
     assert len(found) == 3
     np.testing.assert_allclose(found[0].theta, 0.3)
     np.testing.assert_allclose(found[0].length, 0.01)
@@ -54,7 +54,7 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
     found = run(
         RestDetector(RestSettings()),
         10.0,
-        theta=lambda t: 0.5 + 0.02 * rng.standard_normal(),
+        theta=lambda _: 0.5 + 0.02 * rng.standard_normal(),
         measured=lambda n: n % 3 == 0,
     )
     assert len(found) >= 5
@@ -63,7 +63,7 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
 
 
 def test_no_rest_without_joint_angles():
-    assert run(RestDetector(RestSettings()), 3.0, measured=lambda n: False) == []
+    assert run(RestDetector(RestSettings()), 3.0, measured=lambda _: False) == []
 
 
 def test_sliding_follows_the_last_direction_and_ignores_noise():

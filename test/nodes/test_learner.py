@@ -50,7 +50,7 @@ class Arm:
         self.graph.spin(0.01)
 
 
-def start(graph, robot, **parameters):
+def start(graph, **parameters):
     """Start a learner and listen to it."""
     process = graph.start('learner', robot='arm26', **{**QUICK, **parameters})
     graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
@@ -93,7 +93,7 @@ def samples(graph):
 
 
 def test_it_learns_and_publishes_whole_checkpoints_that_count_up(graph, arm26, trained, state):
-    start(graph, arm26, checkpoint=trained, state_directory=state)
+    start(graph, checkpoint=trained, state_directory=state)
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: len(graph.received['mae_checkpoint']) >= 4, 'three updates')
     learn(graph, arm, lambda: samples(graph) >= 3, 'samples')
@@ -103,7 +103,7 @@ def test_it_learns_and_publishes_whole_checkpoints_that_count_up(graph, arm26, t
 
 
 def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
-    process = start(graph, arm26, checkpoint=trained, state_directory=state)
+    process = start(graph, checkpoint=trained, state_directory=state)
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 4, 'samples')
     stored, version = samples(graph), versions(graph, arm26)[-1]
@@ -111,7 +111,7 @@ def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
     process.end(signal.SIGKILL)
     graph.processes.remove(process)
     graph.received['/diagnostics'].clear()
-    start(graph, arm26, checkpoint='/no/such/file', state_directory=state)
+    start(graph, checkpoint='/no/such/file', state_directory=state)
     graph.wait(lambda: samples(graph) >= stored, 'the samples of before')
     graph.wait(lambda: versions(graph, arm26)[-1] >= version, 'the network of before')
     graph.wait(lambda: not _alive(worker), 'the end of the orphaned training process')
@@ -126,7 +126,7 @@ def _alive(pid):
 
 
 def test_an_anomaly_stops_learning_until_the_reset(graph, arm26, trained):
-    start(graph, arm26, checkpoint=trained, state_directory='')
+    start(graph, checkpoint=trained, state_directory='')
     arm = Arm(graph, arm26)
     detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
     learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
@@ -141,7 +141,7 @@ def test_an_anomaly_stops_learning_until_the_reset(graph, arm26, trained):
 
 
 def test_enable_stops_and_resumes(graph, arm26, trained):
-    start(graph, arm26, checkpoint=trained, state_directory='')
+    start(graph, checkpoint=trained, state_directory='')
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
     assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
@@ -156,7 +156,7 @@ def test_enable_stops_and_resumes(graph, arm26, trained):
 def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backup(
     graph, arm26, trained, state, tmp_path
 ):
-    start(graph, arm26, checkpoint=trained, state_directory=state)
+    start(graph, checkpoint=trained, state_directory=state)
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
     broken = tmp_path / 'broken.safetensors'
@@ -173,7 +173,7 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
 
 
 def test_a_training_process_that_dies_is_noticed_and_replaced(graph, arm26, trained):
-    start(graph, arm26, checkpoint=trained, state_directory='')
+    start(graph, checkpoint=trained, state_directory='')
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 2 and 'update' in values(graph), 'an update')
     first = values(graph)['training process']
@@ -185,7 +185,7 @@ def test_a_training_process_that_dies_is_noticed_and_replaced(graph, arm26, trai
 
 
 def test_relearning_names_legal_muscles(graph, arm26, trained, state):
-    start(graph, arm26, checkpoint=trained, state_directory=state)
+    start(graph, checkpoint=trained, state_directory=state)
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
     success, reason = graph.set_parameter('learner', 'relearn_muscles', ['no_such_muscle'])
@@ -225,8 +225,8 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
     graph.wait(refused, 'the refusal of another frame')
 
 
-def test_two_learners_do_not_share_a_directory(graph, arm26, trained, state):
-    start(graph, arm26, checkpoint=trained, state_directory=state)
+def test_two_learners_do_not_share_a_directory(graph, trained, state):
+    start(graph, checkpoint=trained, state_directory=state)
     graph.wait(lambda: graph.received['mae_checkpoint'], 'the first one')
     second = graph.start('learner', robot='arm26', state_directory=state)
     graph.processes.remove(second)
@@ -236,8 +236,8 @@ def test_two_learners_do_not_share_a_directory(graph, arm26, trained, state):
     assert 'Traceback' not in output
 
 
-def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, arm26, trained):
-    process = start(graph, arm26, checkpoint=trained, state_directory='')
+def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained):
+    process = start(graph, checkpoint=trained, state_directory='')
     graph.wait(lambda: 'training process' in values(graph), 'the training process')
     worker = int(values(graph)['training process'])
     status, output = process.end(signal.SIGINT)
