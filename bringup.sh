@@ -265,7 +265,9 @@ common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
 start estimator estimator "${common[@]}"
 start sim sim "${common[@]}"
-[ $learner = false ] || start learner learner "${common[@]}"
+# What is learnt here stays with the logs: the next run may be another arm.
+[ $learner = false ] ||
+  start learner learner "${common[@]}" -p "state_directory:=$(quoted "$logs/learner")"
 [ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"
 if [ -n "$bag" ]; then
   start replay replay "$bag" --clock "${remap[@]}"

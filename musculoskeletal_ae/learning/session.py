@@ -25,8 +25,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: between two updates [s], so that checkpoints leave at 1 Hz at most
 LEAST_INTERVAL = 1.0
-#: updates that go on training after the newest sample
-AFTER_NEWEST = 10
+#: updates that a new sample is worth: its own, and one more of training
+AFTER_NEWEST = 2
 #: until a training process that died is started again [s], doubled each time up to the longest
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
 
@@ -143,7 +143,7 @@ class Session:
         if self._journal is not None:
             try:
                 self._journal.append(sample, self._collector.store)
-            except OSError as error:
+            except (StateError, OSError) as error:
                 self.trouble = f'samples cannot be saved: {error}'
             else:
                 if self.trouble.startswith('samples'):
@@ -241,11 +241,16 @@ class Session:
             if self.data is not None:
                 self._keep_and_hand_out(checkpoint.from_bytes(self.data, self._robot))
             return
+        if answer.unsaved:
+            self.trouble = f'the network cannot be saved: {answer.unsaved}'
         self._statistics_hold |= answer.calibrated
         self.data = answer.checkpoint
         self._hand_out(answer.checkpoint)
-        for muscle, newest in answer.changed:
-            self.relearn(muscle, newest)
+        try:
+            for muscle, newest in answer.changed:
+                self.relearn(muscle, newest)
+        except (MusculoskeletalError, OSError) as error:
+            self.trouble = f'the state cannot be saved: {error}'
 
     def _hand_out(self, data: bytes) -> None:
         self._checkpoints += 1

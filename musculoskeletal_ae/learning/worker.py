@@ -46,8 +46,12 @@ def serve(connection: Connection) -> None:
         begun = time.perf_counter()
         update = updater.update(message)
         # A node that was killed may have a successor, which keeps its own.
+        unsaved = ''
         if file is not None and os.getppid() == node:
-            checkpoint.save(update.mae, file)
+            try:
+                checkpoint.save(update.mae, file)
+            except OSError as error:
+                unsaved = str(error)
         anomaly = update.mae.anomaly
         connection.send(
             Answer(
@@ -58,6 +62,7 @@ def serve(connection: Connection) -> None:
                 update.noise,
                 update.changed,
                 anomaly is not None and anomaly.calibrated,
+                unsaved,
                 time.perf_counter() - begun,
             )
         )

@@ -7,6 +7,7 @@ import queue
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -42,7 +43,10 @@ class Start(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What came of a job: `Update` in a form that crosses processes, and the time it took [s]."""
+    """What came of a job: `Update` in a form that crosses processes.
+
+    Beside it: why the network could not be saved, or '', and the time that the update took [s].
+    """
 
     checkpoint: bytes
     version: int
@@ -51,6 +55,7 @@ class Answer(NamedTuple):
     noise: Array
     changed: tuple[tuple[int, int], ...]
     calibrated: bool
+    unsaved: str
     seconds: float
 
 
@@ -65,6 +70,8 @@ class WorkerProcess:
 
     def __init__(self, start: Start) -> None:
         """Start the process."""
+        # A file, because nobody reads a pipe while the process lives.
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
         ours, theirs = socket.socketpair()
         with theirs:
             # Its own module, on the interpreter that runs this.
@@ -72,7 +79,7 @@ class WorkerProcess:
                 [sys.executable, '-m', 'musculoskeletal_ae.learning.worker', str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
+                stderr=self._errors,
             )
         self._connection = Connection(ours.detach())
         self.busy = False
@@ -107,8 +114,9 @@ class WorkerProcess:
         if isinstance(answer, Exception):
             self.dead = f'{type(answer).__name__} {answer}'.strip()
             with suppress(subprocess.TimeoutExpired):
-                _, text = self._process.communicate(timeout=ENDING)
-                lines = text.decode(errors='replace').strip().splitlines()
+                self._process.wait(ENDING)
+                self._errors.seek(0)
+                lines = self._errors.read().decode(errors='replace').strip().splitlines()
                 self.dead = f'status {self._process.returncode} {lines[-1] if lines else ""}'
             return None
         return answer
@@ -124,8 +132,7 @@ class WorkerProcess:
             self._process.kill()
             self._process.wait()
         self._thread.join(ENDING)
-        if self._process.stderr:
-            self._process.stderr.close()
+        self._errors.close()
 
     def _talk(self) -> None:
         with self._connection as connection:

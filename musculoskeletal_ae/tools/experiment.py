@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.report.publish import publish
 from musculoskeletal_ae.experiments.report.readme import update_readme
 from musculoskeletal_ae.experiments.suite.registry import NAMES
@@ -32,6 +33,8 @@ def main(argv: list[str] | None = None) -> int:
     args = _parse(argv)
     names = NAMES if args.name == 'all' else (args.name,)
     start = time.perf_counter()
+    # Ended by whoever started it, it clears up as on Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         Robot.load(args.robot)
         args.out.mkdir(parents=True, exist_ok=True)
@@ -53,10 +56,9 @@ def main(argv: list[str] | None = None) -> int:
             files = publish(study, found, args.out)
         if args.readme:
             files += update_readme(args.out, args.readme)
-    except RobotDescriptionError as error:
-        return _failed(str(error))
     except (MusculoskeletalError, OSError) as error:
-        return _failed(str(error))
+        print(f'error: {error}', file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     for file in files:
@@ -66,11 +68,6 @@ def main(argv: list[str] | None = None) -> int:
 
 
 _BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
-
-
-def _failed(message: str) -> int:
-    print(f'error: {message}', file=sys.stderr)
-    return 1
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
@@ -93,7 +90,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         '--preset',
         choices=PRESETS,
         default='default',
-        help='whose networks are shown before and after; the other is shown beside (default)',
+        help='whose networks are measured; preset paper is always shown beside (default)',
     )
     parser.add_argument(
         '--seeds', type=_seeds, help='individual arms, e.g. 0,1,2 (0,1,2,3,4; quick: 0)'

@@ -22,6 +22,7 @@ from musculoskeletal_ae.experiments.figures.style import (
     tidy,
 )
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
+from musculoskeletal_ae.experiments.suite.roles import plotted
 from musculoskeletal_ae.experiments.suite.scenario import CUT_TIME, PAYLOAD
 from musculoskeletal_ae.experiments.suite.study import Measured, Study
 from musculoskeletal_ae.robot.robot import Robot
@@ -100,15 +101,16 @@ def _tracking(robot: Robot, seed: int, row: Measured, folder: Path) -> Plot:
     count = robot.joint_count
     figure, axes = new_figure(12.0, 1.6 * count + 0.8, count, 1, sharex=True)
     for joint, panel in enumerate(axes[:, 0]):
+        factor, unit = plotted(robot, joint)
         for when, colour in WHEN.items():
-            angle = np.degrees(trace[when]['theta'][rows, joint])
+            angle = factor * trace[when]['theta'][rows, joint]
             panel.plot(*thinned(time, angle), color=colour, lw=0.8, label=f'{when} learning')
-        true = np.degrees(trace['theta'][rows, joint])
+        true = factor * trace['theta'][rows, joint]
         panel.plot(*thinned(time, true), color=TRUE, lw=1.2, label='true')
         span = np.ptp(true) + 1.0
         panel.set_ylim(true.min() - 0.4 * span, true.max() + 0.4 * span)
         _events(panel, trace)
-        tidy(panel, '', f'{robot.joints[joint]}\n[deg]')
+        tidy(panel, '', f'{robot.joints[joint]}\n[{unit}]')
     axes[0, 0].legend(loc='lower left', ncols=3, fontsize=9)
     axes[0, 0].set_title(f'individual {seed}')
     axes[-1, 0].set_xlabel('time [s]')
@@ -134,7 +136,7 @@ def _cuts(robot: Robot, rows: Mapping[int, Measured], folder: Path) -> Plot:
                 panel.plot(each, place + shift, 'o', color=colour, alpha=0.6, ms=5)
             panel.plot([], [], 'o', color=colour, label=f'cut, {when} learning')
             panel.axvline(calm, color=colour, ls='--', lw=1, label=f'largest healthy, {when}')
-        panel.set_xscale('log')
+        _whole_decades(panel)
         tidy(panel, f'{title} [{"scaled units" if letter == "a" else "healthy std. dev."}]')
         panel.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=2)
     panel = axes[0, 2]
@@ -164,6 +166,13 @@ def _cuts(robot: Robot, rows: Mapping[int, Measured], folder: Path) -> Plot:
     )
 
 
+def _whole_decades(panel: Any) -> None:
+    """Use a logarithmic axis that begins and ends with a labelled tick."""
+    low, high = panel.dataLim.intervalx
+    panel.set_xscale('log')
+    panel.set_xlim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
+
+
 def _rivals(study: Study, rows: Mapping[int, Measured], folder: Path) -> Plot:
     numbers = [row.numbers for row in rows.values()]
     names = [f'autoencoder, preset {study.preset}', *numbers[0]['baselines']]
@@ -176,10 +185,17 @@ def _rivals(study: Study, rows: Mapping[int, Measured], folder: Path) -> Plot:
     place = np.arange(len(names))
     for when, shift in (('before', -0.2), ('after', 0.2)):
         values = np.array(pairs[when])
-        bars = panel.barh(
-            place + shift, values.mean(axis=1), 0.38, color=WHEN[when], label=f'{when} learning'
-        )
-        panel.bar_label(bars, fmt='%.3f', padding=12, fontsize=9)
+        mean = values.mean(axis=1)
+        panel.barh(place + shift, mean, 0.38, color=WHEN[when], label=f'{when} learning')
+        for at, number, furthest in zip(place + shift, mean, values.max(axis=1), strict=True):
+            panel.annotate(
+                f'{number:.3f}',
+                (furthest, at),
+                xytext=(6, 0),
+                va='center',
+                fontsize=9,
+                textcoords='offset points',
+            )
         for each in values.T:
             panel.plot(each, place + shift, '.', color=TRUE, ms=4)
     panel.set_yticks(place, names)

@@ -11,6 +11,7 @@ import numpy as np
 from musculoskeletal_ae.experiments.figures.arm import picture_rows
 from musculoskeletal_ae.experiments.figures.style import TRUE, Plot, new_figure, save, tidy
 from musculoskeletal_ae.experiments.suite.loss_change import PHASES, STEP
+from musculoskeletal_ae.experiments.suite.roles import plotted
 from musculoskeletal_ae.experiments.suite.study import Measured, Study
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -37,12 +38,18 @@ def _traces(robot: Robot, seed: int, row: Measured, folder: Path) -> Plot:
     shared = time < edges[UNFORCED] - 1e-9
     names = {'theta': robot.joints, 'tension': robot.muscles}
     for panel, key in ((axes[0, 0], 'theta'), (axes[1, 0], 'tension')):
-        factor = 180.0 / np.pi if key == 'theta' else 1.0
         for i, name in enumerate(names[key]):
             colour = f'C{i}'
+            factor, unit = plotted(robot, i) if key == 'theta' else (1.0, 'N')
             simulated = factor * row.traces['after'][key][:, i]
             arm = np.where(shared, factor * row.traces['arm'][key][:, i], np.nan)
-            panel.plot(time, simulated, color=colour, lw=1.6, label=name)
+            panel.plot(
+                time,
+                simulated,
+                color=colour,
+                lw=1.6,
+                label=name if unit in ('deg', 'N') else f'{name} [{unit}]',
+            )
             panel.plot(time, arm, color=colour, lw=1.0, ls='--')
         panel.plot([], [], color=TRUE, lw=1.6, label='simulator after learning')
         panel.plot([], [], color=TRUE, lw=1.0, ls='--', label='emulated arm')

@@ -95,6 +95,14 @@ def _control(found: Mapping[str, Any]) -> str:
         for name, row in found.items()
         if isinstance(row, Mapping) and 'error_rad' in row
     )
+    causes, shape = found['proposed_causes'], found['proposed']
+    why = (
+        f'‖T‖ of <code>proposed</code> beside the bound: {causes["planned_to_bound"]:.2f} as '
+        'planned on the learnt body (beyond 1: the error of its muscle Jacobian), '
+        f'{causes["frictionless_to_bound"]:.2f} on the same arm without friction (with '
+        f'{causes["frictionless_rad"]:.3f} rad left), {shape["tension_to_bound"]:.2f} on the arm: '
+        'the difference is friction, which adds to what the module measures in wires wound in.'
+    )
     return (
         '<h3>Control</h3><p>What all starts of a target have in common is the error of the '
         'learnt body and of the command; their scatter is hysteresis, which no model at rest can '
@@ -102,6 +110,7 @@ def _control(found: Mapping[str, Any]) -> str:
         '<div class="wide"><table><thead><tr><th>method</th><th>error [rad]</th>'
         '<th>in common [rad]</th><th>scatter [rad]</th><th>‖T‖ [N]</th><th>‖T‖ / bound</th>'
         f'<th>bound where it rests [N]</th></tr></thead><tbody>{rows}</tbody></table></div>'
+        f'<p>{why}</p>'
     )
 
 

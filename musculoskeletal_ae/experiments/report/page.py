@@ -76,7 +76,10 @@ def command(name: str, about: Mapping[str, Any]) -> str:
 def _head(results: Results) -> str:
     abouts = [result['about'] for result in results.values()]
     about = abouts[0]
-    name = 'all' if len(results) == len(TEXTS) else next(iter(results))
+    names = ['all'] if len(results) == len(TEXTS) else list(results)
+    commands = '\n'.join(
+        command(name, results.get(name, {'about': about})['about']) for name in names
+    )
     quick = (
         '<p class="note">A run with --quick: one short taste of everything. Its numbers say '
         'nothing about what the method can do.</p>'
@@ -98,7 +101,7 @@ def _head(results: Results) -> str:
         'starts with the paper’s error before learning; nothing else was fitted to it. '
         f'Robot {html.escape(about["robot"])}; means over the individuals with seeds '
         f'{", ".join(map(str, about["seeds"]))}.</p>'
-        f'<p>To repeat it:</p><pre>{html.escape(command(name, about))}</pre>{quick}{mixed}'
+        f'<p>To repeat it:</p><pre>{html.escape(commands)}</pre>{quick}{mixed}'
     )
 
 
@@ -120,6 +123,8 @@ def _summary(results: Results) -> str:
             f'<span class="{kind}">{verdict(results, row)}</span>',
         ]
         lines.append('<tr>' + ''.join(f'<td>{cell}</td>' for cell in cells) + '</tr>')
+    if not lines:
+        return ''
     preset = next(iter(results.values()))['about']['preset']
     heads = ['', 'paper, on Musashi', 'preset paper', f'preset {preset}', 'oracle or bound', 'aim']
     head = ''.join(f'<th>{text}</th>' for text in (*heads, ''))

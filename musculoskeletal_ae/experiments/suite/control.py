@@ -22,8 +22,11 @@ from musculoskeletal_ae.experiments.control import (
     holdable_postures,
     least_holding_tension,
 )
+from musculoskeletal_ae.experiments.suite.scenario import frictionless
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tasks.control import proposed
 from musculoskeletal_ae.tasks.settings import Settings
 
 Array = NDArray[np.float64]
@@ -67,8 +70,34 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
             'bound_reached_n': float(reached[m][held].mean()) if held.any() else 0.0,
             'reached_holdable_share': float(held.mean()),
         }
+    targets = np.array([theta for theta, _ in evaluated])
+    numbers['proposed_causes'] = _causes(robot, networks['default'], seed, targets, bounds)
     traces = {'errors': errors, 'tensions': tensions, 'bounds': bounds}
     return Measured(numbers, traces)
+
+
+def _causes(robot: Robot, mae: Mae, seed: int, targets: Array, bounds: Array) -> dict[str, float]:
+    """Return what `proposed` plans, and what comes of it on the same body without friction.
+
+    The plan's ‖T‖ beside the bound is the learnt body's error; what the frictionless arm has beyond
+    it comes from the tensions' being commanded as lengths, and the rest is friction.
+    """
+    arm = frictionless(robot, seed)
+    planned, errors, tensions = [], [], []
+    for theta in targets:
+        torque = robot.kinematics.holding_torque(theta)
+        none = np.full(robot.muscle_count, robot.tension.bias)
+        plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
+        planned.append(float(np.linalg.norm(plan.tension)))
+        start = 0.5 * (robot.lower + robot.upper)
+        came = approach(arm, mae, Settings(method='proposed'), start, theta)
+        errors.append(came.error)
+        tensions.append(came.tension)
+    return {
+        'planned_to_bound': float((np.array(planned) / bounds).mean()),
+        'frictionless_to_bound': float((np.array(tensions) / bounds).mean()),
+        'frictionless_rad': float(np.mean(errors)),
+    }
 
 
 def _bound(robot: Robot, arm: EmulatedArm) -> float:

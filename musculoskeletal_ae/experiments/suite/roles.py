@@ -11,21 +11,34 @@ ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
 
 
 def elbow(robot: Robot) -> int:
-    """Return the joint to flex: elbow_pitch, else a joint called elbow, else the last."""
-    return _named(robot, ELBOW, robot.joint_count - 1)
+    """Return the joint to flex: elbow_pitch, else an elbow, else the last that turns."""
+    return _named(robot, ELBOW, -1)
 
 
 def shoulder(robot: Robot) -> int:
-    """Return the joint to force and to sweep: shoulder_pitch, else a shoulder, else the first."""
+    """Return the joint to force and sweep: shoulder_pitch, a shoulder, or the first that turns."""
     return _named(robot, SHOULDER, 0)
 
 
 def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
+    turning = [index for index in range(robot.joint_count) if not slides(robot, index)]
     for name in names:
-        for index, joint in enumerate(robot.joints):
-            if name in joint:
+        for index in turning:
+            if name in robot.joints[index]:
                 return index
-    return otherwise
+    return (turning or range(robot.joint_count))[otherwise]
+
+
+def slides(robot: Robot, joint: int) -> bool:
+    """Return whether a joint is prismatic, so that its θ is in metres."""
+    kin = robot.kinematics
+    tree = [i for i in range(1, len(kin.parent)) if kin.theta_index[i] == joint]
+    return bool(kin.prismatic[tree[0]])
+
+
+def plotted(robot: Robot, joint: int) -> tuple[float, str]:
+    """Return by what a joint's θ is multiplied in plots, and the unit it then has."""
+    return (1000.0, 'mm') if slides(robot, joint) else (math.degrees(1.0), 'deg')
 
 
 def within(robot: Robot, joint: int, degrees: float) -> float:

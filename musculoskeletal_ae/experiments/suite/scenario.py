@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -27,6 +28,14 @@ EARLIEST_CUT = 5.0  # [s] drawn uniformly up to it, so that cuts fall into motio
 def message_rows(start: float, end: float) -> slice:
     """Return the rows of a recording between two times [s]."""
     return slice(round(start / SAMPLE_TIME), round(end / SAMPLE_TIME))
+
+
+def frictionless(robot: Robot, seed: int) -> EmulatedArm:
+    """Return an individual as it would be without friction in wires and joints."""
+    individual = Individual(robot, seed)
+    individual.cable_friction[:] = 0.0
+    individual.joint_friction[:] = 0.0
+    return EmulatedArm(robot, seed, individual)
 
 
 class ScriptedArm(EmulatedArm):

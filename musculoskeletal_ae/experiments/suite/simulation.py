@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
 from musculoskeletal_ae.experiments.suite.learning import HELD_OUT
+from musculoskeletal_ae.experiments.suite.scenario import frictionless
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -54,10 +53,7 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
 
 
 def _frictionless(robot: Robot, seed: int, arm: Recording) -> dict[str, float]:
-    individual = Individual(robot, seed)
-    individual.cable_friction[:] = 0.0
-    individual.joint_friction[:] = 0.0
-    body = EmulatedArm(robot, seed, individual)
+    body = frictionless(robot, seed)
     theta, tension = np.empty_like(arm.theta), np.empty_like(arm.tension)
     for n, command in enumerate(arm.command):
         body.command_length(command)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which joints play elbow and shoulder on robots that name none."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from robots import write_robot
+
+from musculoskeletal_ae.experiments.suite.roles import (
+    elbow,
+    flexed,
+    plotted,
+    shoulder,
+    slides,
+    within,
+)
+from musculoskeletal_ae.robot.robot import Robot
+
+
+@pytest.mark.parametrize(
+    ('name', 'flexes', 'forced'),
+    [('musashi_left_arm', 'elbow_pitch', 'shoulder_pitch'), ('arm26', 'elbow', 'shoulder')],
+)
+def test_joints_are_found_by_name(name, flexes, forced):
+    robot = Robot.load(name)
+    assert robot.joints[elbow(robot)] == flexes
+    assert robot.joints[shoulder(robot)] == forced
+    assert flexed(robot) == pytest.approx(-0.5 * math.pi)
+    assert within(robot, shoulder(robot), 30.0) == pytest.approx(math.radians(30.0), abs=1e-3)
+
+
+def test_foreign_names_leave_the_first_and_the_last_joint_that_turn(tmp_path):
+    robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
+    assert slides(robot, robot.joint_count - 1)
+    assert shoulder(robot) == 0
+    assert elbow(robot) == robot.joint_count - 2
+    assert plotted(robot, robot.joint_count - 1) == (1000.0, 'mm')
+    assert robot.lower[elbow(robot)] <= flexed(robot) <= robot.upper[elbow(robot)]
