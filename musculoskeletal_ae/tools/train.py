@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
+from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.evaluation import OUTPUTS, PairError, pair_errors, unseen_states
 from musculoskeletal_ae.mae.initial import Trained, initial_mae
@@ -20,7 +21,7 @@ from musculoskeletal_ae.mae.training import TRAINING_PRESETS
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools.train_from_bag import train_from_bags
+from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     if args.from_bag:
         return _from_bags(robot, args)
-    steps = TRAINING_PRESETS[args.preset].steps // (10 if args.quick else 1)
+    steps = _steps(args)
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
 
@@ -83,14 +84,21 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def _steps(args: argparse.Namespace) -> int:
+    return TRAINING_PRESETS[args.preset].steps // (10 if args.quick else 1)
+
+
 def _from_bags(robot: Robot, args: argparse.Namespace) -> int:
     try:
+        # Before the network is trained, which takes longer than finding a bag unusable.
+        recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
         if args.checkpoint is not None:
             mae = checkpoint.load(args.checkpoint, robot)
         else:
             print(f'training the network of {robot.description.directory.name} to start from')
-            mae = initial_mae(robot, args.preset, args.seed).mae
-        learned = train_from_bags(robot, mae, args.preset, args.from_bag, args.hold_out, args.seed)
+            mae = initial_mae(robot, args.preset, args.seed, steps=_steps(args)).mae
+        learner = OnlineLearner(robot, mae, args.preset, args.seed)
+        learned = train_from_bags(robot, learner, recordings, args.hold_out)
         checkpoint.save(learned, args.out)
     except (MusculoskeletalError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)

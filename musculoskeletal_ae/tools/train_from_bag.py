@@ -38,25 +38,21 @@ def read(path: Path, robot: Robot) -> Pairs:
 
 
 def train_from_bags(
-    robot: Robot, mae: Mae, preset: str, bags: list[Path], held_out: list[Path], seed: int
+    robot: Robot, learner: OnlineLearner, recordings: dict[Path, Pairs], held_out: list[Path]
 ) -> Mae:
-    """Learn from bags in their order, print errors before and after, return the network.
+    """Learn from recordings in their order, print errors before and after, return the network.
 
     Args:
         robot: Whose arm was recorded.
-        mae: Network to start from.
-        preset: Of the learning.
-        bags: To learn from.
-        held_out: Bags that are only judged.
-        seed: Of everything random.
-
-    Raises:
-        BagError: If one is damaged or does not fit the robot.
+        learner: Starts from its network.
+        recordings: As `read` gives them, by path.
+        held_out: Those that are only judged.
     """
-    recordings = {path: read(path, robot) for path in (*bags, *held_out)}
+    mae = learner.mae
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
-    learner = OnlineLearner(robot, mae, preset, seed)
-    for path in bags:
+    for path in recordings:
+        if path in held_out:
+            continue
         seconds = recordings[path].time[-1] - recordings[path].time[0]
         with tqdm(total=round(seconds, 1), unit=' s', desc=path.name, disable=None) as bar:
             learn(robot, learner, recordings[path], bar.update)
