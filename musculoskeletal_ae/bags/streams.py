@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.selection import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.nodes.messages import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.messages import QUANTITIES, read_array, read_posture
 from musculoskeletal_ae.robot.robot import Robot
 
 Array = NDArray[np.float64]

@@ -203,9 +203,13 @@ class EmulatedArm:
         self._command.length_error[:] = self.individual.length_bias + offset
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:
-        """Cut the named muscles and mend all others, which take up T_bias where they are."""
-        names = set(muscles)
-        cut = np.array([name in names for name in self.robot.muscles])
+        """Cut the named muscles and mend all others, which take up T_bias where they are.
+
+        Raises:
+            MusculoskeletalError: If there is no such muscle; nothing changes then.
+        """
+        cut = np.zeros(self.robot.muscle_count, dtype=bool)
+        cut[self.robot.muscle_indices(muscles)] = True
         mended = (self._muscle.ruptured > 0.0) & ~cut
         self._muscle.ruptured[:] = cut
         self._attach(mended)

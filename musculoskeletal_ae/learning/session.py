@@ -17,8 +17,9 @@ from musculoskeletal_ae.learning.collector import Collector
 from musculoskeletal_ae.learning.journal import Journal
 from musculoskeletal_ae.learning.online import PRESETS
 from musculoskeletal_ae.learning.sample import Sample
+from musculoskeletal_ae.learning.supervisor import Supervisor
 from musculoskeletal_ae.learning.update import Job
-from musculoskeletal_ae.learning.worker_process import Answer, Start, WorkerProcess
+from musculoskeletal_ae.learning.worker_process import Answer, Start
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -27,8 +28,6 @@ from musculoskeletal_ae.robot.robot import Robot
 LEAST_INTERVAL = 1.0
 #: updates that a new sample is worth: its own, and one more of training
 AFTER_NEWEST = 2
-#: until a training process that died is started again [s], doubled each time up to the longest
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
 
 
 class Session:
@@ -37,7 +36,6 @@ class Session:
     Attributes:
         data: The newest checkpoint as bytes; None without.
         saved: The state found on disk that fits the robot, or None.
-        trouble: What is wrong, or ''.
     """
 
     def __init__(
@@ -70,15 +68,14 @@ class Session:
         self._preset, self._seed, self._steps = preset, seed, steps
         self.data: bytes | None = None
         self.saved: Mae | None = None
-        self.trouble = ''
+        self._unsaved = ''
         self._version = 0
         self._checkpoints = 0
         self._answer: Answer | None = None
-        self._worker: WorkerProcess | None = None
+        self._training = Supervisor(self._begin_with)
         self._stale = False
         self._due = AFTER_NEWEST
         self._last_start = -LEAST_INTERVAL
-        self._restarts, self._pause, self._restart_at = 0, FIRST_PAUSE, 0.0
         self._set_aside = ''
         self._statistics_hold = True
         self._journal = None if directory is None else Journal(directory, robot)
@@ -100,9 +97,20 @@ class Session:
     def _use(self, mae: Mae) -> None:
         """Go on from a network, and hand it out at once."""
         self.data, self._version = checkpoint.to_bytes(mae), mae.version
-        self._stop_worker()
-        self._start_worker()
+        self._training.start()
         self._hand_out(self.data)
+
+    def _begin_with(self) -> Start:
+        # A new process knows the network but not the body, and nothing of a job that was lost.
+        assert self.data is not None
+        self._stale, self._due = False, AFTER_NEWEST
+        return Start(
+            self._robot.description.directory,
+            self.data,
+            self._preset,
+            self._seed,
+            None if self._journal is None else self._journal.checkpoint_file,
+        )
 
     def replace(self, path: str | Path) -> None:
         """Start anew from a checkpoint file; the state so far is kept as a backup.
@@ -113,13 +121,13 @@ class Session:
         """
         mae = checkpoint.load(path, self._robot)
         self.set_aside()
-        self._begin_with(mae)
+        self._take(mae)
 
     def begin(self, path: str | Path) -> None:
         """Start from a checkpoint file where no network was saved; see `replace` for errors."""
-        self._begin_with(checkpoint.load(path, self._robot))
+        self._take(checkpoint.load(path, self._robot))
 
-    def _begin_with(self, mae: Mae) -> None:
+    def _take(self, mae: Mae) -> None:
         mae = replace(mae, version=max(mae.version, self._version) + 1)
         if self._journal is not None:
             checkpoint.save(mae, self._journal.checkpoint_file)
@@ -128,7 +136,7 @@ class Session:
 
     def set_aside(self) -> None:
         """Forget samples and network; on disk they become a backup."""
-        self._stop_worker()
+        self._training.stop()
         self._collector.clear()
         self.data, self.saved = None, None
         if self._journal is not None:
@@ -144,10 +152,9 @@ class Session:
             try:
                 self._journal.append(sample, self._collector.store)
             except (StateError, OSError) as error:
-                self.trouble = f'samples cannot be saved: {error}'
+                self._unsaved = f'samples cannot be saved: {error}'
             else:
-                if self.trouble.startswith('samples'):
-                    self.trouble = ''
+                self._unsaved = ''
 
     def relearn(self, muscle: int, newest: int = 0) -> None:
         """Learn a muscle's constants anew from its newest samples and what comes.
@@ -167,7 +174,7 @@ class Session:
             anomaly = replace(mae.anomaly, calibrated=False)
             mae = replace(mae, anomaly=anomaly, version=self._version)
             self.data = checkpoint.to_bytes(mae)
-            self._stale = self._worker is not None and self._worker.busy
+            self._stale = self._training.busy
             self._keep_and_hand_out(mae)
 
     def _keep_and_hand_out(self, mae: Mae) -> None:
@@ -194,35 +201,21 @@ class Session:
 
     def poll(self, learning: bool) -> None:
         """Look whether an update is done, and begin the next one if `learning`."""
-        worker = self._worker
-        now = time.monotonic()
-        if worker is None:
-            if self.data is not None and now >= self._restart_at:
-                self._start_worker()
-            return
-        answer = worker.poll()
-        if worker.dead:
-            self._restarts += 1
-            self.trouble = f'the training process died ({worker.dead}); starting it again'
-            self._stop_worker()
-            self._restart_at = now + self._pause
-            self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
-            return
+        answer = self._training.poll()
         if answer is not None:
             self._finish(answer)
-        if worker.busy or worker.least_samples is None or not learning:
-            return
-        enough = len(self._collector.store) >= worker.least_samples
-        if enough and self._due > 0 and now - self._last_start >= LEAST_INTERVAL:
-            self._begin(worker, now)
+        now = time.monotonic()
+        due = learning and self._due > 0 and now - self._last_start >= LEAST_INTERVAL
+        if due and self._training.can_take(len(self._collector.store)):
+            self._begin(now)
 
-    def _begin(self, worker: WorkerProcess, now: float) -> None:
+    def _begin(self, now: float) -> None:
         # Going on without new samples is the corrected body's way, not the paper's.
         self._due = self._due - 1 if self._preset == 'default' else 0
         self._last_start = now
         self._version += 1
         collector = self._collector
-        worker.submit(
+        self._training.submit(
             Job(
                 collector.store.observations(),
                 collector.reservoir.messages(),
@@ -234,7 +227,7 @@ class Session:
         )
 
     def _finish(self, answer: Answer) -> None:
-        self._answer, self.trouble, self._pause = answer, '', FIRST_PAUSE
+        self._answer, self._unsaved = answer, ''
         if self._stale:
             # Begun before a muscle was changed: it would bring the old detector back.
             self._stale = False
@@ -242,7 +235,7 @@ class Session:
                 self._keep_and_hand_out(checkpoint.from_bytes(self.data, self._robot))
             return
         if answer.unsaved:
-            self.trouble = f'the network cannot be saved: {answer.unsaved}'
+            self._unsaved = f'the network cannot be saved: {answer.unsaved}'
         self._statistics_hold |= answer.calibrated
         self.data = answer.checkpoint
         self._hand_out(answer.checkpoint)
@@ -250,37 +243,22 @@ class Session:
             for muscle, newest in answer.changed:
                 self.relearn(muscle, newest)
         except (MusculoskeletalError, OSError) as error:
-            self.trouble = f'the state cannot be saved: {error}'
+            self._unsaved = f'the state cannot be saved: {error}'
 
     def _hand_out(self, data: bytes) -> None:
         self._checkpoints += 1
         self._publish(data)
 
-    def _start_worker(self) -> None:
-        if self.data is None:
-            return
-        self._worker = WorkerProcess(
-            Start(
-                self._robot.description.directory,
-                self.data,
-                self._preset,
-                self._seed,
-                None if self._journal is None else self._journal.checkpoint_file,
-            )
-        )
-        self._due = AFTER_NEWEST
-
-    def _stop_worker(self) -> None:
-        if self._worker is not None:
-            self._worker.close()
-            self._worker = None
-        self._stale = False
-
     def close(self) -> None:
         """End the training process and give the directory free."""
-        self._stop_worker()
+        self._training.stop()
         if self._journal is not None:
             self._journal.close()
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong, or ''."""
+        return self._training.trouble or self._unsaved
 
     def values(self) -> dict[str, str]:
         """Return what people want to know, for /diagnostics."""
@@ -291,12 +269,12 @@ class Session:
             'checkpoint version': str(self._version),
             'preset': self._preset,
             'healthy time': f'{self._collector.reservoir.time:.0f} s',
-            'training process restarts': str(self._restarts),
+            'training process restarts': str(self._training.restarts),
         }
         if self._journal is not None:
             values['state directory'] = str(self._journal.directory)
-        if self._worker is not None:
-            values['training process'] = str(self._worker.pid)
+        if self._training.pid is not None:
+            values['training process'] = str(self._training.pid)
         if self._set_aside:
             values['saved state not used'] = self._set_aside
         if self._answer is not None:

@@ -18,26 +18,17 @@ from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import (
+from musculoskeletal_ae.messages import (
     QUANTITIES,
     array_message,
     read_array,
     read_joints,
     read_posture,
 )
-from musculoskeletal_ae.nodes.shell import (
-    ERROR,
-    LATCHED,
-    OK,
-    RELIABLE,
-    SENSOR,
-    STEADY,
-    WARN,
-    Shell,
-    number,
-    run,
-    text,
-)
+from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.running import run
+from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
 from musculoskeletal_ae.tasks.control_report import control_report, stiffness_values
 from musculoskeletal_ae.tasks.controller import Controller as Core
 from musculoskeletal_ae.tasks.safety import LENGTH, TENSION, Muscles
@@ -101,21 +92,16 @@ class Controller(Shell):
         else:
             descriptor = text(f'{told["meaning"]}; one of: {", ".join(legal)}')
 
-        def setter(value: Any) -> str | None:
+        def setter(value: Any) -> None:
             if legal is not None and value not in legal:
-                return f'{value!r}; legal: {", ".join(legal)}'
+                raise MusculoskeletalError(f'{value!r}; legal: {", ".join(legal)}')
             setattr(self.settings, name, value)
-            return None
 
         self.settable(name, setting.default, descriptor, setter)
 
-    def _set_stiffness(self, wished: Iterable[Any]) -> str | None:
-        try:
-            self.settings.joint_stiffness = read_stiffness(wished, self.robot.joint_count)
-        except MusculoskeletalError as error:
-            return str(error)
+    def _set_stiffness(self, wished: Iterable[Any]) -> None:
+        self.settings.joint_stiffness = read_stiffness(wished, self.robot.joint_count)
         self.core.posture.start()
-        return None
 
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)

@@ -17,18 +17,11 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.nodes.messages import QUANTITIES, array_message, read_array, read_pose
-from musculoskeletal_ae.nodes.shell import (
-    ERROR,
-    LATCHED,
-    OK,
-    RELIABLE,
-    SENSOR,
-    WARN,
-    Shell,
-    number,
-    run,
-)
+from musculoskeletal_ae.messages import QUANTITIES, array_message, read_array, read_pose
+from musculoskeletal_ae.nodes.parameters import number
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.running import run
+from musculoskeletal_ae.nodes.shell import ERROR, OK, WARN, Shell
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.tasks.anomaly import AnomalyDetector, Verdict
 

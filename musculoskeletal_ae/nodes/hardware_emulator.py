@@ -19,9 +19,13 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.messages import array_message, read_array, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.messages import array_message, read_array, read_wrench
-from musculoskeletal_ae.nodes.shell import LATCHED, OK, RELIABLE, WARN, Shell, number, run, text
+from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.running import run
+from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 
 MARKER_RATE = 10.0  # [Hz] of the markers for RViz
@@ -93,20 +97,14 @@ class HardwareEmulator(Shell):
     def _see_marker(self, value: float) -> None:
         self.marker_rate = value
 
-    def _rupture(self, names: Sequence[str]) -> str | None:
-        muscles = [name for name in names if name]
-        for name in muscles:
-            if name not in self.robot.muscles:
-                return f'unknown muscle {name!r}; legal: {", ".join(self.robot.muscles)}'
-        self.arm.set_ruptured(muscles)
-        return None
+    def _rupture(self, names: Sequence[str]) -> None:
+        self.arm.set_ruptured(name for name in names if name)
 
-    def _set_offset(self, values: Sequence[float]) -> str | None:
-        offset = np.asarray(values, dtype=float)
-        if len(offset) not in (1, self.robot.muscle_count) or not np.isfinite(offset).all():
-            return f'{list(values)}: expected 1 or {self.robot.muscle_count} finite numbers [m]'
-        self.arm.set_length_offset(np.broadcast_to(offset, self.robot.muscle_count))
-        return None
+    def _set_offset(self, values: Sequence[float]) -> None:
+        offset, count = np.asarray(values, dtype=float), self.robot.muscle_count
+        if len(offset) not in (1, count) or not np.isfinite(offset).all():
+            raise MusculoskeletalError(f'{list(values)}: expected 1 or {count} finite numbers [m]')
+        self.arm.set_length_offset(np.broadcast_to(offset, count))
 
     # -- messages -------------------------------------------------------------------------------
 

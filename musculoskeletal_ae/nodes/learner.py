@@ -6,9 +6,7 @@ joint_states or vision_joint_states, muscle_states, anomaly_detected → mae_che
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -16,29 +14,16 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.collector import Collector
-from musculoskeletal_ae.learning.online import PRESETS, STEPS
 from musculoskeletal_ae.learning.pairing import Pairing
-from musculoskeletal_ae.learning.rest import RestSettings
 from musculoskeletal_ae.learning.session import Session
-from musculoskeletal_ae.learning.store import Novelty
-from musculoskeletal_ae.nodes.messages import QUANTITIES, read_array, read_posture
-from musculoskeletal_ae.nodes.shell import (
-    ERROR,
-    LATCHED,
-    OK,
-    SENSOR,
-    STEADY,
-    WARN,
-    Shell,
-    bytes_message,
-    number,
-    run,
-    text,
-)
+from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
+from musculoskeletal_ae.nodes.learner_settings import declare_settings
+from musculoskeletal_ae.nodes.parameters import text
+from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
+from musculoskeletal_ae.nodes.running import run
+from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
 
-SOURCES = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 POLL = 0.05  # [s] between looks at the training process
-AUTO = 'auto'
 
 
 class Learner(Shell):
@@ -47,33 +32,19 @@ class Learner(Shell):
     def __init__(self) -> None:
         """Declare parameters and topics, and start the training process."""
         super().__init__('learner')
-        self.declare_parameter('preset', 'default', text(f'how to learn: {PRESETS}', True))
-        self.declare_parameter('seed', 0, text('of everything random', True))
-        self.declare_parameter(
-            'joint_source', 'sensor', text(f'where θ comes from: {tuple(SOURCES)}', True)
-        )
-        self.declare_parameter(
-            'state_directory',
-            AUTO,
-            text("for samples and network; 'auto': below XDG_STATE_HOME; '': nothing kept", True),
-        )
-        self.declare_parameter(
-            'update_steps', STEPS, text('steps of training per update, preset default', True)
-        )
-        self.collector = self._collector()
+        settings = declare_settings(self)
+        self.collector = Collector(self.robot, settings.rest, settings.novelty, settings.seed)
         self.pairing = Pairing(1.0 / self.rate)
-        self.arrival = 0.0
         self.enabled, self.anomaly, self.running = True, False, False
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        value = self.get_parameter
         self.session = Session(
             self.robot,
             self.collector,
-            value('preset').value,
-            value('seed').value,
-            value('update_steps').value,
-            self._directory(value('state_directory').value),
-            self._publish,
+            settings.preset,
+            settings.seed,
+            settings.steps,
+            settings.directory,
+            lambda data: self.publisher.publish(bytes_message(data)),
         )
         self.settable(
             'fresh', False, text('true: drop the saved state for `checkpoint`'), self._start_fresh
@@ -91,11 +62,7 @@ class Learner(Shell):
             self._relearn,
         )
         self.running = True
-        source = value('joint_source').value
-        if source not in SOURCES:
-            legal = ', '.join(SOURCES)
-            raise MusculoskeletalError(f'parameter joint_source: {source!r}; legal: {legal}')
-        self.listen(JointState, SOURCES[source], self._joints, SENSOR)
+        self.listen(JointState, settings.joint_topic, self._joints, SENSOR)
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         self.create_service(SetBool, 'learner/enable', self._enable)
@@ -104,68 +71,26 @@ class Learner(Shell):
 
     # -- parameters -----------------------------------------------------------------------------
 
-    def _collector(self) -> Collector:
-        def positive(name: str, default: float, meaning: str, most: float) -> float:
-            self.declare_parameter(name, default, number(meaning, 0.0, most, True))
-            return float(self.get_parameter(name).value)
-
-        rest, novelty = RestSettings(), Novelty()
-        return Collector(
-            self.robot,
-            RestSettings(
-                positive('rest_time', rest.window, 'how long the arm has to be still [s]', 10.0),
-                positive('rest_joint_rate', rest.joint_rate, 'fastest joint at rest [rad/s]', 1.0),
-                positive('rest_length_rate', rest.length_rate, 'fastest l at rest [m/s]', 1.0),
-            ),
-            Novelty(
-                positive('new_joint_distance', novelty.joint, 'to stored samples [rad]', 3.0),
-                positive('new_tension_distance', novelty.tension, 'to stored ones [N]', 500.0),
-            ),
-            self.get_parameter('seed').value,
-        )
-
-    def _directory(self, value: str) -> Path | None:
-        if value != AUTO:
-            return Path(value) if value else None
-        home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
-        name = self.robot.description.directory.name
-        place = Path(home) / 'musculoskeletal_ae' / name
-        return place.joinpath(*self.get_namespace().strip('/').split('/'))
-
-    def _start_fresh(self, value: bool) -> str | None:
+    def _start_fresh(self, value: bool) -> None:
         if not value:
-            return None
+            return
         if not self.running:
             self.session.set_aside()
-            return None
+            return
         path = self.get_parameter('checkpoint').value
         if not path:
-            return 'there is no `checkpoint` to start from; set that parameter first'
-        return self._take_checkpoint(path)
+            raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
+        self._take_checkpoint(path)
 
-    def _take_checkpoint(self, path: str) -> str | None:
-        if not path:
-            return None
-        try:
-            if self.running:
-                self.session.replace(path)
-            elif self.session.data is None:
-                self.session.begin(path)
-        except (MusculoskeletalError, OSError) as error:
-            return str(error)
-        return None
+    def _take_checkpoint(self, path: str) -> None:
+        if path and self.running:
+            self.session.replace(path)
+        elif path and self.session.data is None:
+            self.session.begin(path)
 
-    def _relearn(self, names: Sequence[str]) -> str | None:
-        muscles = [name for name in names if name]
-        for name in muscles:
-            if name not in self.robot.muscles:
-                return f'unknown muscle {name!r}; legal: {", ".join(self.robot.muscles)}'
-        try:
-            for name in muscles:
-                self.session.relearn(self.robot.muscles.index(name))
-        except (MusculoskeletalError, OSError) as error:
-            return str(error)
-        return None
+    def _relearn(self, names: Sequence[str]) -> None:
+        for muscle in self.robot.muscle_indices(name for name in names if name):
+            self.session.relearn(muscle)
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -206,9 +131,6 @@ class Learner(Shell):
 
     def _poll(self) -> None:
         self.session.poll(self.enabled and not self.anomaly)
-
-    def _publish(self, data: bytes) -> None:
-        self.publisher.publish(bytes_message(data))
 
     def _forget_the_moment(self) -> None:
         self.collector.reset()

@@ -16,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.experiments.picture import Line, save_picture
-from musculoskeletal_ae.nodes.shell import SENSOR
+from musculoskeletal_ae.nodes.qos import SENSOR
 
 
 def _lines(message: MarkerArray) -> list[Line]:

@@ -1,63 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all node shells share: parameters, checkpoints, validity, diagnostics, start and end."""
+"""What all node shells share: parameters, checkpoints, subscriptions, diagnostics."""
 
 from __future__ import annotations
 
-import sys
 import time
-from array import array
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
 
-from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-# A source time that lies further back than this is another publisher's clock, not a reordering.
-REORDERING = int(1e9)  # [ns]
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
-
-def text(description: str, read_only: bool = False) -> ParameterDescriptor:
-    """Describe a parameter that has no range."""
-    return ParameterDescriptor(description=description, read_only=read_only)
-
-
-def number(
-    description: str, low: float, high: float, read_only: bool = False
-) -> ParameterDescriptor:
-    """Describe a number within [low, high]; rclpy refuses what lies outside, NaN included."""
-    span = FloatingPointRange(from_value=low, to_value=high)
-    return ParameterDescriptor(
-        description=description, floating_point_range=[span], read_only=read_only
-    )
 
 
 class Shell(Node):
@@ -77,14 +47,13 @@ class Shell(Node):
         )
         self.robot = Robot.load(self.get_parameter('robot').value)
         self.rate = float(self.get_parameter('rate').value)
-        self.rejected: Counter[str] = Counter()
-        self._setters: dict[str, Callable[[Any], str | None]] = {}
+        self._reception = Reception()
+        self.rejected = self._reception.rejected
+        self._setters: dict[str, Callable[[Any], None]] = {}
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._report_timer = self.create_timer(1.0, self._report, clock=STEADY)
-        self._received: Counter[str] = Counter()
         self._reported_at = time.monotonic()
-        self._last_source: dict[str, int] = {}
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
@@ -108,7 +77,7 @@ class Shell(Node):
         name: str,
         default: Any,
         descriptor: ParameterDescriptor,
-        setter: Callable[[Any], str | None],
+        setter: Callable[[Any], None],
     ) -> None:
         """Declare a parameter that may be set at run time.
 
@@ -116,20 +85,22 @@ class Shell(Node):
             name: Its name.
             default: Its default.
             descriptor: What it means, unit and range.
-            setter: Takes a new value and uses it, or returns the reason why it will not.
+            setter: Takes a new value and uses it, or raises a `MusculoskeletalError` or `OSError`.
         """
         self.declare_parameter(name, default, descriptor)
         self._setters[name] = setter
-        reason = setter(self.get_parameter(name).value)
-        if reason:
-            raise MusculoskeletalError(f'parameter {name}: {reason}')
+        try:
+            setter(self.get_parameter(name).value)
+        except (MusculoskeletalError, OSError) as error:
+            raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
     def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
             if parameter.name in self._setters:
-                reason = self._setters[parameter.name](parameter.value)
-                if reason:
-                    return SetParametersResult(successful=False, reason=reason)
+                try:
+                    self._setters[parameter.name](parameter.value)
+                except (MusculoskeletalError, OSError) as error:
+                    return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     # -- checkpoints ----------------------------------------------------------------------------
@@ -149,13 +120,9 @@ class Shell(Node):
             self.mae = mae
             use(mae)
 
-        def from_file(path: str) -> str | None:
+        def from_file(path: str) -> None:
             if path:
-                try:
-                    take(checkpoints.load(path, self.robot))
-                except MusculoskeletalError as error:
-                    return str(error)
-            return None
+                take(checkpoints.load(path, self.robot))
 
         def from_topic(message: UInt8MultiArray) -> None:
             try:
@@ -177,24 +144,8 @@ class Shell(Node):
 
         The callback raises a `MusculoskeletalError` to reject the message.
         """
-
-        def receive(message: Any, info: dict[str, Any]) -> None:
-            source = info['source_timestamp']
-            behind = self._last_source.get(topic, 0) - source
-            if 0 <= behind < REORDERING and source > 0:
-                self.rejected[f'{topic}: repeated or reordered'] += 1
-                return
-            self._last_source[topic] = source
-            try:
-                callback(message)
-            except MessageError as error:
-                self.rejected[f'{topic}: {error.reason}'] += 1
-            except MusculoskeletalError as error:
-                self.rejected[f'{topic}: {error}'] += 1
-            else:
-                self._received[topic] += 1
-
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
+        receive = self._reception.of(topic, callback)
         self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
     # -- diagnostics ----------------------------------------------------------------------------
@@ -203,9 +154,8 @@ class Shell(Node):
         level, summary, values = self.state()
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
-        for topic, count in self._received.items():
+        for topic, count in self._reception.take_received().items():
             values[f'{topic} rate'] = f'{count / elapsed:.1f} Hz'
-            self._received[topic] = 0
         values['rejected'] = str(sum(self.rejected.values()))
         values |= {f'rejected {reason}': str(n) for reason, n in self.rejected.items()}
         status = DiagnosticStatus(
@@ -218,52 +168,3 @@ class Shell(Node):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-
-
-def bytes_message(data: bytes) -> UInt8MultiArray:
-    """Return a byte array message."""
-    return UInt8MultiArray(data=array('B', data))
-
-
-def run(make: Callable[[], Node]) -> None:
-    """Run one node on a single-threaded executor until it is asked to stop.
-
-    What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
-    """
-    if {'--help', '-h'} & set(sys.argv[1:]):
-        print(f'{sys.modules[make.__module__].__doc__}\n{USAGE}')
-        return
-    rclpy.init()
-    node = None
-    try:
-        node = make()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except rclpy_implementation.RCLError:
-        # A callback that publishes while a signal shuts the context down is no failure.
-        if rclpy.ok():
-            raise
-    except (MusculoskeletalError, *PARAMETER_ERRORS) as error:
-        print(f'error: {error}', file=sys.stderr)
-        sys.exit(1)
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-# What rclpy raises for a value of the wrong type or beyond its range, given at the start.
-PARAMETER_ERRORS = (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    rclpy_implementation.UnknownROSArgsError,
-    rclpy_implementation.RCLInvalidROSArgsError,
-)
-
-USAGE = """
-This is a ROS 2 node. Parameters:  --ros-args -p NAME:=VALUE  or  --params-file FILE;
-names:  -r __ns:=/left_arm  -r TOPIC:=OTHER.  `ros2 param describe` tells each parameter's meaning.
-"""

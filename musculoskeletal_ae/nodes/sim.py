@@ -17,9 +17,12 @@ from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.messages import array_message, read_array, read_joints, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.messages import array_message, read_array, read_joints, read_wrench
-from musculoskeletal_ae.nodes.shell import LATCHED, OK, RELIABLE, WARN, Shell, run, text
+from musculoskeletal_ae.nodes.parameters import text
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.running import run
+from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.tasks.simulation import Simulation
 

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, load_description
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
@@ -59,6 +61,20 @@ class Robot:
     def root_link(self) -> str:
         """Name of the URDF's root link, in whose frame poses and markers are given."""
         return self.description.root_link
+
+    def muscle_indices(self, names: Iterable[str]) -> list[int]:
+        """Return where in T and l the named muscles stand.
+
+        Raises:
+            MusculoskeletalError: If a name is not one of this robot's muscles.
+        """
+        indices = []
+        for name in names:
+            if name not in self.muscles:
+                legal = ', '.join(self.muscles)
+                raise MusculoskeletalError(f'unknown muscle {name!r}; legal: {legal}')
+            indices.append(self.muscles.index(name))
+        return indices
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""

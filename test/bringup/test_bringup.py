@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.nodes.shell import LATCHED
+from musculoskeletal_ae.nodes.qos import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STATUS = re.compile(r'^ *\d+ s  error (\d+\.\d+) rad  A (\d+\.\d+)  samples \d+  checkpoints \d+')

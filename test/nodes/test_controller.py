@@ -12,7 +12,8 @@ from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.shell import LATCHED, bytes_message
+from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.tasks.stiffness_control import stiffness_command
 from musculoskeletal_ae.tasks.stiffness_model import push_deflection
 

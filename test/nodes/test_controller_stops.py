@@ -11,7 +11,8 @@ from controlled_arm import ControlledArm
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.nodes.shell import LATCHED, bytes_message
+from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.qos import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 

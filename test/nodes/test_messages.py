@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.nodes.messages import (
+from musculoskeletal_ae.messages import (
     array_message,
     read_array,
     read_joints,

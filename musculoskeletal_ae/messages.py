@@ -15,7 +15,12 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from std_msgs.msg import (
+    Float64MultiArray,
+    MultiArrayDimension,
+    MultiArrayLayout,
+    UInt8MultiArray,
+)
 
 from musculoskeletal_ae.exceptions import MessageError
 
@@ -66,6 +71,11 @@ def array_message(values: Array, *labels: str) -> Float64MultiArray:
         ]
     )
     return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+
+
+def bytes_message(data: bytes) -> UInt8MultiArray:
+    """Return a byte array message."""
+    return UInt8MultiArray(data=array('B', data))
 
 
 def read_joints(

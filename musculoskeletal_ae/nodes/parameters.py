@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How parameters are described to `ros2 param describe`."""
+
+from __future__ import annotations
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+
+
+def text(description: str, read_only: bool = False) -> ParameterDescriptor:
+    """Describe a parameter that has no range."""
+    return ParameterDescriptor(description=description, read_only=read_only)
+
+
+def number(
+    description: str, low: float, high: float, read_only: bool = False
+) -> ParameterDescriptor:
+    """Describe a number within [low, high]; rclpy refuses what lies outside, NaN included."""
+    span = FloatingPointRange(from_value=low, to_value=high)
+    return ParameterDescriptor(
+        description=description, floating_point_range=[span], read_only=read_only
+    )
