@@ -48,6 +48,7 @@ class OnlineLearner:
         collector: Holds the samples.
         mae: The network as learned so far.
         updates: How many updates there were.
+        updater: The way of learning.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class OnlineLearner:
         self.mae = mae
         self.updates = 0
         self.last: Update | None = None
-        self._updater = make_updater(robot, mae, preset, seed)
+        self.updater = make_updater(robot, mae, preset, seed)
         self._steps = steps
         self._statistics_hold = True
 
@@ -81,7 +82,7 @@ class OnlineLearner:
     def update(self) -> Update | None:
         """Learn a little from the samples so far, if there are enough."""
         collector = self.collector
-        if len(collector.store) < self._updater.least_samples:
+        if len(collector.store) < self.updater.least_samples:
             return None
         job = Job(
             collector.store.observations(),
@@ -91,7 +92,7 @@ class OnlineLearner:
             self._steps,
             self.mae.version + 1,
         )
-        update = self.last = self._updater.update(job)
+        update = self.last = self.updater.update(job)
         self.mae, self.updates = update.mae, self.updates + 1
         anomaly = update.mae.anomaly
         self._statistics_hold |= anomaly is not None and anomaly.calibrated

@@ -6,7 +6,8 @@ ramped to and then held. A new target, method or network starts a new ramp from 
 moment, so that nothing jumps. T_current is read once, when a method starts: read again and again,
 `second` would raise the tension without end.
 
-While the arm rests under `proposed`, `feedback` corrects what friction leaves.
+While the arm rests under `proposed`, `feedback` corrects what friction leaves, and sheds tension
+that is not needed.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class PostureControl:
         missing_torque: What the last goal cannot deliver [N·m], shape (D,).
         solution: Lengths and tensions of the last goal of `proposed` or `stiffness`, or None.
         stiffness: What the last goal of `stiffness` expects, or None.
-        feedback: Correction of the error at rest.
+        feedback: Corrections at rest.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -70,7 +71,8 @@ class PostureControl:
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
         self.solution: Solution | None = None
-        self.feedback = RestFeedback(robot.joint_count)
+        self.feedback = RestFeedback(robot)
+        self._jacobian: Array | None = None
 
     @property
     def exploring(self) -> bool:
@@ -135,7 +137,7 @@ class PostureControl:
         if not self._ramp.done:
             self._command = self._ramp.step(dt)
         else:
-            self._correct(theta, dt)
+            self._correct(tension, theta, dt)
         return self._command.copy()
 
     def _solve_again(self) -> None:
@@ -165,7 +167,7 @@ class PostureControl:
     def _solve(self, mae: Mae, theta: Array, current: Array, limit: Array) -> Array:
         robot, method = self._robot, self._method
         self.missing_torque = np.zeros(robot.joint_count)
-        self.solution = self.stiffness = None
+        self.solution = self.stiffness = self._jacobian = None
         if method == 'geometric':
             return geometric_command(robot, theta)
         if method in ('first', 'second'):
@@ -185,13 +187,16 @@ class PostureControl:
         self.missing_torque = self.solution.missing_torque
         return self.solution.length
 
-    def _correct(self, theta: Array, dt: float) -> None:
-        """Shift the commanded lengths so that the estimate comes nearer to the target."""
+    def _correct(self, tension: Array, theta: Array, dt: float) -> None:
+        """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""
         chosen, solution = self._settings, self.solution
         # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
         if self._method != 'proposed' or chosen.preset == 'paper' or solution is None:
             return
         assert self._mae is not None and self.theta is not None  # they gave the solution
-        if self.feedback.step(self.theta - theta, chosen.feedback_gain, dt):
+        if self._jacobian is None:
+            self._jacobian = self._mae.muscle_jacobian(self.theta, solution.tension)
+        error, gain = self.theta - theta, chosen.feedback_gain
+        if self.feedback.step(error, self._jacobian, tension, self._limit, gain, dt):
             shift = self.feedback.shift(self._mae, self.theta, solution.tension)
             self._command = solution.length + shift

@@ -55,7 +55,10 @@ class Settings:
         0.5, 0.0, 20.0, 'method tension: damping torque [N·m·s/rad]; 0: torque only'
     )
     feedback_gain: float = quantity(
-        0.5, 0.0, 2.0, 'proposed, default: correction of the error at rest [1/s]; 0: none'
+        0.5,
+        0.0,
+        2.0,
+        'proposed, default: correction of error and needless tension at rest [1/s]; 0: none',
     )
     max_age: float = quantity(
         0.2, 0.01, 10.0, 'older muscle_states or estimated_joint_states stop the arm [s]'

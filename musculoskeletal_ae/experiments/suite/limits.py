@@ -75,10 +75,10 @@ def oracle_errors(robot: Robot, seed: int, recording: Recording) -> dict[str, fl
 
 def body_error(robot: Robot, learner: OnlineLearner, recording: Recording) -> float:
     """Return the error of least squares on the body that a learner of preset default fitted."""
-    updater = learner._updater
-    if not isinstance(updater, BodyUpdater):
+    if not isinstance(learner.updater, BodyUpdater):
         raise TypeError('only preset default fits a body')
-    body = updater.body
     theta, tension = recording.theta[::STRIDE], recording.tension[::STRIDE]
-    estimate = LearntLeastSquares(robot, body).estimate(tension, recording.length[::STRIDE])
+    estimate = LearntLeastSquares(robot, learner.updater.body).estimate(
+        tension, recording.length[::STRIDE]
+    )
     return mean_error(estimate, theta)
