@@ -43,6 +43,13 @@ class Readings(NamedTuple):
     temperature: Array
 
 
+def seen_by_camera(pose: pin.SE3, rng: np.random.Generator) -> pin.SE3:
+    """Return a pose as a camera sees the marker, with its noise."""
+    turn = pin.exp3(rng.normal(0.0, MARKER_TURN_NOISE, 3))
+    shift = rng.normal(0.0, MARKER_NOISE, 3)
+    return pin.SE3(pose.rotation @ turn, pose.translation + shift)
+
+
 class EmulatedArm:
     """Rigid bodies by pinocchio, muscles and modules by `mechanics`, faults on request.
 
@@ -259,10 +266,7 @@ class EmulatedArm:
 
     def marker_pose(self) -> pin.SE3:
         """See the end effector's pose in the root link's frame, with a camera's noise."""
-        pose = self.robot.kinematics.end_effector_pose(self.theta)
-        turn = pin.exp3(self._rng.normal(0.0, MARKER_TURN_NOISE, 3))
-        shift = self._rng.normal(0.0, MARKER_NOISE, 3)
-        return pin.SE3(pose.rotation @ turn, pose.translation + shift)
+        return seen_by_camera(self.robot.kinematics.end_effector_pose(self.theta), self._rng)
 
     def route_points(self) -> Array:
         """True route points in the root link's frame [m], shape (P, 3)."""

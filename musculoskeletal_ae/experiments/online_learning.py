@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,6 +46,10 @@ class Streams(NamedTuple):
 
     exploring: Recording
     held_out: Recording
+
+
+#: what is seen of θ [rad] (D,) at the n-th message, with the network of the moment; None if nothing
+See = Callable[[int, Mae], Array | None]
 
 
 class Curve(NamedTuple):
@@ -93,16 +98,27 @@ def oracle_error(robot: Robot, seed: int, recording: Recording) -> float:
 def learn(
     robot: Robot, mae: Mae, preset: str, recorded: Streams, seed: int = 0, steps: int = STEPS
 ) -> Curve:
-    """Feed a recorded stream to a learner, as the node would."""
-    learner = OnlineLearner(robot, mae, preset, seed, steps)
-    samples, errors = [0], [held_out_error(mae, recorded.held_out, 10)]
+    """Feed a recorded stream to a new learner, as the node would."""
+    return follow(OnlineLearner(robot, mae, preset, seed, steps), recorded)
+
+
+def follow(learner: OnlineLearner, recorded: Streams, see: See | None = None) -> Curve:
+    """Feed a recorded stream to a learner.
+
+    Args:
+        learner: Goes on from what it knows.
+        recorded: What to learn from, and what to judge by.
+        see: Where θ comes from; the joint sensors by default.
+    """
+    mae = learner.mae
+    samples = [len(learner.collector.store)]
+    errors = [held_out_error(mae, recorded.held_out, 10)]
     stream = recorded.exploring
     running = np.empty(len(stream.theta))
     start = 0
     for n in range(len(stream.theta)):
-        update = learner.step(
-            stream.tension[n], stream.length[n], SAMPLE_TIME, stream.theta_sensor[n]
-        )
+        theta = stream.theta_sensor[n] if see is None else see(n, learner.mae)
+        update = learner.step(stream.tension[n], stream.length[n], SAMPLE_TIME, theta)
         if update is not None or n == len(running) - 1:
             part = slice(start, n + 1)
             before = learner.mae if update is None else mae
