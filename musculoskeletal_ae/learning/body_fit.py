@@ -6,6 +6,10 @@
 by Gauss–Newton from where the last fit ended. The prior spreads s are physical: how far a hand
 places an attachment, how far elastic units of one kind differ. The weights ω are those of a
 Student distribution, so that a sample taken while the arm was touched, or a glitch, counts little.
+
+The torque balance at rest, g(θ) + Gᵀ T = 0 (PIMBS), is not fitted: what is learned from the lengths
+alone meets it as well as the true body does, which is as well as friction lets anyone
+(`experiments/torque_residual` measures both).
 """
 
 from __future__ import annotations

@@ -39,14 +39,15 @@ class LearntLeastSquares(LeastSquares):
         super().__init__(
             robot,
             lambda theta: at_zero + self._lengths(theta, np.zeros((len(theta), self._muscles))),
-            self._muscle_jacobian,
+            self.muscle_jacobian,
             robot.series_elastic,
         )
 
     def _lengths(self, theta: Array, tension: Array) -> Array:
         return self._body.lengths(theta, tension, np.zeros_like(tension))[0]
 
-    def _muscle_jacobian(self, theta: Array) -> Array:
+    def muscle_jacobian(self, theta: Array) -> Array:
+        """Return G [m/rad] of the fitted body, θ (N, D) gives (N, M, D)."""
         none = np.zeros((len(theta), self._muscles))
         columns = []
         for offset in DIFFERENCE * np.eye(theta.shape[1]):

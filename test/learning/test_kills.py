@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A learner that is killed loses nothing: the quick form of `experiments.learning_kills`."""
+
+from __future__ import annotations
+
+from musculoskeletal_ae.experiments.learning_kills import digest, grown, run, samples
+from musculoskeletal_ae.learning.store import SampleStore
+from musculoskeletal_ae.mae import checkpoint
+
+
+def test_a_killed_learner_loses_nothing(arm26, initial, tmp_path):
+    file = tmp_path / 'initial.safetensors'
+    checkpoint.save(initial, file)
+    assert run(arm26, tmp_path / 'state', file, kills=2, seed=0) == []
+
+
+def test_a_missing_sample_would_be_noticed(arm26):
+    drawn = samples(arm26, 0)
+    store = SampleStore()
+    store.add(next(drawn))
+    before = digest(store)
+    without, more = grown(store, arm26, 1, 0)
+    assert digest(without) == before != digest(more)
