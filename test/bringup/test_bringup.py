@@ -130,6 +130,19 @@ def test_a_dead_node_is_named_and_nothing_is_left(environment):
     assert left_behind(run) == ''
 
 
+def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
+    recording = tmp_path / 'run'
+    live = bringup(environment, '--robot', 'arm26', '--duration', '5', '--record', str(recording))
+    output, _ = live.process.communicate(timeout=300)
+    assert live.process.returncode == 0, output
+    played = bringup(environment, '--robot', 'arm26', '--bag', str(recording))
+    output, _ = played.process.communicate(timeout=300)
+    assert played.process.returncode == 0, output
+    assert len(statuses(output)) >= 3, output
+    assert 'hardware_emulator' not in output and 'controller' not in output
+    assert left_behind(live) == left_behind(played) == ''
+
+
 @pytest.mark.parametrize(
     ('arguments', 'expected'),
     [

@@ -7,12 +7,14 @@ import signal
 
 import numpy as np
 import pytest
-from controlled_arm import ControlledArm
+from controlled_arm import RATE_LIMIT, ControlledArm
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.tasks.controller import LONGEST_STEP
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
@@ -126,3 +128,19 @@ def test_without_joint_sensors_and_without_a_learner_it_moves(graph, arm26, trai
     graph.wait(lambda: len(arm.sent()) > 200, 'commands')
     assert 'stopped' not in arm.state().message
     assert len(graph.received['joint_states']) == 0
+
+
+def test_a_killed_learner_changes_nothing_but_its_diagnostics(arm):
+    learner = arm.graph.start(
+        'learner', robot='arm26', checkpoint=arm.checkpoint, state_directory=''
+    )
+    arm.says('checkpoint version', 'learner')
+    arm.target(THERE)
+    before = len(arm.sent())
+    arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
+    arm.kill(learner, signal.SIGKILL)
+    arm.goes_to(THERE)
+    for node in ('controller', 'estimator', 'hardware_emulator'):
+        assert arm.state(node).level == DiagnosticStatus.OK, arm.state(node).message
+    steps = np.abs(np.diff(arm.sent()[before:], axis=0)).max()
+    assert steps <= RATE_LIMIT * LONGEST_STEP + 1e-9
