@@ -7,7 +7,13 @@ from pathlib import Path
 
 
 class MusculoskeletalError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error this package raises on purpose.
+
+    Attributes:
+        reason: In a few words, what a rejected message is counted under.
+    """
+
+    reason = 'cannot be used'
 
 
 class RobotDescriptionError(MusculoskeletalError):
@@ -17,13 +23,15 @@ class RobotDescriptionError(MusculoskeletalError):
 class CheckpointError(MusculoskeletalError):
     """A checkpoint that is damaged or does not fit the robot."""
 
+    reason = 'unfit checkpoint'
+
 
 class InfeasibleError(MusculoskeletalError):
     """No muscle tension within its limits does what was asked."""
 
 
 class MessageError(MusculoskeletalError):
-    """A received message that breaks a rule of validity; `reason` is what is counted."""
+    """A received message that breaks a rule of validity."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f'{reason}: {detail}')

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000
 
+MOST_WRENCH = 1e4  # [N], [N·m]: no arm outlives more
+
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 
 QUANTITIES = ('length', 'tension', 'temperature')
@@ -48,11 +50,18 @@ def read_array(message: Float64MultiArray, rows: int, columns: int) -> Array:
         raise MessageError('wrong length', f'{len(message.data)} values, not {rows * columns}')
     shape = [columns] if rows == 1 else [rows, columns]
     sizes = [dim.size for dim in message.layout.dim]
-    # Without labels or strides the sizes alone say the layout; a stride that is given must match.
+    # Without labels or strides the sizes alone say the layout; what is given must match.
     strides = [dim.stride for dim in message.layout.dim]
+    names = [dim.label for dim in message.layout.dim]
     legal = [int(np.prod(shape[i:])) for i in range(len(shape))]
-    if sizes and (sizes != shape or any(s not in (0, e) for s, e in zip(strides, legal))):
-        raise MessageError('wrong layout', f'sizes {sizes}, strides {strides}; expected {shape}')
+    labels = ('quantity', 'muscle')[-len(shape) :]
+    if sizes and (
+        sizes != shape
+        or any(s not in (0, e) for s, e in zip(strides, legal))
+        or any(n not in ('', e) for n, e in zip(names, labels))
+    ):
+        given = list(zip(names, sizes, strides))
+        raise MessageError('wrong layout', f'{given}; expected {list(zip(labels, shape, legal))}')
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.asarray(message.data, dtype=float)
@@ -92,16 +101,15 @@ def read_joints(
     Raises:
         MessageError: If names, lengths or a value break a rule.
     """
-    names = list(message.name)
-    if len(names) > MOST_ENTRIES or len(message.position) > MOST_ENTRIES:
-        raise MessageError('oversized', f'{len(names)} joints, at most {MOST_ENTRIES}')
+    names, efforts, speeds = list(message.name), message.effort, message.velocity
+    counts = len(names), len(message.position), len(efforts), len(speeds)
+    if max(counts) > MOST_ENTRIES:
+        raise MessageError('oversized', f'{max(counts)} entries, at most {MOST_ENTRIES}')
     if not names:
         raise MessageError('empty', 'no joints')
-    efforts = message.effort
-    if len(message.position) != len(names) or len(efforts) not in (0, len(names)):
+    if counts[1] != counts[0] or not set(counts[2:]) <= {0, counts[0]}:
         raise MessageError(
-            'wrong length',
-            f'{len(names)} names, {len(message.position)} positions, {len(efforts)} efforts',
+            'wrong length', '{} names, {} positions, {} efforts, {} velocities'.format(*counts)
         )
     listed = set(joints)
     if not foreign_allowed:
@@ -114,14 +122,16 @@ def read_joints(
             continue
         if name in found:
             raise MessageError('duplicate joint', repr(name))
-        # Drivers say NaN for an effort they do not measure; only a target's effort is used.
+        # Drivers say NaN for a velocity or effort they do not measure; only a target's counts.
         effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
         found[name] = (message.position[i], effort)
     if foreign_allowed and len(found) < len(joints):
         missing = [name for name in joints if name not in found]
         raise MessageError('missing joint', ', '.join(missing))
-    if not np.isfinite(list(found.values())).all():
-        raise MessageError('not finite', 'a position or effort')
+    if not np.isfinite(list(found.values())).all() or not (
+        foreign_allowed or np.isfinite(np.asarray(speeds, dtype=float)).all()
+    ):
+        raise MessageError('not finite', 'a position, effort or velocity')
     return found
 
 
@@ -135,7 +145,7 @@ def read_wrench(message: WrenchStamped, root_link: str) -> Array:
     """Return force [N] and torque [N·m] (6,), in axes of the root link; an empty frame is that.
 
     Raises:
-        MessageError: If it is given in another frame or not finite.
+        MessageError: If it is given in another frame, not finite, or absurd.
     """
     force, torque = message.wrench.force, message.wrench.torque
     wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
@@ -143,6 +153,8 @@ def read_wrench(message: WrenchStamped, root_link: str) -> Array:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
     if not np.isfinite(wrench).all():
         raise MessageError('not finite', 'a force or torque')
+    if np.abs(wrench).max() > MOST_WRENCH:
+        raise MessageError('oversized', f'{np.abs(wrench).max():g}, at most {MOST_WRENCH:g}')
     return wrench
 
 

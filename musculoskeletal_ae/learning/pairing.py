@@ -47,10 +47,15 @@ class Pairing:
 
     def joints(self, time: float, theta: Array) -> None:
         """Take a θ [rad] (D,) that came at `time` [s]."""
+        if self._angles and time < self._angles[-1][0]:
+            self.reset()
         self._angles.append((time, theta))
 
     def muscles(self, time: float, tension: Array, length: Array) -> Paired | None:
         """Take T [N] and l [m] that came at `time` [s]; return the message before, paired."""
+        # The clock went back, or became another one.
+        if self._pending is not None and time < self._pending[0]:
+            self.reset()
         pending, self._pending = self._pending, (time, tension, length)
         if pending is None:
             return None

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 # A hundred times the shipped arms' networks.
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
+SMALLEST_EIGENVALUE = 1e-12  # of the largest one
+#: beyond what a trained network restores of a posture at rest: rad, N, m
+ABSURD = (100.0, 1e5, 100.0)
 REMEDY = 'use another checkpoint, or make one with `train`'
 
 
@@ -67,9 +70,11 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
         _check_robot(meta, robot)
         tensors = _tensors(data, header, meta)
     except CheckpointError as error:
-        raise CheckpointError(f'{source}: {error}; {REMEDY}') from error.__cause__
+        # What a hostile header says may hold halves of characters, which no message can carry.
+        said = f'{error}'.encode('utf-8', 'backslashreplace').decode()
+        raise CheckpointError(f'{source}: {said}; {REMEDY}') from error.__cause__
     depth = len(meta.layer_sizes) // 2
-    return Mae(
+    mae = Mae(
         joints=meta.joints,
         muscles=meta.muscles,
         preset=meta.preset,
@@ -90,6 +95,22 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
             meta.anomaly_thresholds,
         ),
     )
+    if robot is not None and not _restores_something(mae, robot):
+        raise CheckpointError(
+            f'{source}: does not restore a posture at rest to finite, sensible values; {REMEDY}'
+        )
+    return mae
+
+
+def _restores_something(mae: Mae, robot: Robot) -> bool:
+    """Return whether the network's answer for the middle posture can be computed with."""
+    theta = 0.5 * (robot.lower + robot.upper)
+    tension = np.full(robot.muscle_count, robot.tension.bias)
+    with np.errstate(all='ignore'):
+        state = mae.estimate(tension, robot.muscle_lengths(theta, tension))
+        jacobian = mae.muscle_jacobian(theta, tension)
+        sensible = [np.abs(part).max() <= most for part, most in zip(state, ABSURD, strict=True)]
+        return all(sensible) and bool(np.abs(jacobian).max() <= max(ABSURD))
 
 
 def save(mae: Mae, path: str | Path) -> None:
@@ -194,12 +215,14 @@ def _check_covariance(covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
         raise CheckpointError('tensor anomaly.covariance is not symmetric')
     try:
-        least = float(np.linalg.eigvalsh(covariance)[0])
+        least, *_, most = np.linalg.eigvalsh(covariance)
     except np.linalg.LinAlgError as error:
         raise CheckpointError('tensor anomaly.covariance has no eigenvalues') from error
-    if not least > 0.0:
+    # Nearer to singular it could not be inverted, as the detector does.
+    if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
-            f'tensor anomaly.covariance has an eigenvalue of {least:g}; it must be positive'
+            f'tensor anomaly.covariance has eigenvalues from {least:g} to {most:g}; the least must '
+            f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
         )
 
 

@@ -156,10 +156,10 @@ def _names(value: Any, what: str) -> tuple[str, ...]:
     if (
         not isinstance(value, list)
         or not 1 <= len(value) <= MAX_NAMES
-        or not all(isinstance(name, str) and name for name in value)
+        or not all(isinstance(name, str) and name.isprintable() and name for name in value)
         or len(set(value)) != len(value)
     ):
-        _fail(what, value, f'1 to {MAX_NAMES} different names')
+        _fail(what, value, f'1 to {MAX_NAMES} different names of printable characters')
     return tuple(value)
 
 

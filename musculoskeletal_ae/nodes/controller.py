@@ -25,7 +25,7 @@ from musculoskeletal_ae.messages import (
     read_joints,
     read_posture,
 )
-from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
@@ -45,7 +45,7 @@ class Controller(Shell):
         """Declare parameters, topics and services."""
         super().__init__('controller')
         self.declare_parameter('explore', False, text('explore from the start', read_only=True))
-        self.declare_parameter('seed', 0, text('seed of the exploration', read_only=True))
+        self.declare_parameter('seed', 0, whole('seed of the exploration'))
         self.settings = Settings()
         self.core = Core(self.robot, self.settings, self.get_parameter('seed').value)
         self._declare_settings()

@@ -42,6 +42,7 @@ class Estimator(Shell):
         self.detector = AnomalyDetector(self.robot)
         self.verdict: Verdict | None = None
         self.cause = ''
+        self.taken = self.get_clock().now()
         self.arrival = -math.inf
         self.command_arrival = -math.inf
         self.settable(
@@ -83,9 +84,10 @@ class Estimator(Shell):
         length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
         if self.mae is None:
             return
-        now = time.monotonic()
-        dt, self.arrival = min(now - self.arrival, LONGEST_PERIOD), now
-        if now - self.command_arrival > COMMAND_AGE:
+        now = self.get_clock().now()
+        dt = min(max((now - self.taken).nanoseconds * 1e-9, 0.0), LONGEST_PERIOD)
+        self.taken, self.arrival = now, time.monotonic()
+        if self.arrival - self.command_arrival > COMMAND_AGE:
             self.detector.commanded_length(None)
         state = self.mae.estimate(tension, length)
         self.theta = state.theta
@@ -124,7 +126,7 @@ class Estimator(Shell):
     def clock_jumped_back(self) -> None:
         """Start the detector's counts anew; what was detected stays."""
         self.detector.reset()
-        self.arrival = -math.inf
+        self.taken = self.get_clock().now()
 
     def state(self) -> tuple[bytes, str, dict[str, str]]:
         """Return what /diagnostics shows."""

@@ -22,7 +22,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import array_message, read_array, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
@@ -39,7 +39,7 @@ class HardwareEmulator(Shell):
     def __init__(self) -> None:
         """Declare parameters and topics, and start the arm."""
         super().__init__('hardware_emulator')
-        self.declare_parameter('seed', 0, text('which individual arm', read_only=True))
+        self.declare_parameter('seed', 0, whole('which individual arm'))
         self.declare_parameter(
             'joint_sensors', True, text('false: no joint_states', read_only=True)
         )

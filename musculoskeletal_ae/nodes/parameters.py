@@ -3,12 +3,18 @@
 
 from __future__ import annotations
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
 
 def text(description: str, read_only: bool = False) -> ParameterDescriptor:
     """Describe a parameter that has no range."""
     return ParameterDescriptor(description=description, read_only=read_only)
+
+
+def whole(description: str) -> ParameterDescriptor:
+    """Describe a whole number of at least 0 that is read once, such as a seed."""
+    span = IntegerRange(from_value=0, to_value=2**63 - 1)
+    return ParameterDescriptor(description=description, integer_range=[span], read_only=True)
 
 
 def number(

@@ -7,10 +7,11 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 # A source time that lies further back than this is another publisher's clock, not a reordering.
 REORDERING = int(1e9)  # [ns]
+LONGEST_TEXT = 500
 
 
 class Reception:
@@ -18,35 +19,41 @@ class Reception:
 
     Attributes:
         rejected: How many messages were rejected, by topic and reason.
+        last_rejected: What was wrong with the last one of them, or ''.
     """
 
     def __init__(self) -> None:
         """Nothing has come yet."""
+        self.last_rejected = ''
         self.rejected: Counter[str] = Counter()
         self._received: Counter[str] = Counter()
-        self._last_source: dict[str, int] = {}
+        self._last: dict[str, tuple[int, int]] = {}
 
     def of(
-        self, topic: str, callback: Callable[[Any], None]
+        self, topic: str, callback: Callable[[Any], None], publishers: Callable[[], int]
     ) -> Callable[[Any, dict[str, Any]], None]:
         """Return what to subscribe with: calls `callback` unless the message comes twice or late.
 
-        The callback raises a `MusculoskeletalError` to reject the message.
+        Args:
+            topic: To count under.
+            callback: Raises a `MusculoskeletalError` to reject the message.
+            publishers: Counts who publishes there: a message does not say who sent it, and two
+                clocks or counters cannot be compared.
         """
 
         def receive(message: Any, info: dict[str, Any]) -> None:
-            source = info['source_timestamp']
-            behind = self._last_source.get(topic, 0) - source
-            if 0 <= behind < REORDERING and source > 0:
+            time, number = info['source_timestamp'], info['publication_sequence_number']
+            last_time, last_number = self._last.get(topic, (0, 0))
+            late = 0 <= last_time - time < REORDERING and number <= last_number
+            if late and time > 0 and publishers() == 1:
                 self.rejected[f'{topic}: repeated or reordered'] += 1
                 return
-            self._last_source[topic] = source
+            self._last[topic] = time, number
             try:
                 callback(message)
-            except MessageError as error:
-                self.rejected[f'{topic}: {error.reason}'] += 1
             except MusculoskeletalError as error:
-                self.rejected[f'{topic}: {error}'] += 1
+                self.rejected[f'{topic}: {error.reason}'] += 1
+                self.last_rejected = f'{topic}: {error}'[:LONGEST_TEXT]
             else:
                 self._received[topic] += 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -28,6 +29,16 @@ names:  -r __ns:=/left_arm  -r TOPIC:=OTHER.  `ros2 param describe` tells each p
 """
 
 
+def reason(error: Exception) -> str:
+    """Return what rcl says is wrong, without where in its sources it says so."""
+    return ' '.join(str(error).split(', at /')[0].split())
+
+
+def _refuse(error: object) -> NoReturn:
+    print(f'error: {error}', file=sys.stderr)
+    sys.exit(1)
+
+
 def run(make: Callable[[], Node]) -> None:
     """Run one node on a single-threaded executor until it is asked to stop.
 
@@ -36,7 +47,10 @@ def run(make: Callable[[], Node]) -> None:
     if {'--help', '-h'} & set(sys.argv[1:]):
         print(f'{sys.modules[make.__module__].__doc__}\n{USAGE}')
         return
-    rclpy.init()
+    try:
+        rclpy.init()
+    except (rclpy_implementation.RCLError, *PARAMETER_ERRORS) as error:
+        _refuse(reason(error))
     node = None
     try:
         node = make()
@@ -50,8 +64,7 @@ def run(make: Callable[[], Node]) -> None:
         if rclpy.ok():
             raise
     except (MusculoskeletalError, *PARAMETER_ERRORS) as error:
-        print(f'error: {error}', file=sys.stderr)
-        sys.exit(1)
+        _refuse(error)
     finally:
         if node is not None:
             node.destroy_node()

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
@@ -16,7 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import number, text
@@ -55,7 +56,7 @@ class Shell(Node):
         self._report_timer = self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
         backward = JumpThreshold(
-            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
         self._jump = self.get_clock().create_jump_callback(
             backward, post_callback=lambda _: self.clock_jumped_back()
@@ -95,12 +96,16 @@ class Shell(Node):
             raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
     def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        taken: list[str] = []
         for parameter in parameters:
             if parameter.name in self._setters:
                 try:
                     self._setters[parameter.name](parameter.value)
                 except (MusculoskeletalError, OSError) as error:
+                    for name in reversed(taken):  # all or nothing
+                        self._setters[name](self.get_parameter(name).value)
                     return SetParametersResult(successful=False, reason=str(error))
+                taken.append(parameter.name)
         return SetParametersResult(successful=True)
 
     # -- checkpoints ----------------------------------------------------------------------------
@@ -117,8 +122,11 @@ class Shell(Node):
         self.mae: Mae | None = None
 
         def take(mae: Mae) -> None:
+            try:
+                use(mae)
+            except (np.linalg.LinAlgError, FloatingPointError) as error:
+                raise CheckpointError(f'cannot be computed with ({error})') from error
             self.mae = mae
-            use(mae)
 
         def from_file(path: str) -> None:
             if path:
@@ -126,11 +134,10 @@ class Shell(Node):
 
         def from_topic(message: UInt8MultiArray) -> None:
             try:
-                mae = checkpoints.from_bytes(bytes(message.data), self.robot)
-            except MusculoskeletalError as error:
+                take(checkpoints.from_bytes(bytes(message.data), self.robot))
+            except CheckpointError as error:
                 unfit(str(error))
                 raise
-            take(mae)
 
         self.settable('checkpoint', '', text('MAE checkpoint file; empty: wait for one'), from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
@@ -145,7 +152,8 @@ class Shell(Node):
         The callback raises a `MusculoskeletalError` to reject the message.
         """
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
-        receive = self._reception.of(topic, callback)
+        full = self.resolve_topic_name(topic)
+        receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
         self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
     # -- diagnostics ----------------------------------------------------------------------------
@@ -158,6 +166,8 @@ class Shell(Node):
             values[f'{topic} rate'] = f'{count / elapsed:.1f} Hz'
         values['rejected'] = str(sum(self.rejected.values()))
         values |= {f'rejected {reason}': str(n) for reason, n in self.rejected.items()}
+        if self._reception.last_rejected:
+            values['last rejected'] = self._reception.last_rejected
         status = DiagnosticStatus(
             level=level,
             name=f'{self.get_fully_qualified_name()}: state',

@@ -76,8 +76,9 @@ class Sim(Shell):
 
     def _use(self, mae: Mae) -> None:
         if self.arm is None:
-            self.arm = Simulation(self.robot, mae, self.preset)
-            self.arm.settle()
+            arm = Simulation(self.robot, mae, self.preset)
+            arm.settle()
+            self.arm = arm
         else:
             self.arm.use(mae)
 

@@ -16,6 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.running import PARAMETER_ERRORS, reason
 
 
 def message_class(type_name: str) -> Any:
@@ -48,8 +49,7 @@ def _own_arguments(arguments: list[str]) -> list[str]:
 
 
 def _refuse(arguments: list[str], error: RuntimeError) -> NoReturn:
-    reason = ' '.join(str(error).split(', at /')[0].split())
-    print(f'{arguments[0]}: error: --ros-args: {reason}', file=sys.stderr)
+    print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
     sys.exit(2)
 
 
@@ -71,7 +71,7 @@ def run_tool(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return work(parse(_own_arguments(arguments)), arguments)
-    except (MusculoskeletalError, InvalidTopicNameException) as error:
+    except (MusculoskeletalError, InvalidTopicNameException, *PARAMETER_ERRORS) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -71,12 +71,11 @@ class AnomalyDetector:
 
     def use(self, mae: Mae) -> None:
         """Take the healthy statistics of a checkpoint."""
-        self._statistics = mae.anomaly
-        self._whiten = None
+        whiten = None
         if mae.anomaly is not None:
-            factor = np.linalg.cholesky(mae.anomaly.covariance)
-            self._whiten = np.linalg.inv(factor)
+            whiten = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
             self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
+        self._statistics, self._whiten = mae.anomaly, whiten
 
     @property
     def calibrated(self) -> bool:

@@ -6,7 +6,8 @@ so the tension limit of a muscle is a length limit,
 
     l_target ≥ l − (T_limit − T_bias)/K_stiff,
 
-which may pay a muscle out faster than the rate limit, never wind it in. The limit of a muscle whose
+which may pay a muscle out faster than the rate limit, never wind it in. l is the median of the last
+three readings there, so that a glitch of a sensor lets no muscle go. The limit of a muscle whose
 module runs hot falls smoothly from tension.max to T_bias.
 
 A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
@@ -15,6 +16,7 @@ limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times 
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -79,6 +81,7 @@ class SafetyFilter:
         self.cause = ''
         self.command: Command | None = None
         self._held = 0.0
+        self._readings: deque[Array] = deque(maxlen=3)
         postures = robot.random_postures(200, np.random.default_rng(0))
         self._longest: Array = robot.routes.relative_lengths(postures).max(axis=0)
 
@@ -103,6 +106,8 @@ class SafetyFilter:
             dt: Time since the step before [s].
             fresh: Whether `muscles` still says where the muscles are.
         """
+        if not self._readings or muscles.length is not self._readings[-1]:
+            self._readings.append(muscles.length)
         if not self.cause:
             wished = wished or self.command
             if wished is None:
@@ -129,7 +134,8 @@ class SafetyFilter:
         value = before.value + np.clip(wished.value - before.value, -change, change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
-        shortest = muscles.length - (limit - robot.tension.bias) / robot.stiffness
+        length = np.minimum(np.median(self._readings, axis=0), self._longest)
+        shortest = length - (limit - robot.tension.bias) / robot.stiffness
         return Command(kind, np.maximum(value, shortest))
 
     def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:

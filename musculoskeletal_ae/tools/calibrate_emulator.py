@@ -17,6 +17,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import to_mae
 from musculoskeletal_ae.mae.training import initial_training
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools import options
 
 
 def _trained(robot: Robot, preset: str) -> Mae:
@@ -28,21 +29,17 @@ def main() -> None:
     """Train both presets, record the motion on every individual and print the errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm', help='name or directory')
-    parser.add_argument('--seeds', default='0,1,2,3,4,5,6,7,8,9', help='individuals')
-    parser.add_argument('--minutes', type=float, default=5.0, help='of held-out motion')
+    parser.add_argument('--seeds', type=options.seeds, default=tuple(range(10)), help='individuals')
+    parser.add_argument('--minutes', type=options.minutes, default=5.0, help='of held-out motion')
     arguments = parser.parse_args()
-    try:
-        seeds = [int(seed) for seed in arguments.seeds.split(',')]
-    except ValueError:
-        parser.error(f'--seeds {arguments.seeds!r}: expected whole numbers such as 0,1,2')
-    if not 0.1 <= arguments.minutes <= 1000.0:
-        parser.error(f'--minutes {arguments.minutes:g}: expected 0.1 to 1000')
     try:
         robot = Robot.load(arguments.robot)
         default, paper = _trained(robot, 'default'), _trained(robot, 'paper')
-        total = 60.0 * arguments.minutes * len(seeds)
+        total = 60.0 * arguments.minutes * len(arguments.seeds)
         with tqdm(total=total, unit=' robot s', unit_scale=True) as bar:
-            rows = calibration(robot, default, paper, seeds, arguments.minutes, bar.update)
+            rows = calibration(
+                robot, default, paper, arguments.seeds, arguments.minutes, bar.update
+            )
     except MusculoskeletalError as error:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(1)

@@ -21,6 +21,7 @@ from musculoskeletal_ae.robot.checks import (
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.moment_arms import MATTERS
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools import options
 
 Array = NDArray[np.float64]
 
@@ -35,8 +36,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         'robot', help=f'a directory, or a shipped robot: {", ".join(sorted(shipped_robots()))}'
     )
-    parser.add_argument('--postures', type=_count, default=200, help='random postures (200)')
-    parser.add_argument('--seed', type=int, default=0, help='seed of the postures (0)')
+    parser.add_argument(
+        '--postures', type=options.whole(1, 1_000_000), default=200, help='random postures (200)'
+    )
+    parser.add_argument('--seed', type=options.seed, default=0, help='seed of the postures (0)')
     parser.add_argument('--plot', type=Path, metavar='FILE.png', help='check_<robot>.png')
     parser.add_argument('--no-plot', action='store_true', help='write no plot')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
@@ -66,13 +69,6 @@ def main(argv: list[str] | None = None) -> int:
     count = len(result.faults)
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
     return 1 if count else 0
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'expected a number >= 1, got {value}')
-    return value
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:

@@ -21,8 +21,8 @@ from musculoskeletal_ae.experiments.suite.run import run, total_weight
 from musculoskeletal_ae.experiments.suite.study import PRESETS, Study
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools import options
 
-MOST_MINUTES = 600.0
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
 MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
@@ -93,14 +93,16 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         help='whose networks are measured; preset paper is always shown beside (default)',
     )
     parser.add_argument(
-        '--seeds', type=_seeds, help='individual arms, e.g. 0,1,2 (0,1,2,3,4; quick: 0)'
+        '--seeds', type=options.seeds, help='individual arms, e.g. 0,1,2 (0,1,2,3,4; quick: 0)'
     )
-    parser.add_argument('--minutes', type=_minutes, help='of exploration (10; quick: 2)')
+    parser.add_argument('--minutes', type=options.minutes, help='of exploration (10; quick: 2)')
     parser.add_argument('--quick', action='store_true', help='a taste of everything, in minutes')
     parser.add_argument(
         '--out', type=Path, default=Path('experiments'), metavar='DIR', help='(experiments)'
     )
-    parser.add_argument('--jobs', type=_jobs, default=None, help='processes (one per core)')
+    parser.add_argument(
+        '--jobs', type=options.whole(1, 256), default=None, help='processes (one per core)'
+    )
     parser.add_argument(
         '--readme',
         type=Path,
@@ -112,36 +114,6 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
     args.jobs = args.jobs or len(os.sched_getaffinity(0))
     return args
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-    try:
-        seeds = tuple(int(part) for part in text.split(','))
-    except ValueError:
-        seeds = (-1,)
-    if min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise argparse.ArgumentTypeError(f'{text!r}: expected different whole numbers, as in 0,1,2')
-    return seeds
-
-
-def _minutes(text: str) -> float:
-    try:
-        minutes = float(text)
-    except ValueError:
-        minutes = -1.0
-    if not 0.2 <= minutes <= MOST_MINUTES:
-        raise argparse.ArgumentTypeError(f'{text!r}: expected 0.2 to {MOST_MINUTES:g}')
-    return minutes
-
-
-def _jobs(text: str) -> int:
-    try:
-        jobs = int(text)
-    except ValueError:
-        jobs = 0
-    if not 1 <= jobs <= 256:
-        raise argparse.ArgumentTypeError(f'{text!r}: expected 1 to 256')
-    return jobs
 
 
 if __name__ == '__main__':

@@ -20,6 +20,7 @@ from musculoskeletal_ae.robot.series_elastic import (
     SeriesElastic,
     fit_series_elastic,
 )
+from musculoskeletal_ae.tools import options
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,9 @@ def main(argv: list[str] | None = None) -> int:
         action='store_true',
         help='write a synthetic table to TABLE instead (never over an existing file)',
     )
-    parser.add_argument('--seed', type=int, default=0, help='seed of the example noise (0)')
+    parser.add_argument(
+        '--seed', type=options.seed, default=0, help='seed of the example noise (0)'
+    )
     args = parser.parse_args(argv)
     try:
         if args.make_example:

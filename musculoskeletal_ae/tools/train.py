@@ -21,6 +21,7 @@ from musculoskeletal_ae.mae.training import TRAINING_PRESETS
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools import options
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 
 Array = NDArray[np.float64]
@@ -127,7 +128,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         default='default',
         help='paper: network and training as printed; default: the best measured (default)',
     )
-    parser.add_argument('--seed', type=_seed, default=0, help='of data and weights (0)')
+    parser.add_argument('--seed', type=options.seed, default=0, help='of data and weights (0)')
     parser.add_argument('--plot', type=Path, metavar='FILE.png', help='loss and errors')
     parser.add_argument(
         '--from-bag',
@@ -158,13 +159,6 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     if not args.from_bag and (args.hold_out or args.checkpoint):
         parser.error('--hold-out and --checkpoint go with --from-bag')
     return args
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f'expected 0 to 2^63 - 1, got {value}')
-    return value
 
 
 def table(errors: list[PairError], title: str) -> str:
