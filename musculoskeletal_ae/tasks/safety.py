@@ -31,6 +31,8 @@ LENGTH, TENSION = 'length', 'tension'
 
 # Width of the band below the highest temperature in which a muscle's tension limit falls.
 COOLING_BAND = 15.0  # [°C]
+#: [m] by which a true muscle, or its sensor, may be longer than the model's
+LENGTH_MARGIN = 0.03
 
 
 class Command(NamedTuple):
@@ -83,7 +85,8 @@ class SafetyFilter:
         self._held = 0.0
         self._readings: deque[Array] = deque(maxlen=3)
         postures = robot.random_postures(200, np.random.default_rng(0))
-        self._longest: Array = robot.routes.relative_lengths(postures).max(axis=0)
+        longest = robot.routes.relative_lengths(postures).max(axis=0)
+        self._longest: Array = longest + LENGTH_MARGIN
 
     def stop(self, cause: str) -> None:
         """Latch a stop; the first cause is kept."""
@@ -130,6 +133,8 @@ class SafetyFilter:
         before = self.command
         if before is None or before.kind != kind:
             before = unchanging(robot, kind, muscles)
+            if kind == LENGTH:
+                before = Command(kind, np.minimum(before.value, self._longest))
         change = self._rate(kind) * dt
         value = before.value + np.clip(wished.value - before.value, -change, change)
         if kind == TENSION:

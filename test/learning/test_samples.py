@@ -164,3 +164,13 @@ def test_the_nearest_angle_within_half_a_period_is_paired():
     assert second.theta == [1.0]
     assert second.dt == pytest.approx(0.011)
     assert third.theta is None
+
+
+def test_a_clock_that_goes_back_starts_pairing_anew():
+    pairing = Pairing(0.01)
+    pairing.muscles(1.7e9, np.ones(1), np.ones(1))
+    assert pairing.muscles(0.0, np.ones(1), np.ones(1)) is None
+    pairing.joints(0.0, np.array([2.0]))
+    after = pairing.muscles(0.01, np.ones(1), np.ones(1))
+    assert after.dt == 0.0
+    assert after.theta == [2.0]

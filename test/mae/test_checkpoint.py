@@ -133,6 +133,8 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'joints': ['knee', 'ankle']}, 'layer_sizes'),
         ({'joints': []}, 'joints'),
         ({'joints': [1]}, 'joints'),
+        ({'joints': ['\ud800']}, 'printable'),
+        ({'joints': ['kn\nee']}, 'printable'),
         ({'muscles': ['quad', 'quad']}, 'different names'),
         ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
         ({'layer_sizes': [8, 4, 3, 4, 6]}, 'layer_sizes'),
@@ -172,12 +174,35 @@ def test_zero_spread_is_refused():
         from_bytes(to_bytes(replace(small(), std=np.full(5, 1e-30))))
 
 
-@pytest.mark.parametrize('covariance', [-np.eye(4), np.triu(np.ones((4, 4))), np.zeros((4, 4))])
+@pytest.mark.parametrize(
+    'covariance',
+    [
+        -np.eye(4),
+        np.triu(np.ones((4, 4))),
+        np.zeros((4, 4)),
+        np.ones((4, 4)) + 1e-15 * np.eye(4),
+    ],
+)
 def test_covariance_that_is_none_is_refused(covariance):
     good = small()
     bad = replace(good, anomaly=replace(good.anomaly, covariance=covariance))
     with pytest.raises(CheckpointError, match='covariance'):
         from_bytes(to_bytes(bad))
+
+
+def test_weights_that_cannot_be_computed_with_are_refused_for_a_robot(mae, robot):
+    huge = tuple((np.full_like(weight, 1e9), bias) for weight, bias in mae.decoder)
+    data = to_bytes(replace(mae, decoder=huge))
+    from_bytes(data)
+    with pytest.raises(CheckpointError, match='posture at rest'):
+        from_bytes(data, robot)
+
+
+@pytest.mark.parametrize('key', ['extra\ud800', 'joints'])
+def test_whatever_a_header_holds_its_refusal_can_be_sent_in_a_message(key):
+    with pytest.raises(CheckpointError) as refused:
+        from_bytes(with_metadata(**{key: ['\ud800']}))
+    assert str(refused.value).encode()
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 from musculoskeletal_ae.messages import array_message, bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
@@ -66,7 +67,9 @@ def test_estimates_come_by_name_and_near_the_truth(estimator, arm26):
     assert joints.header.stamp.sec > 0
     np.testing.assert_allclose(joints.position, theta, atol=0.3)
     assert np.isfinite(estimator.received['anomaly'][-1].data)
-    assert estimator.received['anomaly_detected'][0].data is False
+    detected = estimator.received['anomaly_detected']
+    estimator.wait(lambda: detected, 'the latched decision')
+    assert detected[0].data is False
 
 
 def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimator, arm26):
@@ -114,8 +117,24 @@ def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refu
     publisher = estimator.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
     estimator.wait(lambda: values(estimator).get('checkpoint version') == '41', 'version 41')
-    publisher.publish(bytes_message(b'not a checkpoint'))
-    estimator.wait(lambda: int(values(estimator).get('rejected', 0)) > 0, 'the refusal')
+    unprintable = checkpoint.to_bytes(replace(mae, joints=('\ud800', 'b')))
+    singular = np.ones((12, 12)) + 1e-15 * np.eye(12)
+    statistics = AnomalyStatistics(np.zeros(12), singular, True, 100, {})
+    for refusals, data in enumerate(
+        (
+            b'not a checkpoint',
+            unprintable,
+            checkpoint.to_bytes(replace(mae, anomaly=statistics)),
+        ),
+        start=1,
+    ):
+        publisher.publish(bytes_message(data))
+        estimator.wait(
+            lambda count=str(refusals): (
+                values(estimator).get('rejected mae_checkpoint: unfit checkpoint') == count
+            ),
+            f'refusal {refusals}',
+        )
     assert values(estimator)['checkpoint version'] == '41'
     answer(estimator, good)
 

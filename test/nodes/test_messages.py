@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from geometry_msgs.msg import WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import JointState
@@ -16,6 +19,7 @@ from musculoskeletal_ae.messages import (
     read_array,
     read_joints,
     read_posture,
+    read_wrench,
 )
 
 JOINTS = ('a', 'b')
@@ -109,3 +113,30 @@ def test_a_wrong_target_is_rejected_by_reason(message, reason):
     with pytest.raises(MessageError) as error:
         read_joints(message, JOINTS, foreign_allowed=False)
     assert error.value.reason == reason
+
+
+def test_labels_that_are_given_must_match():
+    rows = np.zeros((3, 3))
+    assert read_array(array_message(rows, '', ''), 3, 3).shape == (3, 3)
+    with pytest.raises(MessageError, match='wrong layout'):
+        read_array(array_message(rows, 'muscle', 'quantity'), 3, 3)
+
+
+def test_velocities_are_counted_and_a_target_s_are_finite():
+    many = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[math.nan] * 100_000)
+    with pytest.raises(MessageError, match='oversized'):
+        read_joints(many, ['a', 'b'], foreign_allowed=True)
+    one = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[0.0])
+    with pytest.raises(MessageError, match='wrong length'):
+        read_joints(one, ['a', 'b'], foreign_allowed=True)
+    unmeasured = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[math.nan] * 2)
+    assert len(read_joints(unmeasured, ['a', 'b'], foreign_allowed=True)) == 2
+    with pytest.raises(MessageError, match='not finite'):
+        read_joints(unmeasured, ['a', 'b'], foreign_allowed=False)
+
+
+def test_a_wrench_that_no_arm_outlives_is_refused():
+    message = WrenchStamped()
+    message.wrench.force.x = 1e6
+    with pytest.raises(MessageError, match='oversized'):
+        read_wrench(message, 'torso')

@@ -12,6 +12,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks.safety import (
     COOLING_BAND,
     LENGTH,
+    LENGTH_MARGIN,
     TENSION,
     Command,
     Muscles,
@@ -37,7 +38,7 @@ def vectors(low, high):
 
 
 @given(
-    st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.3), vectors(BIAS, MAX)), max_size=6),
+    st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
     st.floats(0.001, 1.0),
 )
 def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_the_limit(
@@ -45,17 +46,38 @@ def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_t
 ):
     guard, before = SafetyFilter(ROBOT, Settings(rate_limit=rate)), None
     for wish, length, limit in wishes:
-        now = Muscles(length, np.full(COUNT, BIAS), COLD)
-        sent = guard.step(Command(LENGTH, wish), now, limit, DT).value
+        # What two readings of three say is believed.
+        for _ in range(2):
+            now = Muscles(length.copy(), np.full(COUNT, BIAS), COLD)
+            sent = guard.step(Command(LENGTH, wish), now, limit, DT).value
+            if before is None:
+                before = unchanging(ROBOT, LENGTH, now).value
+            assert (sent - before >= -rate * DT - 1e-12).all()
+            last, before = before, sent
         demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
         assert (demanded <= limit + 1e-6).all()
-        if before is None:
-            before = unchanging(ROBOT, LENGTH, now).value
-        change, at_limit = sent - before, demanded >= limit - 1e-6
-        assert (change >= -rate * DT - 1e-12).all()
         # Paying out faster is what the tension limit may do, and nothing else.
-        assert (change[~at_limit] <= rate * DT + 1e-12).all()
+        assert ((sent - last)[demanded < limit - 1e-6] <= rate * DT + 1e-12).all()
+
+
+@pytest.mark.parametrize('glitch', [2.0, 1e308, -1e308])
+def test_one_wrong_reading_lets_no_muscle_go(glitch):
+    settings = Settings()
+    guard = SafetyFilter(ROBOT, settings)
+    wish = Command(LENGTH, np.full(COUNT, -0.01))
+    before = [guard.step(wish, muscles(), LIMIT, DT).value for _ in range(30)][-1]
+    for length in (0.0, glitch, 0.0, 0.0):
+        sent = guard.step(wish, muscles(length), LIMIT, DT).value
+        assert np.abs(sent - before).max() <= settings.rate_limit * DT + 1e-12
         before = sent
+
+
+def test_a_sensor_that_stays_wrong_pays_out_to_the_longest_the_muscle_can_be_at_most():
+    guard = SafetyFilter(ROBOT, Settings())
+    for _ in range(10):
+        sent = guard.step(unchanging(ROBOT, LENGTH, muscles()), muscles(5.0), LIMIT, DT).value
+    theta = ROBOT.random_postures(2000, np.random.default_rng(3))
+    assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
 
 
 @given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))

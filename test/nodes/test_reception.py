@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is dropped as late, and under which names rejections are counted; no graph needed."""
+
+from __future__ import annotations
+
+import pytest
+
+from musculoskeletal_ae.exceptions import CheckpointError, MessageError
+from musculoskeletal_ae.nodes.reception import Reception
+
+SECOND = 1_000_000_000
+
+
+class Inbox:
+    """A topic with so many publishers."""
+
+    def __init__(self, publishers=1):
+        self.used = []
+        self.reception = Reception()
+        self.receive = self.reception.of('topic', self.used.append, lambda: publishers)
+
+    def get(self, message, time, number):
+        self.receive(message, {'source_timestamp': time, 'publication_sequence_number': number})
+
+
+def test_what_comes_twice_or_late_is_dropped_and_counted():
+    inbox = Inbox()
+    for number, time in ((1, 10), (2, 20), (2, 20), (1, 15), (3, 30)):
+        inbox.get(number, time * SECOND // 100, number)
+    assert inbox.used == [1, 2, 3]
+    assert inbox.reception.rejected == {'topic: repeated or reordered': 2}
+
+
+def test_a_publisher_whose_clock_stepped_back_is_heard():
+    inbox = Inbox()
+    inbox.get('before', 100 * SECOND, 1)
+    inbox.get('after', 100 * SECOND - SECOND // 2, 2)
+    inbox.get('much later', 5 * SECOND, 3)
+    assert inbox.used == ['before', 'after', 'much later']
+
+
+def test_of_two_publishers_neither_hides_the_other():
+    inbox = Inbox(publishers=2)
+    inbox.get('ahead', 100 * SECOND, 50)
+    inbox.get('behind', 100 * SECOND - SECOND // 2, 1)
+    assert inbox.used == ['ahead', 'behind']
+
+
+@pytest.mark.parametrize(
+    ('error', 'reason'),
+    [
+        (MessageError('empty', 'no joints'), 'topic: empty'),
+        (CheckpointError('made for other joints'), 'topic: unfit checkpoint'),
+    ],
+)
+def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reason):
+    reception = Reception()
+
+    def refuse(_):
+        raise error
+
+    receive = reception.of('topic', refuse, lambda: 1)
+    for number in range(1, 4):
+        receive(None, {'source_timestamp': number, 'publication_sequence_number': number})
+    assert reception.rejected == {reason: 3}
+    assert str(error) in reception.last_rejected
+    assert not reception.take_received()
