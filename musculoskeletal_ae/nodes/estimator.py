@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages import QUANTITIES, array_message, read_array, read_pose
-from musculoskeletal_ae.nodes.parameters import number
+from musculoskeletal_ae.nodes.parameters import declare_preset, number
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, WARN, Shell
@@ -39,6 +39,8 @@ class Estimator(Shell):
     def __init__(self) -> None:
         """Declare parameters and topics."""
         super().__init__('estimator')
+        # Shared by all nodes; what network it is, the checkpoint says.
+        declare_preset(self, 'of the checkpoint')
         self.detector = AnomalyDetector(self.robot)
         self.verdict: Verdict | None = None
         self.cause = ''

@@ -4,6 +4,10 @@
 from __future__ import annotations
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.mae.metadata import PRESETS
 
 
 def text(description: str, read_only: bool = False) -> ParameterDescriptor:
@@ -15,6 +19,19 @@ def whole(description: str) -> ParameterDescriptor:
     """Describe a whole number of at least 0 that is read once, such as a seed."""
     span = IntegerRange(from_value=0, to_value=2**63 - 1)
     return ParameterDescriptor(description=description, integer_range=[span], read_only=True)
+
+
+def declare_preset(node: Node, meaning: str) -> str:
+    """Declare `preset`, read once, and return it.
+
+    Raises:
+        MusculoskeletalError: If there is no such preset.
+    """
+    descriptor = text(f'{meaning}; one of: {", ".join(PRESETS)}', read_only=True)
+    preset = str(node.declare_parameter('preset', 'default', descriptor).value)
+    if preset not in PRESETS:
+        raise MusculoskeletalError(f'parameter preset: {preset!r}; legal: {", ".join(PRESETS)}')
+    return preset
 
 
 def number(

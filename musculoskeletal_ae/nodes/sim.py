@@ -15,18 +15,16 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages import array_message, read_array, read_joints, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.parameters import text
+from musculoskeletal_ae.nodes.parameters import declare_preset, text
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.tasks.simulation import Simulation
 
-PRESETS = ('default', 'paper')
 MARKER_RATE = 10.0  # [Hz] of the markers for RViz
 TEMPERATURE = 25.0  # [°C]
 # After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
@@ -39,14 +37,7 @@ class Sim(Shell):
     def __init__(self) -> None:
         """Declare parameters and topics."""
         super().__init__('sim')
-        self.declare_parameter(
-            'preset', 'default', text(f'one of: {", ".join(PRESETS)}', read_only=True)
-        )
-        self.preset = self.get_parameter('preset').value
-        if self.preset not in PRESETS:
-            raise MusculoskeletalError(
-                f'parameter preset: {self.preset!r}; legal: {", ".join(PRESETS)}'
-            )
+        self.preset = declare_preset(self, 'descent and weights')
         self.declare_parameter(
             'as_robot', False, text('take the place of the robot on its topics', read_only=True)
         )
