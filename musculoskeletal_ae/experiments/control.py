@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.control_loop import ControlLoop
+from musculoskeletal_ae.experiments.control_nominal import nominal_tables
+from musculoskeletal_ae.experiments.holdable import holdable_postures
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.tasks.settings import Settings
 
 Array = NDArray[np.float64]
@@ -39,7 +39,6 @@ PROTOCOL = {
 }
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
 DURATION = 8.0  # [s]
-TRIES = 1000
 
 
 @dataclass(frozen=True)
@@ -72,33 +71,6 @@ class ControlResult:
             }
             for method, approaches in self.approaches.items()
         }
-
-
-def least_holding_tension(robot: Robot, jacobian: Array, theta: Array) -> Array:
-    """Return the least T [N] (M,) that holds θ with G of shape (M, D); see `holding_tension`."""
-    torque = robot.kinematics.holding_torque(theta)
-    return holding_tension(jacobian, torque, robot.tension.bias, robot.tension.limit, 0.0)
-
-
-def holdable_postures(
-    robot: Robot, individual: Individual, count: int, rng: np.random.Generator
-) -> list[tuple[Array, Array]]:
-    """Return random (θ, least T) that both the model and the true body can hold.
-
-    Raises:
-        MusculoskeletalError: If hardly any posture can be held.
-    """
-    found: list[tuple[Array, Array]] = []
-    for theta in robot.random_postures(TRIES, rng):
-        try:
-            least_holding_tension(robot, robot.routes.muscle_jacobian(theta), theta)
-            true = individual.muscle_jacobian(theta[None])[0]
-            found.append((theta, least_holding_tension(robot, true, theta)))
-        except InfeasibleError:
-            continue
-        if len(found) == count:
-            return found
-    raise MusculoskeletalError(f'only {len(found)} of {TRIES} postures can be held')
 
 
 def approach(
@@ -142,8 +114,6 @@ def control_protocol(
 
 def main(argv: list[str] | None = None) -> None:
     """Print the tables."""
-    from musculoskeletal_ae.experiments.control_nominal import nominal_tables
-
     parser = argparse.ArgumentParser(prog='control', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--checkpoint', required=True, help='of preset default')

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.control import holdable_postures
+from musculoskeletal_ae.experiments.holdable import holdable_postures
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tasks import control

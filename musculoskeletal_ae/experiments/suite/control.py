@@ -19,9 +19,8 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments.control import (
     PROTOCOL,
     approach,
-    holdable_postures,
-    least_holding_tension,
 )
+from musculoskeletal_ae.experiments.holdable import holdable_postures, least_holding_tension
 from musculoskeletal_ae.experiments.suite.scenario import frictionless
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
