@@ -26,6 +26,8 @@ MARGIN = 2.0  # [s] before a detection and after its reset
 # Beyond these a sensor errs, not the arm.
 OUTSIDE = 0.1  # of the joint's range
 TOO_TENSE = 1.1  # of tension.max
+#: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
+MOST_WAITING = 5000
 
 
 class Waiting(NamedTuple):
@@ -61,7 +63,7 @@ class Collector:
         self.rejected: Counter[str] = Counter()
         self._rest = RestDetector(rest or RestSettings())
         self._sliding = SlidingTracker(robot.muscle_count)
-        self._waiting: deque[Waiting] = deque()
+        self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
         self._time = 0.0
         self._closed_until = 0.0
         self._anomaly = False

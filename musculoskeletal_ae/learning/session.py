@@ -87,8 +87,8 @@ class Session:
     def _use(self, mae: Mae) -> None:
         """Go on from a network, and hand it out at once."""
         self.data, self._version = checkpoint.to_bytes(mae), mae.version
-        # A muscle may have been changed since the detector was calibrated last.
-        self._statistics_hold = mae.anomaly is not None and mae.anomaly.calibrated
+        # Where they do not, the checkpoint says that the detector is not calibrated.
+        self._statistics_hold = True
         self._training.start()
         self._handout.give(self.data)
 

@@ -164,3 +164,17 @@ def test_the_nearest_angle_within_half_a_period_is_paired():
     assert second.theta == [1.0]
     assert second.dt == pytest.approx(0.011)
     assert third.theta is None
+
+
+def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch):
+    monkeypatch.setattr('musculoskeletal_ae.learning.collector.MOST_WAITING', 20)
+    monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
+    collector = Collector(arm26)
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    rest_at(collector, arm26, theta, 0.5)
+    pull = np.full(6, 60.0)
+    for _ in range(200):
+        collector.step(pull, arm26.muscle_lengths(theta, pull), 0.0, theta)
+    assert len(collector._waiting) <= 20
+    assert len(collector._rest._window) <= 50
+    assert len(collector._rest._rest) <= 50
