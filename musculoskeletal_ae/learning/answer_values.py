@@ -18,4 +18,7 @@ def answer_values(answer: Answer, robot: Robot) -> dict[str, str]:
     if len(answer.noise):
         worst = int(answer.noise.argmax())
         values['length noise'] = f'{1e3 * answer.noise[worst]:.2f} mm ({robot.muscles[worst]})'
+    if answer.doubtful:
+        names = ', '.join(robot.muscles[m] for m in answer.doubtful)
+        values['newest samples contradict several muscles'] = f'{names}; look at the joint sensors'
     return values

@@ -245,8 +245,7 @@ class Session:
         self._training.submit(
             Job(
                 collector.store.observations(),
-                collector.reservoir.messages(),
-                collector.reservoir.time,
+                collector.healthy(),
                 self._statistics_hold,
                 self._steps,
                 self._version,

@@ -54,6 +54,7 @@ class Answer(NamedTuple):
     error: float
     noise: Array
     changed: tuple[tuple[int, int], ...]
+    doubtful: tuple[int, ...]
     calibrated: bool
     unsaved: str
     seconds: float
