@@ -16,6 +16,7 @@ from musculoskeletal_ae.learning.journal import Journal
 from musculoskeletal_ae.learning.session import Session
 from musculoskeletal_ae.learning.store import SampleStore
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 
 STEPS = ('mkdir', 'link', 'replace', 'rename', 'unlink', 'rmdir', 'fsync')
 
@@ -70,14 +71,15 @@ class Idle:
 
     trouble, busy, restarts, pid = '', False, 0, None
 
-    def __init__(self, _) -> None:
-        self.running = False
+    def __init__(self, begin_with) -> None:
+        self.running, self.begin_with = False, begin_with
 
     def start(self) -> None:
-        self.running = True
+        self.begin_with()
+        self.running, self.busy = True, False
 
     def stop(self) -> None:
-        self.running = False
+        self.running = self.busy = False
 
     def poll(self) -> None:
         return None
@@ -98,13 +100,13 @@ def begun(arm26, initial, tmp_path, monkeypatch):
         for one in open_ones:
             one.close()
         collector = Collector(arm26)
-        new = Session(arm26, collector, 'default', 0, 1, tmp_path / 'state', lambda _: None)
+        new = Session(arm26, collector, 'default', 0, 1, tmp_path / 'state', begin.published.append)
         if new.data is None:
             new.begin(file)
         open_ones.append(new)
         return new, collector.store
 
-    begin.file = file
+    begin.file, begin.published = file, []
     yield begin
     for one in open_ones:
         one.close()
@@ -226,3 +228,36 @@ def test_a_kill_while_a_state_is_replaced_leaves_all_of_one(tmp_path, arm26, ini
     assert set(outcomes) == {(3, 5), (0, 9)}
     assert outcomes == sorted(outcomes, reverse=True)
     assert outcomes[-1] == (0, 9)
+
+
+def test_a_muscle_relearned_while_it_trains_leaves_no_calibrated_detector_anywhere(
+    begun, arm26, initial, stage, tmp_path
+):
+    learning, store = begun()
+    accept(learning, store, stage, 3)
+    calibrated = AnomalyStatistics(np.zeros(12), np.eye(12), True, 100)
+    # The training process has saved what it learned, and is killed with its answer.
+    file = tmp_path / 'state' / 'checkpoint.safetensors'
+    before = checkpoint.from_bytes(learning.data, arm26).version
+    checkpoint.save(replace(initial, version=before + 1, anomaly=calibrated), file)
+    learning._version, learning._training.busy = before + 1, True
+    learning.relearn(2)
+    assert learning._training.running
+    assert not learning._training.busy
+    on_disk = checkpoint.load(file, arm26)
+    assert on_disk.version == before + 2
+    assert on_disk.anomaly is None or not on_disk.anomaly.calibrated
+    found, samples = begun()
+    assert checkpoint.from_bytes(found.data, arm26).version == on_disk.version
+    assert not any(known[2] for known in samples.known)
+
+
+def test_a_muscle_that_a_full_disk_does_not_let_be_relearned_stays_known(begun, stage, disk):
+    learning, store = begun()
+    accept(learning, store, stage, 3)
+    learning._training.busy = True
+    disk.fail(1)
+    with pytest.raises(OSError, match='No space left'):
+        learning.relearn(2)
+    assert all(known[2] for known in store.known)
+    assert learning._training.running
