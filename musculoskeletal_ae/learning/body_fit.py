@@ -115,10 +115,6 @@ class Fit:
     weight: Array
 
 
-#: of a body that a network has learned before, as a share of the prior spread around it
-INHERITED_SHARE = 0.5
-
-
 def fit_body(
     body: CorrectedBody,
     seen: Observations,
@@ -142,7 +138,7 @@ def fit_body(
     for m, layout in enumerate(body.layouts):
         known, mean, spread = seen.known[:, m], prior.mean(layout), prior.spread(layout)
         if inherited is not None:
-            mean, spread = inherited[m], INHERITED_SHARE * spread
+            mean = inherited[m]
         if (~known).sum() >= LEAST_ANCHOR:
             _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, rounds, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)

@@ -60,6 +60,7 @@ class BodyUpdater:
         self._robot, self._origin, self._mae = robot, mae, mae
         self._prior = prior or Prior()
         self.body = CorrectedBody(robot, seed=seed)
+        self._seed, self._confirmed = seed, False
         self._inherited: list[Array] | None = None
         if learned_steps(mae):
             inherit(self.body, mae, self._prior, seed)
@@ -72,6 +73,7 @@ class BodyUpdater:
         """Learn a little; bounded time for a bounded store."""
         seen, robot = job.seen, self._robot
         error = newest_error(self._mae, seen)
+        self._doubt_inheritance(seen)
         fit = fit_body(self.body, seen, self._prior, self._inherited)
         contradicted = _contradicted(seen, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
@@ -93,6 +95,18 @@ class BodyUpdater:
         self._mae = with_statistics(mae, self._mae, job)
         doubtful = () if alone else tuple(m for m, _ in contradicted)
         return Update(self._mae, loss, error, fit.noise, contradicted if alone else (), doubtful)
+
+    def _doubt_inheritance(self, seen: Observations) -> None:
+        """Once there are a few samples: a body learned on another arm is worse than none."""
+        if self._inherited is None or self._confirmed or len(seen) < IN_A_ROW:
+            return
+        self._confirmed = True
+        body = CorrectedBody(self._robot, self._inherited, self._seed)
+        (length,) = body.lengths(seen.theta, seen.tension, seen.sliding)
+        if np.median(np.abs(seen.length - length)[seen.known]) > LEAST_CHANGE:
+            self._inherited = None
+            self.body = CorrectedBody(self._robot, seed=self._seed)
+            self._trainer.hurry()
 
     def _with_real(self, data: Dream, seen: Observations, fit: Fit) -> Dream:
         """Put real samples, freed of friction as the body knows it, in the place of some dreams."""

@@ -12,8 +12,10 @@ from musculoskeletal_ae.learning.worker_process import Answer, Start, WorkerProc
 
 #: until a training process that died is started again [s], doubled each time up to the longest
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
-#: until a process that neither comes up nor answers is taken to hang [s], and what each step of
-#: training adds; a hundred steps take a second
+#: until a process that does not come up is taken to hang [s]: the first import on a slow disk takes
+#: minutes
+PATIENCE_AT_START = 300.0
+#: the same of one that does not answer, and what each step of training adds; it takes a hundredth
 PATIENCE, PATIENCE_PER_STEP = 60.0, 0.1
 
 
@@ -42,7 +44,7 @@ class Supervisor:
     def start(self) -> None:
         """Start a process, in the place of the one before; later, if that cannot be done now."""
         self.stop()
-        self._deadline = time.monotonic() + PATIENCE
+        self._deadline = time.monotonic() + PATIENCE_AT_START
         try:
             self._worker = WorkerProcess(self._begin_with())
         except OSError as error:

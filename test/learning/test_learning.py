@@ -8,6 +8,8 @@ import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import paper_updater
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_fit import Prior
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.healthy import (
     GLITCHES,
@@ -220,6 +222,27 @@ def test_a_learner_that_starts_again_goes_on_as_calmly_as_it_was(learned, arm26)
         update = again.update(job(store))
     assert error(update.mae, *states) < 1.1 * error(mae, *states)
     assert learned_steps(update.mae) == learned_steps(mae) + 2 * 60
+
+
+def test_a_network_of_another_arm_is_learned_anew_as_fast_as_one_of_geometry(
+    learned, arm26, initial
+):
+    from .conftest import Stage
+
+    other = CorrectedBody(arm26, seed=8)
+    rng = np.random.default_rng(5)
+    for m, layout in enumerate(other.layouts):
+        other.parameters[m] = Prior().spread(layout) * rng.standard_normal(layout.size)
+    stage = Stage(other)
+    states = stage.states(1000)
+    store = stage.store(20)
+    ends = []
+    for start in (learned[0], initial):
+        updater = BodyUpdater(arm26, start)
+        for _ in range(6):
+            update = updater.update(job(store))
+        ends.append(error(update.mae, *states))
+    assert ends[0] < 1.3 * ends[1]
 
 
 def test_a_network_of_geometry_brings_no_body(arm26, initial):
