@@ -115,7 +115,13 @@ class Fit:
     weight: Array
 
 
-def fit_body(body: CorrectedBody, seen: Observations, prior: Prior, rounds: int = ROUNDS) -> Fit:
+def fit_body(
+    body: CorrectedBody,
+    seen: Observations,
+    prior: Prior,
+    inherited: list[Array] | None = None,
+    rounds: int = ROUNDS,
+) -> Fit:
     """Fit the parameters of a body in place.
 
     Args:
@@ -123,12 +129,16 @@ def fit_body(body: CorrectedBody, seen: Observations, prior: Prior, rounds: int 
         seen: The samples.
         prior: What is known without any. A muscle with samples that say nothing about it any more
             was changed: what they said is where its new parameters are looked for.
+        inherited: Parameters learned before, without the samples that they came from; they take
+            the place of the geometric model.
         rounds: Gauss–Newton steps.
     """
     poses = body.poses(seen.theta)
     parts = []
     for m, layout in enumerate(body.layouts):
         known, mean, spread = seen.known[:, m], prior.mean(layout), prior.spread(layout)
+        if inherited is not None:
+            mean = inherited[m]
         if (~known).sum() >= LEAST_ANCHOR:
             _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, rounds, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, Observations, Prior, fit_body
 from musculoskeletal_ae.learning.dream import Dream, dream
+from musculoskeletal_ae.learning.inherit import inherit
 from musculoskeletal_ae.learning.trainer import BATCH, Trainer
 from musculoskeletal_ae.learning.update import (
     Job,
     Update,
     history,
+    learned_steps,
     newest_error,
     with_statistics,
 )
@@ -54,11 +56,16 @@ class BodyUpdater:
     least_samples = 2
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0, prior: Prior | None = None) -> None:
-        """Go on from a network; the body is found out from the samples of the first job."""
+        """Go on from a network, and from the body that it knows if it has learned one."""
         self._robot, self._origin, self._mae = robot, mae, mae
         self._prior = prior or Prior()
         self.body = CorrectedBody(robot, seed=seed)
-        self._trainer = Trainer(from_mae(mae), seed)
+        self._seed, self._confirmed = seed, False
+        self._inherited: list[Array] | None = None
+        if learned_steps(mae):
+            inherit(self.body, mae, self._prior, seed)
+            self._inherited = list(self.body.parameters)
+        self._trainer = Trainer(from_mae(mae), seed, learned_steps(mae))
         self._rng = np.random.default_rng([seed, 0xD2])
         self._statistics_held = True
 
@@ -66,8 +73,12 @@ class BodyUpdater:
         """Learn a little; bounded time for a bounded store."""
         seen, robot = job.seen, self._robot
         error = newest_error(self._mae, seen)
-        fit = fit_body(self.body, seen, self._prior)
-        changed = _changed(seen, fit)
+        self._doubt_inheritance(seen)
+        fit = fit_body(self.body, seen, self._prior, self._inherited)
+        contradicted = _contradicted(seen, fit)
+        # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
+        # the robust weights leave such samples out until they are the rule.
+        alone = len(contradicted) == 1
         if self._statistics_held and not job.statistics_hold:
             self._trainer.hurry()
         self._statistics_held = job.statistics_hold
@@ -78,11 +89,24 @@ class BodyUpdater:
             robot.joints,
             robot.muscles,
             self._origin.preset,
-            history(self._origin, len(seen), 'default'),
+            history(self._origin, len(seen), 'default', self._trainer.steps),
             job.version,
         )
         self._mae = with_statistics(mae, self._mae, job)
-        return Update(self._mae, loss, error, fit.noise, changed)
+        doubtful = () if alone else tuple(m for m, _ in contradicted)
+        return Update(self._mae, loss, error, fit.noise, contradicted if alone else (), doubtful)
+
+    def _doubt_inheritance(self, seen: Observations) -> None:
+        """Once there are a few samples: a body learned on another arm is worse than none."""
+        if self._inherited is None or self._confirmed or len(seen) < IN_A_ROW:
+            return
+        self._confirmed = True
+        body = CorrectedBody(self._robot, self._inherited, self._seed)
+        (length,) = body.lengths(seen.theta, seen.tension, seen.sliding)
+        if np.median(np.abs(seen.length - length)[seen.known]) > LEAST_CHANGE:
+            self._inherited = None
+            self.body = CorrectedBody(self._robot, seed=self._seed)
+            self._trainer.hurry()
 
     def _with_real(self, data: Dream, seen: Observations, fit: Fit) -> Dream:
         """Put real samples, freed of friction as the body knows it, in the place of some dreams."""
@@ -101,7 +125,7 @@ class BodyUpdater:
         return data
 
 
-def _changed(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
+def _contradicted(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
     """Return muscles whose newest samples contradict the body in one direction, and how many."""
     found = []
     for m, noise in enumerate(fit.noise):

@@ -5,15 +5,18 @@
 
 Messages, moving and resting, are kept in a reservoir, a uniform draw from all that ever came; each
 new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
-friction gives d heavy tails, and on a part of the messages that Σ did not see.
+friction gives d heavy tails, and on a part of the messages that Σ did not see. Glitches of
+a sensor are no part of that: a few messages at most, far beyond all the rest, are left out.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.anomaly_statistics import FLOOR, AnomalyStatistics
 from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.tasks.anomaly import DISTANCE
@@ -22,7 +25,8 @@ Array = NDArray[np.float64]
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept
-#: healthy time [s] and samples learned before a detector is worth trusting
+#: healthy time [s], samples learned, and different rests within that time before a detector is
+#: worth trusting
 LEAST_TIME, LEAST_SAMPLES = 60.0, 20
 #: Threshold over the largest d seen, for a body well known. A load of 3.6 kg that was never carried
 #: before doubles it; a wire that is cut multiplies it by six to ten within 0.3 s.
@@ -32,6 +36,22 @@ YOUNG = 20.0
 #: Σ is mixed with its own diagonal, so that no combination of muscles looks impossible that was
 #: only not seen
 DIAGONAL_SHARE = 0.1
+#: this share of the messages is left out at most, and what is so many times beyond all others
+GLITCHES, GLITCH = 0.002, 3.0
+
+
+class Healthy(NamedTuple):
+    """What was seen of the healthy arm since it was last changed.
+
+    Attributes:
+        messages: (T, l), shape (N, 2M).
+        time: Time that they were drawn from [s].
+        rests: How many different rests there were within.
+    """
+
+    messages: NDArray[np.float32]
+    time: float
+    rests: int
 
 
 class Reservoir:
@@ -71,29 +91,27 @@ class Reservoir:
         return self._kept[: min(self._seen, len(self._kept))].copy()
 
 
-def calibrate(
-    mae: Mae, messages: NDArray[np.float32], time: float, samples: int
-) -> AnomalyStatistics | None:
+def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
     """Return statistics of a network's residuals, or None where there is too little.
 
     Args:
         mae: The network.
-        messages: (T, l) of healthy messages, shape (N, 2M).
-        time: Healthy time they were drawn from [s].
+        healthy: What the healthy arm showed.
         samples: How many samples the network has learned.
     """
-    if len(messages) < 2:
+    if len(healthy.messages) < 2:
         return None
-    tension, length = np.split(messages.astype(float), 2, axis=1)
-    error = residuals(mae, tension, length)
-    calibrated = time >= LEAST_TIME and samples >= LEAST_SAMPLES
+    tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
+    error = _without_glitches(residuals(mae, tension, length))
+    known = min(samples, healthy.rests)
+    calibrated = healthy.time >= LEAST_TIME and known >= LEAST_SAMPLES
     part = AnomalyStatistics.of(error[::2], calibrated)
     held_out = distances(_regularised(part), error[1::2])
     statistics = _regularised(AnomalyStatistics.of(error, calibrated))
     largest = max(float(held_out.max()), float(distances(statistics, error).max()))
     norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error, 2, axis=1))
     thresholds = {
-        DISTANCE: MARGIN * (1.0 + YOUNG / max(samples, 1)) * largest,
+        DISTANCE: MARGIN * (1.0 + YOUNG / max(known, 1)) * largest,
         'norm': float(np.max(norm)),
     }
     return AnomalyStatistics(
@@ -101,19 +119,28 @@ def calibrate(
     )
 
 
+def _without_glitches(error: Array) -> Array:
+    few = int(GLITCHES * len(error))
+    if few == 0:
+        return error
+    # Statistics that glitches cannot spoil: of the others, first by each residual's own spread.
+    middle = np.median(error, axis=0)
+    spread = np.median(np.abs(error - middle), axis=0) + FLOOR
+    order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
+    distance = distances(_regularised(AnomalyStatistics.of(error[order[:-few]], False)), error)
+    rest = np.sort(distance)[-few - 1]
+    return error[distance <= GLITCH * rest]
+
+
 def recalibrate(
-    mae: Mae,
-    before: AnomalyStatistics | None,
-    messages: NDArray[np.float32],
-    time: float,
-    samples: int,
+    mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int
 ) -> AnomalyStatistics | None:
     """Return statistics of a network's residuals that are at least as trusted as those before.
 
     After a restart the messages are few, and the calibrated statistics of the network that was
     saved serve its successors until there are enough. Arguments as `calibrate`.
     """
-    found = calibrate(mae, messages, time, samples)
+    found = calibrate(mae, healthy, samples)
     keep = before is not None and before.calibrated
     if found is None or (keep and not found.calibrated):
         return before

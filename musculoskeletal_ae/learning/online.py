@@ -86,8 +86,7 @@ class OnlineLearner:
             return None
         job = Job(
             collector.store.observations(),
-            collector.reservoir.messages(),
-            collector.reservoir.time,
+            collector.healthy(),
             self._statistics_hold,
             self._steps,
             self.mae.version + 1,

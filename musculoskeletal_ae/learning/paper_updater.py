@@ -48,6 +48,7 @@ class PaperUpdater:
         self._settings = TRAINING_PRESETS['paper']
         self._optimiser = Adam(self._network, self._settings.step_size)
         self._rng = np.random.default_rng([seed, 0x9A])
+        self._steps = 0
 
     def update(self, job: Job) -> Update:
         """Learn one newest sample among stored ones; `job.steps` is the paper's own here."""
@@ -55,9 +56,12 @@ class PaperUpdater:
         error = newest_error(self._mae, seen)
         values = np.concatenate([seen.theta, seen.tension, seen.length], axis=1)
         values = values * scale_vector(robot.joint_count, robot.muscle_count)
+        # The print knows no changed muscle: a sample that says nothing about one is none.
+        values = values[seen.known.all(axis=1)]
+        enough = len(values) >= self.least_samples
         mask = torch.arange(3).repeat_interleave(DATA + 2)
         batches = []
-        for _ in range(BATCHES):
+        for _ in range(BATCHES if enough else 0):
             stored = self._rng.choice(len(values) - 1, DATA, replace=False)
             rows = np.vstack([values[-1], np.zeros(values.shape[1]), values[stored]])
             batches.append(torch.as_tensor(np.tile(rows, (3, 1)), dtype=torch.float32))
@@ -68,13 +72,16 @@ class PaperUpdater:
                 value.backward()
                 self._optimiser.step(1.0)
                 losses.append(value.item())
+        self._steps += len(losses)
         mae = to_mae(
             self._network,
             robot.joints,
             robot.muscles,
             self._origin.preset,
-            history(self._origin, len(seen), 'paper'),
+            history(self._origin, len(seen), 'paper', self._steps),
             job.version,
         )
         self._mae = with_statistics(mae, self._mae, job)
-        return Update(self._mae, float(np.mean(losses[-BATCHES:])), error, np.empty(0))
+        return Update(
+            self._mae, float(np.mean(losses[-BATCHES:])) if enough else np.nan, error, np.empty(0)
+        )

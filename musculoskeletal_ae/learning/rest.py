@@ -19,6 +19,7 @@ from musculoskeletal_ae.learning.sample import Sample
 Array = NDArray[np.float64]
 
 LONGEST = 1.0  # [s] of rest that one sample averages
+MOST = 5000  # readings of one rest: an end where the clock stands still
 SURE = 3.0  # standard errors that a difference of means may have by chance
 
 
@@ -45,7 +46,7 @@ class RestDetector:
     def __init__(self, settings: RestSettings) -> None:
         """Start with an empty window."""
         self.settings = settings
-        self._window: deque[tuple[float, Array | None, Sample]] = deque()
+        self._window: deque[tuple[float, Array | None, Sample]] = deque(maxlen=MOST)
         self._rest: list[Sample] = []
         self._span = 0.0
         self._time = 0.0
@@ -83,7 +84,7 @@ class RestDetector:
                 self._span += dt
                 if measured:
                     self._rest.append(reading)
-            if self._span < LONGEST:
+            if self._span < LONGEST and len(self._rest) < MOST:
                 return None
         elif not was_still:
             return None

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, StateError
+from musculoskeletal_ae.learning.answer_values import answer_values
 from musculoskeletal_ae.learning.collector import Collector
+from musculoskeletal_ae.learning.handout import LEAST_INTERVAL, Handout
 from musculoskeletal_ae.learning.journal import Journal
 from musculoskeletal_ae.learning.online import PRESETS
 from musculoskeletal_ae.learning.sample import Sample
@@ -24,8 +27,6 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: between two updates [s], so that checkpoints leave at 1 Hz at most
-LEAST_INTERVAL = 1.0
 #: updates that a new sample is worth: its own, and one more of training
 AFTER_NEWEST = 2
 
@@ -64,31 +65,20 @@ class Session:
         """
         if preset not in PRESETS:
             raise MusculoskeletalError(f'preset {preset!r} is unknown; legal: {", ".join(PRESETS)}')
-        self._robot, self._collector, self._publish = robot, collector, publish
+        self._robot, self._collector = robot, collector
+        self._handout = Handout(publish)
         self._preset, self._seed, self._steps = preset, seed, steps
         self.data: bytes | None = None
         self.saved: Mae | None = None
-        self._unsaved = ''
         self._version = 0
-        self._checkpoints = 0
         self._answer: Answer | None = None
         self._training = Supervisor(self._begin_with)
-        self._stale = False
         self._due = AFTER_NEWEST
         self._last_start = -LEAST_INTERVAL
-        self._set_aside = ''
         self._statistics_hold = True
         self._journal = None if directory is None else Journal(directory, robot)
         if self._journal is not None:
-            self._load(self._journal)
-
-    def _load(self, journal: Journal) -> None:
-        try:
-            self.saved = journal.load(self._collector.store)
-        except StateError as error:
-            self._set_aside = f'{error}'
-            self.set_aside()
-            return
+            self.saved = self._journal.load(collector.store)
         if self.saved is not None:
             self._use(self.saved)
 
@@ -97,19 +87,21 @@ class Session:
     def _use(self, mae: Mae) -> None:
         """Go on from a network, and hand it out at once."""
         self.data, self._version = checkpoint.to_bytes(mae), mae.version
+        # Where they do not, the checkpoint says that the detector is not calibrated.
+        self._statistics_hold = True
         self._training.start()
-        self._hand_out(self.data)
+        self._handout.give(self.data)
 
     def _begin_with(self) -> Start:
         # A new process knows the network but not the body, and nothing of a job that was lost.
         assert self.data is not None
-        self._stale, self._due = False, AFTER_NEWEST
+        self._due = AFTER_NEWEST
         return Start(
             self._robot.description.directory,
             self.data,
             self._preset,
             self._seed,
-            None if self._journal is None else self._journal.checkpoint_file,
+            None if self._journal is None else self._journal.network.path,
         )
 
     def replace(self, path: str | Path) -> None:
@@ -117,70 +109,95 @@ class Session:
 
         Raises:
             MusculoskeletalError: If the file does not fit; nothing is changed then.
-            OSError: If the disk is full or gone.
+            OSError: If the disk is full or gone; nothing is changed then.
         """
-        mae = checkpoint.load(path, self._robot)
-        self.set_aside()
-        self._take(mae)
-
-    def begin(self, path: str | Path) -> None:
-        """Start from a checkpoint file where no network was saved; see `replace` for errors."""
-        self._take(checkpoint.load(path, self._robot))
-
-    def _take(self, mae: Mae) -> None:
-        mae = replace(mae, version=max(mae.version, self._version) + 1)
-        if self._journal is not None:
-            checkpoint.save(mae, self._journal.checkpoint_file)
-        self._statistics_hold = True
+        mae = self._numbered(checkpoint.load(path, self._robot))
+        self._drop_state(mae)
         self._use(mae)
 
+    def begin(self, path: str | Path) -> None:
+        """Start from a checkpoint file where no network was saved.
+
+        Raises:
+            MusculoskeletalError: If the file does not fit.
+        """
+        mae = self._numbered(checkpoint.load(path, self._robot))
+        if self._journal is not None:
+            self._journal.network.keep(mae)
+        self._use(mae)
+
+    def _numbered(self, mae: Mae) -> Mae:
+        return replace(mae, version=max(mae.version, self._version) + 1)
+
     def set_aside(self) -> None:
-        """Forget samples and network; on disk they become a backup."""
+        """Forget samples and network; on disk they become a backup.
+
+        Raises:
+            OSError: If the disk is full or gone; nothing is changed then.
+        """
+        self._drop_state(None)
+
+    def _drop_state(self, successor: Mae | None) -> None:
+        # Ended first: what it is learning would be saved over the successor.
         self._training.stop()
+        if self._journal is not None:
+            try:
+                self._journal.replace(successor)
+            except OSError:
+                self._training_again()
+                raise
         self._collector.clear()
         self.data, self.saved = None, None
-        if self._journal is not None:
-            backup = self._journal.set_aside()
-            if backup is not None:
-                self._set_aside = f'{self._set_aside} (kept in {backup})'.strip()
-            self._journal.rewrite(self._collector.store)
+        self._handout.drop()
+
+    def _training_again(self) -> None:
+        if self.data is not None:
+            self._training.start()
 
     def accept(self, sample: Sample) -> None:
         """Keep a sample that the collector has just accepted, and learn it soon."""
         self._due = AFTER_NEWEST
         if self._journal is not None:
-            try:
-                self._journal.append(sample, self._collector.store)
-            except (StateError, OSError) as error:
-                self._unsaved = f'samples cannot be saved: {error}'
-            else:
-                self._unsaved = ''
+            self._journal.log.append(sample, self._collector.store)
 
     def relearn(self, muscle: int, newest: int = 0) -> None:
         """Learn a muscle's constants anew from its newest samples and what comes.
 
         The detector is uncalibrated until enough of the changed arm has been seen.
+
+        Raises:
+            OSError: If the disk is full or gone; nothing is changed then.
         """
+        busy = self._training.busy
+        if busy:
+            # A job begun before would bring the detector of the arm as it was back.
+            self._training.stop()
+        try:
+            self._doubt_detector(busy)
+        finally:
+            if busy:
+                self._training_again()
         self._collector.relearn(muscle, newest)
         if self._journal is not None:
-            self._journal.forget(muscle, newest)
+            self._journal.log.forget(muscle, newest, self._collector.store)
         self._due = AFTER_NEWEST
         self._statistics_hold = False
+
+    def _doubt_detector(self, outdated: bool) -> None:
+        """Take back that the detector is calibrated; on disk it may be `outdated` either way."""
         if self.data is None:
             return
         mae = checkpoint.from_bytes(self.data, self._robot)
-        if mae.anomaly is not None and mae.anomaly.calibrated:
-            self._version += 1
-            anomaly = replace(mae.anomaly, calibrated=False)
-            mae = replace(mae, anomaly=anomaly, version=self._version)
-            self.data = checkpoint.to_bytes(mae)
-            self._stale = self._training.busy
-            self._keep_and_hand_out(mae)
-
-    def _keep_and_hand_out(self, mae: Mae) -> None:
+        calibrated = mae.anomaly is not None and mae.anomaly.calibrated
+        if not calibrated and not outdated:
+            return
+        if mae.anomaly is not None:
+            mae = replace(mae, anomaly=replace(mae.anomaly, calibrated=False))
+        mae = replace(mae, version=self._version + 1)
         if self._journal is not None:
-            checkpoint.save(mae, self._journal.checkpoint_file)
-        self._hand_out(checkpoint.to_bytes(mae))
+            self._journal.network.save(mae)
+        self._version, self.data = mae.version, checkpoint.to_bytes(mae)
+        self._handout.give(self.data)
 
     def save(self) -> Path:
         """Write everything; returns where.
@@ -191,11 +208,19 @@ class Session:
         """
         if self._journal is None:
             raise StateError("state_directory is '': nothing is kept; start with a directory")
-        self._journal.rewrite(self._collector.store)
-        if self.data is not None:
-            mae = checkpoint.from_bytes(self.data, self._robot)
-            checkpoint.save(mae, self._journal.checkpoint_file)
+        self._journal.log.rewrite(self._collector.store)
+        if self._journal.network.trouble and self.data is not None:
+            self._journal.network.save(checkpoint.from_bytes(self.data, self._robot))
         return self._journal.directory
+
+    def _heal(self) -> None:
+        """Write what could not be written before, if that is possible now."""
+        if self._journal is None:
+            return
+        self._journal.log.heal(self._collector.store)
+        # While it trains, the training process may be about to save a newer one.
+        if self.data is not None and not self._training.busy:
+            self._journal.network.heal(self.data)
 
     # -- training -------------------------------------------------------------------------------
 
@@ -204,6 +229,8 @@ class Session:
         answer = self._training.poll()
         if answer is not None:
             self._finish(answer)
+        self._heal()
+        self._handout.poll()
         now = time.monotonic()
         due = learning and self._due > 0 and now - self._last_start >= LEAST_INTERVAL
         if due and self._training.can_take(len(self._collector.store)):
@@ -218,8 +245,7 @@ class Session:
         self._training.submit(
             Job(
                 collector.store.observations(),
-                collector.reservoir.messages(),
-                collector.reservoir.time,
+                collector.healthy(),
                 self._statistics_hold,
                 self._steps,
                 self._version,
@@ -227,27 +253,16 @@ class Session:
         )
 
     def _finish(self, answer: Answer) -> None:
-        self._answer, self._unsaved = answer, ''
-        if self._stale:
-            # Begun before a muscle was changed: it would bring the old detector back.
-            self._stale = False
-            if self.data is not None:
-                self._keep_and_hand_out(checkpoint.from_bytes(self.data, self._robot))
-            return
-        if answer.unsaved:
-            self._unsaved = f'the network cannot be saved: {answer.unsaved}'
+        self._answer = answer
+        if self._journal is not None:
+            self._journal.network.outcome(answer.unsaved)
         self._statistics_hold |= answer.calibrated
         self.data = answer.checkpoint
-        self._hand_out(answer.checkpoint)
-        try:
-            for muscle, newest in answer.changed:
+        self._handout.give(answer.checkpoint)
+        for muscle, newest in answer.changed:
+            # With a full disk the next update finds the same change again.
+            with suppress(OSError):
                 self.relearn(muscle, newest)
-        except (MusculoskeletalError, OSError) as error:
-            self._unsaved = f'the state cannot be saved: {error}'
-
-    def _hand_out(self, data: bytes) -> None:
-        self._checkpoints += 1
-        self._publish(data)
 
     def close(self) -> None:
         """End the training process and give the directory free."""
@@ -258,14 +273,15 @@ class Session:
     @property
     def trouble(self) -> str:
         """What is wrong, or ''."""
-        return self._training.trouble or self._unsaved
+        disk = '' if self._journal is None else self._journal.trouble
+        return '; '.join(filter(None, (self._training.trouble, disk)))
 
     def values(self) -> dict[str, str]:
         """Return what people want to know, for /diagnostics."""
         values = {
             'samples': str(len(self._collector.store)),
             'accepted': str(self._collector.store.accepted),
-            'checkpoints': str(self._checkpoints),
+            'checkpoints': str(self._handout.count),
             'checkpoint version': str(self._version),
             'preset': self._preset,
             'healthy time': f'{self._collector.reservoir.time:.0f} s',
@@ -273,21 +289,10 @@ class Session:
         }
         if self._journal is not None:
             values['state directory'] = str(self._journal.directory)
+            if self._journal.not_used:
+                values['saved state not used'] = self._journal.not_used
         if self._training.pid is not None:
             values['training process'] = str(self._training.pid)
-        if self._set_aside:
-            values['saved state not used'] = self._set_aside
         if self._answer is not None:
-            answer = self._answer
-            values |= {
-                'error at newest samples': f'{answer.error:.4f} rad',
-                'loss': f'{answer.loss:.4f}',
-                'update': f'{answer.seconds:.2f} s',
-                'anomaly calibrated': str(answer.calibrated),
-            }
-            if len(answer.noise):
-                worst = int(answer.noise.argmax())
-                values['length noise'] = (
-                    f'{1e3 * answer.noise[worst]:.2f} mm ({self._robot.muscles[worst]})'
-                )
+            values |= answer_values(self._answer, self._robot)
         return values

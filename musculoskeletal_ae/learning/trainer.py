@@ -37,16 +37,16 @@ class Trainer:
 
     Attributes:
         network: The average: what is published.
-        steps: Steps taken so far.
+        steps: Steps taken so far, in former lives too.
     """
 
-    def __init__(self, network: Network, seed: int = 0, step_size: float = STEP_SIZE) -> None:
-        """Go on from a network's weights."""
+    def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
+        """Go on from a network's weights, as calmly as after so many `steps`."""
         self.network = network
         self._restless = copy.deepcopy(network)
-        self._optimiser = Muon(self._restless, MUON_MATRIX_RATIO * step_size, step_size)
+        self._optimiser = Muon(self._restless, MUON_MATRIX_RATIO * STEP_SIZE, STEP_SIZE)
         self._rng = np.random.default_rng([seed, 0x7A])
-        self.steps = 0
+        self.steps = steps
 
     def train(self, data: Dream, steps: int) -> float:
         """Take steps on batches of a dream; returns the mean loss of the last half of them."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.learning.body_fit import Observations
-from musculoskeletal_ae.learning.healthy import recalibrate
+from musculoskeletal_ae.learning.healthy import Healthy, recalibrate
 from musculoskeletal_ae.mae.mae import Mae
 
 Array = NDArray[np.float64]
@@ -24,8 +25,7 @@ class Job(NamedTuple):
 
     Attributes:
         seen: The samples, the oldest first.
-        messages: Healthy messages (T, l), shape (N, 2M).
-        healthy_time: Time that they were drawn from [s].
+        healthy: What was seen of the healthy arm.
         statistics_hold: Whether the statistics so far are of the arm as it is now; not after a
             muscle was changed.
         steps: Steps of training.
@@ -33,8 +33,7 @@ class Job(NamedTuple):
     """
 
     seen: Observations
-    messages: NDArray[np.float32]
-    healthy_time: float
+    healthy: Healthy
     statistics_hold: bool
     steps: int
     version: int
@@ -49,7 +48,8 @@ class Update(NamedTuple):
         error: Mean ‖θ_est − θ‖₂ over the newest samples, before they were learned [rad].
         noise: Standard deviation of each length that the body does not explain [m], (M,); empty
             where no body is fitted.
-        changed: Muscles whose newest samples contradict all older ones, with how many do.
+        changed: The muscle, if any, whose newest samples contradict all older ones, with how many.
+        doubtful: Muscles that newest samples contradict together: θ is wrong there, not they.
     """
 
     mae: Mae
@@ -57,6 +57,7 @@ class Update(NamedTuple):
     error: float
     noise: Array
     changed: tuple[tuple[int, int], ...] = ()
+    doubtful: tuple[int, ...] = ()
 
 
 class Updater(Protocol):
@@ -75,7 +76,7 @@ def with_statistics(mae: Mae, before: Mae, job: Job) -> Mae:
     if known is not None and not job.statistics_hold:
         known = replace(known, calibrated=False)
     samples = len(job.seen)
-    found = recalibrate(mae, known, job.messages, job.healthy_time, samples)
+    found = recalibrate(mae, known, job.healthy, samples)
     return replace(mae, anomaly=found)
 
 
@@ -89,6 +90,13 @@ def newest_error(mae: Mae, seen: Observations) -> float:
     return float(np.linalg.norm(estimate - seen.theta[newest], axis=1).mean())
 
 
-def history(mae: Mae, samples: int, preset: str) -> str:
-    """Return how a network was made and what it learned since."""
-    return f'{mae.training.split(LEARNED)[0]}{LEARNED}{samples} samples at rest, preset {preset}'
+def history(mae: Mae, samples: int, preset: str, steps: int) -> str:
+    """Return how a network was made and what it learned since; `learned_steps` reads it."""
+    origin = mae.training.split(LEARNED)[0]
+    return f'{origin}{LEARNED}{samples} samples at rest, preset {preset}, {steps} steps'
+
+
+def learned_steps(mae: Mae) -> int:
+    """Return how many steps of preset `default` a network has learned on a real arm, or 0."""
+    found = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
+    return int(found[1]) if found else 0

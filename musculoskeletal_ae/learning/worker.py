@@ -61,6 +61,7 @@ def serve(connection: Connection) -> None:
                 update.error,
                 update.noise,
                 update.changed,
+                update.doubtful,
                 anomaly is not None and anomaly.calibrated,
                 unsaved,
                 time.perf_counter() - begun,

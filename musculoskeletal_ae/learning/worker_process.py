@@ -54,6 +54,7 @@ class Answer(NamedTuple):
     error: float
     noise: Array
     changed: tuple[tuple[int, int], ...]
+    doubtful: tuple[int, ...]
     calibrated: bool
     unsaved: str
     seconds: float
@@ -113,13 +114,26 @@ class WorkerProcess:
         self.busy = False
         if isinstance(answer, Exception):
             self.dead = f'{type(answer).__name__} {answer}'.strip()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(ENDING)
-                self._errors.seek(0)
-                lines = self._errors.read().decode(errors='replace').strip().splitlines()
-                self.dead = f'status {self._process.returncode} {lines[-1] if lines else ""}'
+            if isinstance(answer, EOFError | OSError):
+                self.dead = self._last_words() or self.dead
+            else:
+                self.kill()  # it lives, but what it says cannot be taken
             return None
         return answer
+
+    def _last_words(self) -> str:
+        try:
+            self._process.wait(ENDING)
+        except subprocess.TimeoutExpired:
+            return ''
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors='replace').strip().splitlines()
+        return f'status {self._process.returncode} {lines[-1] if lines else ""}'
+
+    def kill(self) -> None:
+        """End the process by force."""
+        with suppress(OSError):
+            self._process.kill()
 
     def close(self) -> None:
         """End the process; within `ENDING` by itself, else by force."""
@@ -140,6 +154,7 @@ class WorkerProcess:
                 try:
                     connection.send(job)
                     self._answers.put(connection.recv())
-                except (EOFError, OSError) as error:
+                # Whatever it is, as a torn pickle or no memory: it would be waited for else.
+                except Exception as error:  # noqa: BLE001
                     self._answers.put(error)
                     return

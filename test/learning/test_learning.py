@@ -8,11 +8,20 @@ import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import paper_updater
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_fit import Prior
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.healthy import LEAST_TIME, Reservoir
+from musculoskeletal_ae.learning.healthy import (
+    GLITCHES,
+    LEAST_SAMPLES,
+    LEAST_TIME,
+    Healthy,
+    Reservoir,
+    calibrate,
+)
 from musculoskeletal_ae.learning.online import OnlineLearner, make_updater
 from musculoskeletal_ae.learning.paper_updater import PaperUpdater
-from musculoskeletal_ae.learning.update import Job
+from musculoskeletal_ae.learning.update import Job, learned_steps
 from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.tasks.anomaly import DISTANCE
 
@@ -21,9 +30,10 @@ def error(mae, theta, tension, length):
     return float(np.linalg.norm(mae.estimate(tension, length).theta - theta, axis=1).mean())
 
 
-def job(store, messages=None, time=0.0, steps=60, hold=True):
+def job(store, messages=None, time=0.0, steps=60, hold=True, rests=100):
     empty = np.empty((0, 12), dtype=np.float32)
-    return Job(store.observations(), empty if messages is None else messages, time, hold, steps, 1)
+    healthy = Healthy(empty if messages is None else messages, time, rests)
+    return Job(store.observations(), healthy, hold, steps, 1)
 
 
 @pytest.fixture(scope='module')
@@ -66,6 +76,17 @@ def test_a_changed_muscle_is_noticed_unasked(arm26, initial, stage):
     assert updater.update(job(store, steps=1)).changed == ((3, 5),)
 
 
+def test_a_slipped_joint_sensor_reopens_no_muscle(arm26, initial, stage):
+    updater, store = BodyUpdater(arm26, initial), stage.store(20)
+    updater.update(job(store, steps=1))
+    for _ in range(4):
+        sample = stage.sample()
+        store.add(sample._replace(theta=sample.theta + np.array([0.15, 0.0])))
+    update = updater.update(job(store, steps=1))
+    assert update.changed == ()
+    assert len(update.doubtful) > 1
+
+
 def messages(stage, count):
     _, tension, length = stage.states(count)
     return np.concatenate([tension, length], axis=1).astype(np.float32)
@@ -81,6 +102,34 @@ def test_the_detector_is_calibrated_only_with_enough_healthy_data(learned):
     assert kept.calibrated  # as after a restart, whose messages are few
     lost = updater.update(job(store, messages(stage, 10), 1.0, 1, hold=False)).mae.anomaly
     assert not lost.calibrated  # after a muscle was replaced
+
+
+def test_one_posture_is_not_enough_for_a_detector(learned):
+    _, updater, store, stage = learned
+    seen = messages(stage, 600)
+    few = updater.update(job(store, seen, LEAST_TIME, 1, hold=False, rests=LEAST_SAMPLES - 1)).mae
+    assert not few.anomaly.calibrated
+
+
+def test_the_statistics_of_many_rests_are_kept_until_there_are_as_many_again(learned):
+    _, updater, store, stage = learned
+    before = updater.update(job(store, messages(stage, 600), LEAST_TIME, 1)).mae.anomaly
+    assert before.calibrated
+    after = updater.update(job(store, messages(stage, 600), LEAST_TIME, 1, rests=1)).mae.anomaly
+    assert after is before
+
+
+def test_a_glitch_does_not_spoil_the_detector(learned):
+    mae, _, store, stage = learned
+    seen = messages(stage, 1000)
+    clean = calibrate(mae, Healthy(seen, LEAST_TIME, 50), len(store))
+    for row in range(int(GLITCHES * len(seen))):
+        seen[100 * row + 7, 6 + row] += 0.2
+    spoilt = calibrate(mae, Healthy(seen, LEAST_TIME, 50), len(store))
+    assert clean.samples == 1000
+    assert spoilt.samples == 1000 - int(GLITCHES * len(seen))
+    for name, threshold in clean.thresholds.items():
+        assert spoilt.thresholds[name] == pytest.approx(threshold, rel=0.02)
 
 
 def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(learned):
@@ -138,3 +187,65 @@ def test_one_stream_gives_one_network(arm26, initial, stage):
 def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26, initial):
     with pytest.raises(MusculoskeletalError, match='default, paper'):
         make_updater(arm26, initial, 'best')
+
+
+def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26, initial, stage):
+    updater = PaperUpdater(arm26, initial)
+    store = stage.store(30)
+    store.forget(1, 5)
+    update = updater.update(job(store))
+    np.testing.assert_array_equal(update.mae.encoder[0][0], initial.encoder[0][0])
+    for _ in range(updater.least_samples - 5):
+        store.add(stage.sample())
+    update = updater.update(job(store))
+    assert (update.mae.encoder[0][0] != initial.encoder[0][0]).any()
+
+
+def test_a_learned_network_without_its_samples_is_not_forgotten(learned, arm26):
+    mae, _, _, stage = learned
+    states = stage.states(1000)
+    before = error(mae, *states)
+    updater = BodyUpdater(arm26, mae)
+    store = stage.store(2)
+    for _ in range(3):
+        update = updater.update(job(store))
+        store.add(stage.sample())
+    assert error(update.mae, *states) < 1.2 * before
+
+
+def test_a_learner_that_starts_again_goes_on_as_calmly_as_it_was(learned, arm26):
+    mae, _, store, stage = learned
+    assert learned_steps(mae) > 0
+    states = stage.states(1000)
+    again = BodyUpdater(arm26, mae)
+    for _ in range(2):
+        update = again.update(job(store))
+    assert error(update.mae, *states) < 1.1 * error(mae, *states)
+    assert learned_steps(update.mae) == learned_steps(mae) + 2 * 60
+
+
+def test_a_network_of_another_arm_is_learned_anew_as_fast_as_one_of_geometry(
+    learned, arm26, initial
+):
+    from .conftest import Stage
+
+    other = CorrectedBody(arm26, seed=8)
+    rng = np.random.default_rng(5)
+    for m, layout in enumerate(other.layouts):
+        other.parameters[m] = Prior().spread(layout) * rng.standard_normal(layout.size)
+    stage = Stage(other)
+    states = stage.states(1000)
+    store = stage.store(20)
+    ends = []
+    for start in (learned[0], initial):
+        updater = BodyUpdater(arm26, start)
+        for _ in range(6):
+            update = updater.update(job(store))
+        ends.append(error(update.mae, *states))
+    assert ends[0] < 1.3 * ends[1]
+
+
+def test_a_network_of_geometry_brings_no_body(arm26, initial):
+    assert learned_steps(initial) == 0
+    body = BodyUpdater(arm26, initial).body
+    assert all((parameters == 0.0).all() for parameters in body.parameters)

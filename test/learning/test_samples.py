@@ -174,3 +174,45 @@ def test_a_clock_that_goes_back_starts_pairing_anew():
     after = pairing.muscles(0.01, np.ones(1), np.ones(1))
     assert after.dt == 0.0
     assert after.theta == [2.0]
+
+
+def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch):
+    monkeypatch.setattr('musculoskeletal_ae.learning.collector.MOST_WAITING', 20)
+    monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
+    collector = Collector(arm26)
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    rest_at(collector, arm26, theta, 0.5)
+    pull = np.full(6, 60.0)
+    for _ in range(200):
+        collector.step(pull, arm26.muscle_lengths(theta, pull), 0.0, theta)
+    assert len(collector._waiting) <= 20
+    assert len(collector._rest._window) <= 50
+    assert len(collector._rest._rest) <= 50
+
+
+def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    pull = np.full(6, 60.0)
+    length = arm26.muscle_lengths(theta, pull)
+    for n in range(800):
+        glitch = n in (300, 500)
+        collector.step(pull, length + (0.5 if glitch else 0.0), DT, theta)
+    assert collector.rejected['length beyond what the joints allow'] == 2
+    assert len(collector.store) == 1
+    np.testing.assert_allclose(collector.store.samples[0].length, length)
+    assert np.ptp(collector.healthy().messages, axis=0).max() < 1e-6
+
+
+def test_rests_count_as_often_as_they_differ_since_the_arm_was_changed(collector, arm26):
+    for place in (0.3, 0.5, 0.5, 0.7):
+        theta = arm26.lower + place * (arm26.upper - arm26.lower)
+        rest_at(collector, arm26, theta, 1.5)
+    rest_at(collector, arm26, theta, MARGIN)
+    stored = len(collector.store)
+    assert stored >= 3
+    assert collector.healthy().rests == stored
+    collector.relearn(0, 1)
+    assert collector.healthy().rests == 0
+    rest_at(collector, arm26, theta, 2.0 + MARGIN)
+    assert collector.healthy().rests == 1
+    assert len(collector.store) == stored

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the soak would not tolerate."""
+
+from __future__ import annotations
+
+import pytest
+
+from musculoskeletal_ae.experiments.learning_soak import judged
+
+FLAT = [0.5] * 40
+
+
+@pytest.mark.parametrize(
+    ('worst', 'filled', 'most', 'times', 'said'),
+    [
+        (1.1, 300.0, 330.0, FLAT, []),
+        (1.3, 300.0, 330.0, FLAT, ['the error']),
+        (1.1, 300.0, 400.0, FLAT, ['memory']),
+        (1.1, 300.0, 330.0, [*FLAT, *[0.9] * 40], ['an update']),
+        (1.1, 0.0, 0.0, [], []),
+    ],
+)
+def test_error_memory_and_time_are_judged(worst, filled, most, times, said):
+    found = judged(worst, filled, most, times)
+    assert len(found) == len(said)
+    assert all(text.startswith(start) for text, start in zip(found, said, strict=True))
