@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.online import PRESETS, STEPS
+from musculoskeletal_ae.learning.online import STEPS
 from musculoskeletal_ae.learning.rest import RestSettings
 from musculoskeletal_ae.learning.store import Novelty
-from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.parameters import declare_preset, number, text, whole
 from musculoskeletal_ae.nodes.shell import Shell
 
 SOURCES = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
@@ -44,15 +44,15 @@ def declare_settings(node: Shell) -> LearnerSettings:
     """Declare and read them.
 
     Raises:
-        MusculoskeletalError: If the source of θ is unknown.
+        MusculoskeletalError: If the preset or the source of θ is unknown.
     """
 
     def positive(name: str, default: float, meaning: str, most: float) -> float:
         value = node.declare_parameter(name, default, number(meaning, 0.0, most, True)).value
         return float(value)
 
-    preset = node.declare_parameter('preset', 'default', text(f'how to learn: {PRESETS}', True))
-    seed = node.declare_parameter('seed', 0, text('of everything random', True))
+    preset = declare_preset(node, 'how to learn')
+    seed = node.declare_parameter('seed', 0, whole('of everything random'))
     meaning = f'where θ comes from: {tuple(SOURCES)}'
     source = node.declare_parameter('joint_source', 'sensor', text(meaning, True)).value
     if source not in SOURCES:
@@ -64,7 +64,7 @@ def declare_settings(node: Shell) -> LearnerSettings:
     steps = node.declare_parameter('update_steps', STEPS, text(meaning, True))
     rest, novelty = RestSettings(), Novelty()
     return LearnerSettings(
-        preset.value,
+        preset,
         seed.value,
         steps.value,
         SOURCES[source],
