@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from controlled_arm import RATE_LIMIT, ControlledArm
 from geometry_msgs.msg import WrenchStamped
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
@@ -134,3 +136,18 @@ def test_heat_lowers_the_limit_and_is_said(arm):
     assert arm.graph.set_parameter('controller', 'temperature_limit', 40.0)[0]
     arm.says('tension limited by heat')
     assert 'stopped' not in arm.state().message
+
+
+def test_parameters_set_together_are_taken_all_or_none(arm):
+    changes = [Parameter('method', value='tension'), Parameter('checkpoint', value='/nowhere')]
+    request = SetParametersAtomically.Request(parameters=[p.to_parameter_msg() for p in changes])
+    result = arm.graph.call(
+        SetParametersAtomically, 'controller/set_parameters_atomically', request
+    ).result
+    assert not result.successful
+    assert 'nowhere' in result.reason
+    arm.target(HERE)
+    arm.goes_to(HERE)
+    assert len(arm.sent('tension')) == 0
+    said = {pair.key: pair.value for pair in arm.state().values}
+    assert said['method'] == 'proposed'
