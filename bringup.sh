@@ -85,7 +85,7 @@ elif [ -d "$robot" ]; then
   robot_directory=$robot
 else
   refuse "--robot '$robot' is neither a directory nor one of: $(
-    cd "$repository/config" && for each in */; do [ -d "$each" ] && printf '%s ' "${each%/}"; done
+    cd "$repository/config" && for each in */muscles.yaml; do printf '%s ' "${each%/*}"; done
   )"
 fi
 if [ -n "$checkpoint" ]; then
@@ -272,7 +272,8 @@ start sim sim "${common[@]}"
 if [ -n "$bag" ]; then
   start replay replay "$bag" --clock "${remap[@]}"
 else
-  start controller controller "${common[@]}" -p "explore:=$explore"
+  # A pause of a busy desktop is no fault of an emulated arm.
+  start controller controller "${common[@]}" -p "explore:=$explore" -p max_age:=1.0
 fi
 
 # The status line. It counts --duration from when estimates arrive, and ends after it.

@@ -76,6 +76,8 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
         _fit(bag, robot, namespace, check)
     else:
         fits = [name for name in shipped_robots() if not _faults(bag, name, namespace)]
+        for name in fits[:1]:
+            _rejections(bag, name, namespace, check)
         check.lines.append(f'fits: {", ".join(fits) or "none of the shipped robots (see --robot)"}')
     return check
 
@@ -115,9 +117,13 @@ def _fit(bag: Bag, robot: str, namespace: str | None, check: BagCheck) -> None:
     check.faults += faults
     if faults:
         return
+    _rejections(bag, robot, namespace, check)
+    check.lines.append(f'fits: {robot}')
+
+
+def _rejections(bag: Bag, robot: str, namespace: str | None, check: BagCheck) -> None:
     streams = read_streams(bag, Robot.load(robot), namespace=namespace)
     check.lines += [f'rejected {count}: {why}' for why, count in streams.rejected.items()]
-    check.lines.append(f'fits: {robot}')
 
 
 def _faults(bag: Bag, name: str, namespace: str | None) -> list[str]:

@@ -39,7 +39,7 @@ class BringupStatus(Shell):
         self.detected = False
         self.checkpoints = 0
         self.samples = ''
-        self.suspect = ''
+        self.suspect = self.stopped = ''
         self.started: float | None = None
         self.listen(JointState, 'joint_states', self._measured, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
@@ -71,6 +71,8 @@ class BringupStatus(Shell):
                 self.samples = values.get('samples', '')
             elif status.name.startswith(f'{here}/estimator:'):
                 self.suspect = values.get('suspect muscle', '')
+            elif status.name.startswith(f'{here}/controller:'):
+                self.stopped = status.message if status.message.startswith('stopped') else ''
 
     def _print(self) -> None:
         now = time.monotonic()
@@ -86,6 +88,8 @@ class BringupStatus(Shell):
         line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
         if self.detected:
             line += f'  ANOMALY: {self.suspect}'
+        elif self.stopped:
+            line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset ends it)'
         print(line, flush=True)
         if 0.0 < self.duration <= elapsed:
             raise ExternalShutdownException

@@ -35,6 +35,7 @@ from musculoskeletal_ae.tasks.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.tasks.settings import Settings, read_stiffness
 from musculoskeletal_ae.tasks.stiffness_control import StiffnessSolution
 
+RESUMED = 'going on to the last target, if any; controller/explore explores again'
 LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}
 
 
@@ -114,6 +115,10 @@ class Controller(Shell):
 
     def _target(self, message: JointState) -> None:
         self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
+        if self.core.safety.cause:
+            self.get_logger().warning(
+                f'stopped ({self.core.safety.cause}): the target waits for controller/reset'
+            )
         if self.core.clamped:
             clamped = ', '.join(self.core.clamped)
             self.get_logger().warning(f'target clamped to the joint limits: {clamped}')
@@ -121,7 +126,9 @@ class Controller(Shell):
     def _explore(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         reason = self.core.explore(request.data)
         response.success = not reason
-        response.message = reason or ('exploring' if request.data else 'holding')
+        stopped = self.core.safety.cause
+        holding = f'stopped: {stopped}' if stopped else 'holding'
+        response.message = reason or ('exploring' if request.data else holding)
         return response
 
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -132,7 +139,7 @@ class Controller(Shell):
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         reason = self.core.reset(time.monotonic())
         response.success = not reason
-        response.message = f'refused: {reason}' if reason else 'going on to the last target, if any'
+        response.message = f'refused: {reason}' if reason else RESUMED
         return response
 
     def _watch(self) -> None:

@@ -43,7 +43,7 @@ class Estimator(Shell):
         declare_preset(self, 'of the checkpoint')
         self.detector = AnomalyDetector(self.robot)
         self.verdict: Verdict | None = None
-        self.cause = ''
+        self.cause = self.suspect = ''
         self.taken = self.get_clock().now()
         self.arrival = -math.inf
         self.command_arrival = -math.inf
@@ -101,8 +101,8 @@ class Estimator(Shell):
         self.muscle_publisher.publish(array_message(restored, 'quantity', 'muscle'))
         self.anomaly_publisher.publish(Float64(data=self.verdict.anomaly))
         if self.verdict.cause and not self.cause:
-            suspect = self.robot.muscles[self.verdict.suspect]
-            self.cause = f'{suspect}: {self.verdict.cause}'
+            self.suspect = self.robot.muscles[self.verdict.suspect]
+            self.cause = f'{self.suspect}: {self.verdict.cause}'
             self.get_logger().warning(f'anomaly detected: {self.cause}')
             self.detected_publisher.publish(Bool(data=True))
 
@@ -120,7 +120,7 @@ class Estimator(Shell):
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
         response.message = f'cleared: {self.cause}' if self.cause else 'nothing was detected'
-        self.cause = ''
+        self.cause = self.suspect = ''
         self.detector.reset()
         self.detected_publisher.publish(Bool(data=False))
         return response
@@ -142,7 +142,8 @@ class Estimator(Shell):
             values |= {
                 'A': f'{self.verdict.anomaly:.4f}',
                 'd': f'{self.verdict.distance:.1f}',
-                'suspect muscle': self.robot.muscles[self.verdict.suspect],
+                # What was found first: when it is mended, the rest of the latch accuses others.
+                'suspect muscle': self.suspect or self.robot.muscles[self.verdict.suspect],
             }
         if self.cause:
             return ERROR, f'anomaly detected: {self.cause}', values

@@ -22,8 +22,9 @@ class Reception:
         last_rejected: What was wrong with the last one of them, or ''.
     """
 
-    def __init__(self) -> None:
-        """Nothing has come yet."""
+    def __init__(self, warn: Callable[[str], object]) -> None:
+        """Nothing has come yet; `warn` is told of the first rejection for each reason."""
+        self._warn = warn
         self.last_rejected = ''
         self.rejected: Counter[str] = Counter()
         self._received: Counter[str] = Counter()
@@ -52,8 +53,10 @@ class Reception:
             try:
                 callback(message)
             except MusculoskeletalError as error:
-                self.rejected[f'{topic}: {error.reason}'] += 1
                 self.last_rejected = f'{topic}: {error}'[:LONGEST_TEXT]
+                self.rejected[f'{topic}: {error.reason}'] += 1
+                if self.rejected[f'{topic}: {error.reason}'] == 1:
+                    self._warn(f'rejected {self.last_rejected} (counted in /diagnostics)')
             else:
                 self._received[topic] += 1
 

@@ -48,7 +48,7 @@ class Shell(Node):
         )
         self.robot = Robot.load(self.get_parameter('robot').value)
         self.rate = float(self.get_parameter('rate').value)
-        self._reception = Reception()
+        self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected
         self._setters: dict[str, Callable[[Any], None]] = {}
         self.add_on_set_parameters_callback(self._set_parameters)

@@ -78,8 +78,9 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         "paper's numbers beside. Exit status 1: the robot or a file is not usable, "
         '2: bad options.',
     )
+    names = (*NAMES, 'all')
     robots = ', '.join(sorted(shipped_robots()))
-    parser.add_argument('name', metavar='NAME', choices=(*NAMES, 'all'), help=', '.join(NAMES))
+    parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))
     parser.add_argument(
         '--robot',
         default='musashi_left_arm',

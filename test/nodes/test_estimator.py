@@ -153,6 +153,15 @@ def test_an_anomaly_is_latched_until_reset(estimator, arm26):
     detected = estimator.received['anomaly_detected']
     estimator.wait(lambda: detected[-1].data, 'the detection')
     estimator.wait(lambda: 'detected' in diagnosis(estimator).message, 'the diagnosis')
+    named = values(estimator)['suspect muscle']
+    other = healthy(arm26, theta, tension)
+    other.data[6 + arm26.muscles.index(named)] += 5.0
+    other.data[5 if named == arm26.muscles[0] else 0] -= 0.1
+    for _ in range(8):
+        answer(estimator, other)
+    estimator.received['/diagnostics'].clear()
+    estimator.wait(lambda: values(estimator), 'the next diagnosis')
+    assert values(estimator)['suspect muscle'] == named
     for _ in range(8):
         answer(estimator, healthy(arm26, theta, tension))
     assert detected[-1].data

@@ -16,7 +16,7 @@ class Inbox:
 
     def __init__(self, publishers=1):
         self.used = []
-        self.reception = Reception()
+        self.reception = Reception(print)
         self.receive = self.reception.of('topic', self.used.append, lambda: publishers)
 
     def get(self, message, time, number):
@@ -54,7 +54,8 @@ def test_of_two_publishers_neither_hides_the_other():
     ],
 )
 def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reason):
-    reception = Reception()
+    warnings = []
+    reception = Reception(warnings.append)
 
     def refuse(_):
         raise error
@@ -64,4 +65,6 @@ def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reaso
         receive(None, {'source_timestamp': number, 'publication_sequence_number': number})
     assert reception.rejected == {reason: 3}
     assert str(error) in reception.last_rejected
+    assert len(warnings) == 1
+    assert str(error) in warnings[0]
     assert not reception.take_received()
