@@ -54,7 +54,9 @@ def test_it_publishes_what_musashi_s_modules_would(arm, arm26):
     assert np.all(np.abs(temperature - 25.0) < 5.0)
     joints = arm.next('joint_states')
     assert tuple(joints.name) == arm26.joints
-    assert arm.received['robot_description'][0].data == arm26.description.urdf
+    described = arm.received['robot_description']
+    arm.wait(lambda: described, 'the description')
+    assert described[0].data == arm26.description.urdf
     arm.next('hardware_emulator/markers')
     markers = arm.received['hardware_emulator/markers'][-1].markers
     assert sum(m.ns == 'muscles' for m in markers) == 6

@@ -167,7 +167,9 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     graph.start('controller', robot='arm26', checkpoint=trained, first_duration=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
-    assert graph.received['robot_description'][0].data == arm26.description.urdf
+    described = graph.received['robot_description']
+    graph.wait(lambda: described, 'the description')
+    assert described[0].data == arm26.description.urdf
     target = graph.publisher(JointState, 'target_joint_states')
     for theta in (np.array([-0.5, -1.2]), np.array([0.1, -0.5])):
         target.publish(JointState(name=arm26.joints, position=theta.tolist()))
@@ -188,4 +190,4 @@ def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained):
     refused.process.wait(timeout=60.0)
     status, output = refused.end()
     assert status == 1
-    assert 'legal: default, paper' in output
+    assert 'legal: paper, default' in output
