@@ -167,9 +167,7 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     graph.start('controller', robot='arm26', checkpoint=trained, first_duration=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
-    described = graph.received['robot_description']
-    graph.wait(lambda: described, 'the description')
-    assert described[0].data == arm26.description.urdf
+    assert graph.received['robot_description'][0].data == arm26.description.urdf
     target = graph.publisher(JointState, 'target_joint_states')
     for theta in (np.array([-0.5, -1.2]), np.array([0.1, -0.5])):
         target.publish(JointState(name=arm26.joints, position=theta.tolist()))
