@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from pathlib import Path
 from typing import NoReturn
 
 from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.bags.writer import COMPRESSIONS
+from musculoskeletal_ae.options import not_negative, positive
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
 
@@ -22,25 +22,6 @@ class OneLineParser(argparse.ArgumentParser):
         """Say what is wrong and end with status 2."""
         print(f'{self.prog}: error: {message} (see {self.prog} --help)', file=sys.stderr)
         sys.exit(2)
-
-
-def positive(text: str) -> float:
-    """Return a positive, finite number."""
-    value = not_negative(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a number above 0')
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Return a finite number that is not negative."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a number of at least 0')
-    return value
 
 
 def names(text: str) -> list[str]:

@@ -11,13 +11,13 @@ import sys
 
 from tqdm import tqdm
 
+from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.calibration import calibration, table
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import to_mae
 from musculoskeletal_ae.mae.training import initial_training
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import options
 
 
 def _trained(robot: Robot, preset: str) -> Mae:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import (
     REQUIRED_SHARE,
@@ -21,7 +22,6 @@ from musculoskeletal_ae.robot.checks import (
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.moment_arms import MATTERS
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import options
 
 Array = NDArray[np.float64]
 

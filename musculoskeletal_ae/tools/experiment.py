@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.report.publish import publish
 from musculoskeletal_ae.experiments.report.readme import update_readme
@@ -21,7 +22,6 @@ from musculoskeletal_ae.experiments.suite.run import run, total_weight
 from musculoskeletal_ae.experiments.suite.study import PRESETS, Study
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import options
 
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)

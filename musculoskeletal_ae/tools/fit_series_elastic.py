@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.series_elastic import (
     DEFAULT_FORCE,
@@ -20,7 +21,6 @@ from musculoskeletal_ae.robot.series_elastic import (
     SeriesElastic,
     fit_series_elastic,
 )
-from musculoskeletal_ae.tools import options
 
 Array = NDArray[np.float64]
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
@@ -21,7 +22,6 @@ from musculoskeletal_ae.mae.training import TRAINING_PRESETS
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import options
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 
 Array = NDArray[np.float64]

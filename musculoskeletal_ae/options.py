@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable
 
 
@@ -37,12 +38,29 @@ def seeds(text: str) -> tuple[int, ...]:
     return values
 
 
+def positive(text: str) -> float:
+    """Return a positive, finite number."""
+    value = not_negative(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number above 0')
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Return a finite number that is not negative."""
+    return _number(text, f'{text!r} is not a number of at least 0', 0.0, sys.float_info.max)
+
+
 def minutes(text: str) -> float:
     """Return minutes of robot time."""
+    return _number(text, f'{text!r}: expected 0.2 to 600', 0.2, 600.0)
+
+
+def _number(text: str, problem: str, low: float, high: float) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0.2 <= value <= 600.0:
-        raise argparse.ArgumentTypeError(f'{text!r}: expected 0.2 to 600')
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(problem)
     return value
