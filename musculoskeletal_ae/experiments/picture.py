@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+BALL = 1.7  # of a line's width
+
 
 class Line(NamedTuple):
     """A polyline.
@@ -37,18 +39,24 @@ def save_picture(lines: Sequence[Line], path: str | Path, title: str = '') -> No
     reach = 0.5 * float((every.max(axis=0) - every.min(axis=0)).max()) + 0.03
     for i, (azimuth, name) in enumerate([(-10.0, 'from the front'), (-80.0, 'from the right')]):
         axes: Any = figure.add_subplot(1, 2, i + 1, projection='3d')
+        axes.set_proj_type('ortho')
         for line in lines:
+            width = 400.0 * line.width
+            # Balls where bones meet, and where a muscle's route is held.
             axes.plot(
                 *line.points.T,
                 color=line.colour,
-                linewidth=400.0 * line.width,
+                linewidth=width,
                 solid_capstyle='round',
-                path_effects=None,
+                marker='o',
+                markersize=BALL * width,
+                markeredgecolor='0.35',
+                markeredgewidth=0.5,
             )
         axes.set_xlim(middle[0] - reach, middle[0] + reach)
         axes.set_ylim(middle[1] - reach, middle[1] + reach)
         axes.set_zlim(middle[2] - reach, middle[2] + reach)
-        axes.set_box_aspect((1.0, 1.0, 1.0))
+        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.05)
         axes.locator_params(nbins=5)
         axes.set_xlabel('x [m]')
         axes.set_ylabel('y [m]')
