@@ -27,14 +27,15 @@ def arm(graph, arm26, trained):
     return ControlledArm(graph, arm26, trained)
 
 
-@pytest.mark.parametrize('method', ['geometric', 'first', 'second', 'proposed', 'stiffness'])
-def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm, method):
-    assert arm.graph.set_parameter('controller', 'method', method)[0]
+def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
+    for n, method in enumerate(('geometric', 'first', 'second', 'proposed', 'stiffness')):
+        assert arm.graph.set_parameter('controller', 'method', method)[0]
+        goal = THERE if n % 2 else HERE
+        arm.target(goal)
+        arm.goes_to(goal, within=0.5)
     done, reason = arm.graph.set_parameter('controller', 'method', 'magic')
     assert not done
     assert 'proposed' in reason
-    arm.target(HERE)
-    arm.goes_to(HERE, within=0.5)
     assert len(arm.sent('tension')) == 0
 
 
