@@ -150,5 +150,6 @@ def test_parameters_set_together_are_taken_all_or_none(arm):
     arm.target(HERE)
     arm.goes_to(HERE)
     assert len(arm.sent('tension')) == 0
+    arm.says('method')
     said = {pair.key: pair.value for pair in arm.state().values}
     assert said['method'] == 'proposed'
