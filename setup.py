@@ -20,7 +20,7 @@ NODES = [
     'replay',
     'sim',
 ]
-TOOLS = ['calibrate_emulator', 'check_robot', 'experiment', 'fit_series_elastic', 'train']
+TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 
 def config_files() -> list[tuple[str, list[str]]]:
@@ -35,7 +35,7 @@ def config_files() -> list[tuple[str, list[str]]]:
 setup(
     name=NAME,
     version='0.1.0',
-    packages=find_packages(exclude=['test', 'test.*']),
+    packages=find_packages(exclude=['bench', 'bench.*', 'test', 'test.*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

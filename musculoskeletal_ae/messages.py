@@ -13,7 +13,6 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import (
     Float64MultiArray,
@@ -22,9 +21,8 @@ from std_msgs.msg import (
     UInt8MultiArray,
 )
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
-
-Array = NDArray[np.float64]
 
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000

@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.selection import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.messages import QUANTITIES, read_array, read_posture
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # A source time that lies further back than this is another publisher's clock, not a reordering.
 _REORDERING = 1_000_000_000  # [ns]

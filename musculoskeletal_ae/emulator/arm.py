@@ -10,11 +10,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
 

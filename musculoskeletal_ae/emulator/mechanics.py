@@ -17,10 +17,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import (
     Tree,
     WrappedRoutes,
@@ -29,8 +28,6 @@ from musculoskeletal_ae.emulator.wrapping import (
     segment_length,
     tree_poses,
 )
-
-Array = NDArray[np.float64]
 
 STEP = 0.001  # [s]
 

@@ -20,7 +20,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
+
 Ints = NDArray[np.int64]
 
 

@@ -15,19 +15,17 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bench.control_nominal import nominal_tables
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.control_loop import ControlLoop
-from musculoskeletal_ae.experiments.control_nominal import nominal_tables
 from musculoskeletal_ae.experiments.holdable import holdable_postures
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.settings import Settings
-
-Array = NDArray[np.float64]
 
 #: name → (method, preset); with preset `paper` the paper's network is used as well
 PROTOCOL = {

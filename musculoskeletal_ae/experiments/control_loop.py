@@ -7,15 +7,13 @@ It steps the same core as the nodes, faster than real time.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.safety import LENGTH, Command, Muscles
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.tasks.controller import Controller
-from musculoskeletal_ae.tasks.safety import LENGTH, Command, Muscles
-from musculoskeletal_ae.tasks.settings import Settings
-
-Array = NDArray[np.float64]
 
 PERIOD = 0.01  # [s], 100 Hz as the modules report
 

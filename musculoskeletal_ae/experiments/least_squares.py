@@ -13,14 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import LENGTH_NOISE, TENSION_NOISE
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 30
 DAMPING = 1e-3  # of the normal matrix's diagonal

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import mean_error, oracle
@@ -31,8 +31,6 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 #: seeds of the random streams: exploring, and the motion never used for learning
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000

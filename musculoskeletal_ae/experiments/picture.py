@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 BALL = 1.7  # of a line's width
 

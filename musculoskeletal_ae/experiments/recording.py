@@ -7,15 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
+from musculoskeletal_ae.control.length import first_command, ramp
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.exploration import RAMP_SHARE, Exploration
-from musculoskeletal_ae.tasks.length_command import first_command, ramp
-
-Array = NDArray[np.float64]
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 

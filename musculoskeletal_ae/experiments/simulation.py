@@ -17,20 +17,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bench.sim_responses import FLEXED, FORCED, print_responses
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.length import msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.experiments.sim_responses import FLEXED, FORCED, print_responses
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
-from musculoskeletal_ae.tasks.length_command import msc_compensation
-from musculoskeletal_ae.tasks.simulation import Simulation
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 STEP = 0.01  # [s]
 STILL = 1e-4  # [rad/s]

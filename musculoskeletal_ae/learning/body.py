@@ -17,11 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-
-Array = NDArray[np.float64]
 
 FEATURES = 60  # of the smooth rest, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CorrectedBody, Layout
 from musculoskeletal_ae.robot.kinematics import JointPoses
-
-Array = NDArray[np.float64]
 
 FREEDOM = 4.0  # of the Student distribution
 ROUNDS = 6  # of Gauss–Newton per fit

@@ -13,8 +13,8 @@ needs many, and gets them from the body.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, Observations, Prior, fit_body
 from musculoskeletal_ae.learning.dream import Dream, dream
@@ -32,8 +32,6 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae, to_mae
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 REAL_SHARE = 0.1
 #: how often a dream is used before it is forgotten

@@ -11,16 +11,14 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.healthy import Healthy, Reservoir
 from musculoskeletal_ae.learning.rest import RestDetector, RestSettings
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.sliding import SlidingTracker
 from musculoskeletal_ae.learning.store import Novelty, SampleStore
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MARGIN = 2.0  # [s] before a detection and after its reset
 # Beyond these a sensor errs, not the arm.

@@ -13,13 +13,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.mae.samples import OVERLOAD_SHARE
 from musculoskeletal_ae.mae.units import scale_vector
-
-Array = NDArray[np.float64]
 
 #: share of dreams with most muscles near T_bias, as muscle stiffness control holds them
 HELD_SHARE = 0.5

@@ -16,12 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.mae.anomaly_statistics import FLOOR, AnomalyStatistics
 from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.tasks.anomaly import DISTANCE
-
-Array = NDArray[np.float64]
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept

@@ -11,13 +11,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import Observations, Prior, fit_body
 from musculoskeletal_ae.mae.mae import Mae
-
-Array = NDArray[np.float64]
 
 STATES = 400  # that the network is asked for
 TRUST = 0.001  # [m] by which its lengths may err

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.anomaly import AnomalyDetector
 
 # Between two recordings, and over a hole in one, the arm may have gone anywhere.
 HOLE = 0.5  # [s]

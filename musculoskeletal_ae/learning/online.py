@@ -11,9 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.collector import Collector
@@ -21,8 +19,6 @@ from musculoskeletal_ae.learning.paper_updater import PaperUpdater
 from musculoskeletal_ae.learning.update import Job, Update, Updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 PRESETS = ('default', 'paper')
 STEPS = 100  # of training in one update of preset default

@@ -6,10 +6,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 KEPT = 16  # joint angles that wait for their muscle message
 

@@ -12,11 +12,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.sample import Sample
-
-Array = NDArray[np.float64]
 
 LONGEST = 1.0  # [s] of rest that one sample averages
 MOST = 5000  # readings of one rest: an end where the clock stands still

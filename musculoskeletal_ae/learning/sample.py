@@ -5,10 +5,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 
 class Sample(NamedTuple):

@@ -18,14 +18,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.store import SampleStore
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MAGIC = b'MAESMPL1'
 SAMPLE, FORGET = 1, 2

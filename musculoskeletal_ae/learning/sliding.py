@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
 SMOOTHING = 0.05  # [s], so that the sensor's noise does not slide the wire

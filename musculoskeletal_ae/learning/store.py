@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body_fit import Observations
 from musculoskeletal_ae.learning.sample import Sample
-
-Array = NDArray[np.float64]
 
 CAPACITY = 400
 

@@ -13,15 +13,12 @@ import copy
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from musculoskeletal_ae.learning.dream import Dream
 from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimisers import Muon
 from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY, one_thread
-
-Array = NDArray[np.float64]
 
 STEP_SIZE = 2e-3
 BATCH = 128

@@ -8,13 +8,11 @@ from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body_fit import Observations
 from musculoskeletal_ae.learning.healthy import Healthy, recalibrate
 from musculoskeletal_ae.mae.mae import Mae
-
-Array = NDArray[np.float64]
 
 #: between how the network was made and what it learned since, in `Mae.training`
 LEARNED = '; learned online: '

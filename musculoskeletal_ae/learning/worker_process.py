@@ -14,12 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.update import Job
-
-Array = NDArray[np.float64]
 
 ENDING = 2.0  # [s] that the process has to end by itself
 

@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 # Below any sensor's resolution (0.02 N, 0.01 mm); keeps the covariance invertible when a network
 # restores some combination of its inputs perfectly.

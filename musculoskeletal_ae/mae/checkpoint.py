@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae import metadata
 from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
@@ -25,8 +25,6 @@ from musculoskeletal_ae.mae.layers import Layer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.metadata import Metadata
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # A hundred times the shipped arms' networks.
 MAX_BYTES = 64 * 1024 * 1024

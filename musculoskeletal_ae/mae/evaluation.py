@@ -6,15 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 from musculoskeletal_ae.mae.mae import Mae, State
 from musculoskeletal_ae.mae.samples import geometric_samples
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 #: outputs with the unit and the factor from SI that errors are shown in
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))

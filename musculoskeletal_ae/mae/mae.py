@@ -15,14 +15,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae import layers
 from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 from musculoskeletal_ae.mae.layers import Layer
 from musculoskeletal_ae.mae.units import Mask, scale_vector, visible
-
-Array = NDArray[np.float64]
 
 
 class State(NamedTuple):

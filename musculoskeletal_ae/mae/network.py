@@ -14,13 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask, visible
-
-Array = NDArray[np.float64]
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     'tanh': torch.tanh,

@@ -11,12 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # Share of samples, in preset default, with tensions beyond what is planned.
 OVERLOAD_SHARE = 0.2

@@ -16,15 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae import samples
 from musculoskeletal_ae.mae.network import PRESETS, Network
 from musculoskeletal_ae.mae.optimisers import Adam, Muon
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # Keeps the gradient of a norm finite at zero.
 TINY = 1e-12

@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 THETA_SCALE = 1.0  # scaled units per [rad] (or [m] of a prismatic joint)
 TENSION_SCALE = 1.0 / 200.0  # scaled units per [N]

@@ -17,6 +17,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.control.controller import Controller as Core
+from musculoskeletal_ae.control.report import control_report, stiffness_values
+from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
+from musculoskeletal_ae.control.settings import Settings, read_stiffness
+from musculoskeletal_ae.control.stiffness import StiffnessSolution
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import (
     QUANTITIES,
@@ -29,11 +34,6 @@ from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
-from musculoskeletal_ae.tasks.control_report import control_report, stiffness_values
-from musculoskeletal_ae.tasks.controller import Controller as Core
-from musculoskeletal_ae.tasks.safety import LENGTH, TENSION, Muscles
-from musculoskeletal_ae.tasks.settings import Settings, read_stiffness
-from musculoskeletal_ae.tasks.stiffness_control import StiffnessSolution
 
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
 LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}

@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages import QUANTITIES, array_message, read_array, read_pose
 from musculoskeletal_ae.nodes.parameters import declare_preset, number
@@ -23,7 +24,6 @@ from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, WARN, Shell
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
-from musculoskeletal_ae.tasks.anomaly import AnomalyDetector, Verdict
 
 # Commands older than this no longer say what the modules do.
 COMMAND_AGE = 0.5  # [s]

@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.drawing import Drawing
-
-Array = NDArray[np.float64]
 
 BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
 BONE_COLOUR = (0.85, 0.85, 0.8)

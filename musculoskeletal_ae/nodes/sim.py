@@ -23,7 +23,7 @@ from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
-from musculoskeletal_ae.tasks.simulation import Simulation
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 MARKER_RATE = 10.0  # [Hz] of the markers for RViz
 TEMPERATURE = 25.0  # [°C]

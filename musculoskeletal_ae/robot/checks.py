@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot import moment_arms as arms
 from musculoskeletal_ae.robot.moment_arms import Finding
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness
 from musculoskeletal_ae.robot.tension import holding_tension
-
-Array = NDArray[np.float64]
 
 WISHED_TENSION = 60.0  # [N]
 REQUIRED_SHARE = 0.95

@@ -14,15 +14,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.entries import EntryReader, listed, read_text
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_urdf
-
-Array = NDArray[np.float64]
 
 TOP_KEYS = ('joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector')
 MUSCLE_KEYS = ('name', 'route', 'series_elastic')

@@ -15,11 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # How far a camera's marker pose can be trusted: of a usual one, and only their ratio matters.
 POSITION_SPREAD, TURN_SPREAD = 0.002, 0.01  # [m], [rad]

@@ -7,14 +7,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, load_description
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
-
-Array = NDArray[np.float64]
 
 
 class Robot:

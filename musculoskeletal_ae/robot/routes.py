@@ -14,11 +14,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
-
-Array = NDArray[np.float64]
 
 # Bounds the memory of one batched evaluation to a few tens of megabytes.
 CHUNK = 4096

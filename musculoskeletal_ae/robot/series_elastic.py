@@ -13,9 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 DEFAULT_FORCE = 100.0  # [N]
 DEFAULT_RATE = 30.0  # [1/m]

@@ -12,9 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def muscle_stiffness(robot: Robot, theta: Array, tension: Array) -> Array:

@@ -14,11 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 import quadprog
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
-
-Array = NDArray[np.float64]
 
 SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of some hundred N
 

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from musculoskeletal_ae import options
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import (
     REQUIRED_SHARE,
@@ -22,8 +22,6 @@ from musculoskeletal_ae.robot.checks import (
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.moment_arms import MATTERS
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def main(argv: list[str] | None = None) -> int:

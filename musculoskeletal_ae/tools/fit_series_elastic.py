@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from musculoskeletal_ae import options
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.series_elastic import (
     DEFAULT_FORCE,
@@ -21,8 +21,6 @@ from musculoskeletal_ae.robot.series_elastic import (
     SeriesElastic,
     fit_series_elastic,
 )
-
-Array = NDArray[np.float64]
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']
 EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from musculoskeletal_ae import options
@@ -23,8 +22,6 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
-
-Array = NDArray[np.float64]
 
 UNSEEN = 5000
 ENTERED = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.bags import samples
+from bench import bag_samples as samples
 from musculoskeletal_ae.bags.definitions import encode, message_class
 
 ARRAY = 'std_msgs/msg/Float64MultiArray'

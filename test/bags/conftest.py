@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from graph import DEADLINE, Graph
 
-from musculoskeletal_ae.bags import samples
+from bench import bag_samples as samples
 
 _counter = itertools.count(1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from musculoskeletal_ae.bags import samples
+from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from musculoskeletal_ae.experiments.learning_kills import digest, grown, run, samples
+from bench.kills import digest, grown, run, samples
 from musculoskeletal_ae.learning.store import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 

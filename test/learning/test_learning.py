@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import paper_updater
 from musculoskeletal_ae.learning.body import CorrectedBody
@@ -23,7 +24,6 @@ from musculoskeletal_ae.learning.online import OnlineLearner, make_updater
 from musculoskeletal_ae.learning.paper_updater import PaperUpdater
 from musculoskeletal_ae.learning.update import Job, learned_steps
 from musculoskeletal_ae.mae.evaluation import residuals
-from musculoskeletal_ae.tasks.anomaly import DISTANCE
 
 
 def error(mae, theta, tension, length):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from musculoskeletal_ae.experiments.learning_soak import judged
+from bench.soak import judged
 
 FLAT = [0.5] * 40
 

@@ -12,9 +12,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.control.controller import LONGEST_STEP
 from musculoskeletal_ae.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
-from musculoskeletal_ae.tasks.controller import LONGEST_STEP
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 

@@ -13,11 +13,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 from visualization_msgs.msg import MarkerArray
 
+from musculoskeletal_ae.control.length import first_command
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.messages import array_message, bytes_message, read_array
 from musculoskeletal_ae.nodes.qos import LATCHED
-from musculoskeletal_ae.tasks.length_command import first_command
-from musculoskeletal_ae.tasks.simulation import Simulation
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 
 @pytest.fixture

@@ -5,12 +5,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Baseline(Protocol):

@@ -9,12 +9,10 @@ started at the estimate before, as a robot would that runs it message by message
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # In the paper's scaled units (mm/100) lengths and their tolerances are of the size of one.
 SCALE = 10.0

@@ -13,12 +13,10 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.baselines.estimator import unstretched
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 DEGREE = 3
 MODEL_SAMPLES = 20_000

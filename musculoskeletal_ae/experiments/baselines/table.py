@@ -10,13 +10,11 @@ was measured while exploring, every row with its elongation taken off.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.baselines.estimator import unstretched
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 ROWS = 100_000
 

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MARGIN = 0.03  # [m]
 HEADER = 0.9  # [inch] for the titles

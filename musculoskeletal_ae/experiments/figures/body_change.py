@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.figures.style import (
     AFTER,
     BEFORE,
@@ -21,8 +22,6 @@ from musculoskeletal_ae.experiments.figures.style import (
 )
 from musculoskeletal_ae.experiments.suite.study import Measured, Study
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 COLUMNS = 5
 LINES = (('before', BEFORE, 'before learning'), ('after', AFTER, 'after learning'))

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.figures.style import (
     AFTER,
     MARK,
@@ -21,8 +21,6 @@ from musculoskeletal_ae.experiments.figures.style import (
 )
 from musculoskeletal_ae.experiments.suite.study import Measured, Study
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 PRINTED_MINUTES = 10.0
 PRINTED = (0.324, 0.154)  # [rad] the paper's fit at the start and after ten minutes

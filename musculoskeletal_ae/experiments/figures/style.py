@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from musculoskeletal_ae.arrays import Array
 
 # Told apart by people who see colours differently, and in grey.
 BEFORE, AFTER, PAPER, TRUE, MARK = '#D55E00', '#0072B2', '#CC79A7', '#222222', '#777777'

@@ -6,8 +6,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
 from musculoskeletal_ae.experiments.suite.detection import Watched, alarms_begun, anomaly, auroc
 from musculoskeletal_ae.experiments.suite.scenario import (
@@ -18,9 +18,6 @@ from musculoskeletal_ae.experiments.suite.scenario import (
 )
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.anomaly import DISTANCE
-
-Array = NDArray[np.float64]
 
 
 def anomaly_levels(

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.suite.learning import rest_samples
 from musculoskeletal_ae.experiments.suite.roles import shoulder
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # [rad]
 POINTS = 101  # of tension

@@ -12,8 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.proposed import proposed
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments.control import (
@@ -25,10 +27,6 @@ from musculoskeletal_ae.experiments.suite.scenario import frictionless
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.control import proposed
-from musculoskeletal_ae.tasks.settings import Settings
-
-Array = NDArray[np.float64]
 
 
 def measure(study: Study, seed: int, progress: Progress) -> Measured:

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
 from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae, State
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.anomaly import AnomalyDetector
-
-Array = NDArray[np.float64]
 
 
 class Watched(NamedTuple):

@@ -7,8 +7,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import online_learning as protocol
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
@@ -18,8 +18,6 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 EXPLORING, HELD_OUT = 'exploring', 'held_out'
 

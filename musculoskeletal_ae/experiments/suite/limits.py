@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import LENGTH_NOISE
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import LeastSquares, mean_error, oracle
@@ -22,8 +22,6 @@ from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 STRIDE = 10  # of messages; least squares is slow
 DIFFERENCE = 1e-4  # [rad]

@@ -11,19 +11,17 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.length import geometric_command
+from musculoskeletal_ae.control.proposed import proposed
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.suite.roles import elbow, flexed, shoulder, within
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
-from musculoskeletal_ae.tasks.control import proposed
-from musculoskeletal_ae.tasks.length_command import geometric_command
-from musculoskeletal_ae.tasks.simulation import Simulation
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 STEP = 0.02  # [s]
 FORCE = 50.0  # [N]

@@ -8,12 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 PAYLOAD = 3.6  # [kg], the paper's dumbbell
 #: a muscle carries tension if it pulls this much more than T_bias, far beyond the sensor's noise

@@ -12,17 +12,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
 from musculoskeletal_ae.experiments.suite.learning import HELD_OUT
 from musculoskeletal_ae.experiments.suite.scenario import frictionless
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tasks.simulation import Simulation
-
-Array = NDArray[np.float64]
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 
 def measure(study: Study, seed: int, progress: Progress) -> Measured:

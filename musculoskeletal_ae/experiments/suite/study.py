@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-Array = NDArray[np.float64]
 #: told which share of an experiment's work has been done since it was told last
 Progress = Callable[[float], None]
 

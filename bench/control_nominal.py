@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What control does on the nominal body: no mismatch, no friction, what is left is the network's.
+
+1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
+   QP on the true G, lengths by the true body.
+2. stiffness: the deflection of a push at the wished stiffness in the lower and the upper quarter of
+   the reported reachable range, and the ratio of both beside the predicted one.
+3. torque: joint torque that the commanded tensions make, beside the commanded torque.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import proposed as control
+from musculoskeletal_ae.control.length import (
+    first_command,
+    geometric_command,
+    msc_compensation,
+)
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.stiffness import stiffness_command
+from musculoskeletal_ae.control.stiffness_model import push_deflection
+from musculoskeletal_ae.control.torque import TorqueControl
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.experiments.holdable import holdable_postures
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES, QUICK = 50, 3
+SETTLING, PERIOD = 3.0, 0.02  # [s]
+QUARTERS = (0.125, 0.875)  # middles of the lower and the upper quarter of the reachable range
+PUSH = 1.0  # [N·m] of torque at the joint
+TORQUE_SPREAD = 1.0  # [N·m] of effort beyond the arm's weight
+
+
+def nominal_arm(robot: Robot) -> EmulatedArm:
+    """Return the geometric model as a body."""
+    return EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
+
+
+def settle(arm: EmulatedArm, length: Array) -> None:
+    """Let the arm come to rest under a command [m] (M,)."""
+    for _ in range(round(SETTLING / PERIOD)):
+        arm.command_length(length)
+        arm.step(PERIOD)
+
+
+def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, Array]:
+    """Return for each method (error [rad], ‖T‖ [N], bound ‖T‖ [N]) of every posture, (N, 3)."""
+    arm = nominal_arm(robot)
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    bias, limit = np.full(robot.muscle_count, robot.tension.bias), robot.tension.limit
+    rng = np.random.default_rng(5)
+    for theta, least in holdable_postures(robot, arm.individual, count, rng):
+        torque = robot.kinematics.holding_torque(theta)
+        bound = robot.muscle_lengths(theta, least) + msc_compensation(robot, least)
+        commands = {
+            'bound: QP on the true body': bound,
+            'QP on the true G, l from ①': first_command(robot, mae, theta, least),
+            'proposed': control.proposed(robot, mae, theta, torque, bias, limit).length,
+            'proposed, paper': control.proposed_paper(robot, paper, theta, torque, bias).length,
+            'first': first_command(robot, mae, theta, bias),
+            'first, paper': first_command(robot, paper, theta, bias),
+            'geometric': geometric_command(robot, theta),
+        }
+        seconds = {'first': ('second', mae), 'first, paper': ('second, paper', paper)}
+        for name, command in commands.items():
+            arm.reset(theta)
+            settle(arm, command)
+            after = [name]
+            if name in seconds:
+                after.append(seconds[name][0])
+            for which in after:
+                if which != name:
+                    settle(arm, first_command(robot, seconds[name][1], theta, arm.tension))
+                error = float(np.linalg.norm(arm.theta - theta))
+                tension = float(np.linalg.norm(arm.tension))
+                rows.setdefault(which, []).append((error, tension, float(np.linalg.norm(least))))
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+def stiffness_ratios(
+    robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None, push: float = PUSH
+) -> Array:
+    """Return (measured, predicted) ratio of deflection, lower over upper quarter, (N, 2).
+
+    Each posture wishes for one joint, in turn; the push is the wrench that comes nearest to a
+    torque [N·m] on that joint alone.
+    """
+    arm = arm or nominal_arm(robot)
+    ratios = []
+    rng = np.random.default_rng(8)
+    postures = holdable_postures(robot, arm.individual, count, rng)
+    for n, (theta, _) in enumerate(postures):
+        joint = n % robot.joint_count
+        torque = robot.kinematics.holding_torque(theta)
+        wish = np.zeros(robot.joint_count)
+        free = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
+        low, high = free.lowest[joint], free.highest[joint]
+        jacobian = robot.kinematics.end_effector_jacobian(theta)
+        wrench = np.asarray(push * np.linalg.pinv(jacobian.T)[:, joint], dtype=np.float64)
+        deflections = []
+        for quarter in QUARTERS:
+            wish[joint] = low + quarter * (high - low)
+            found = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
+            expected = push_deflection(robot, theta, found.stiffness, wrench)[joint]
+            moved = _pushed(arm, theta, found.command.length, wrench)[joint]
+            deflections.append((moved, expected))
+        (soft, soft_expected), (stiff, stiff_expected) = deflections
+        ratios.append((soft / stiff, soft_expected / stiff_expected))
+    return np.array(ratios)
+
+
+def _pushed(arm: EmulatedArm, theta: Array, length: Array, wrench: Array) -> Array:
+    """Return half of what turns between a push and the opposite push [rad], shape (D,)."""
+    arm.reset(theta)
+    settle(arm, length)
+    ends = []
+    for sign in (1.0, -1.0):
+        arm.set_wrench(sign * wrench)
+        settle(arm, length)
+        ends.append(arm.theta)
+    arm.set_wrench(np.zeros(6))
+    turned: Array = 0.5 * (ends[0] - ends[1])
+    return turned
+
+
+def torque_errors(robot: Robot, mae: Mae, count: int) -> Array:
+    """Return ‖−Gᵀ T − τ‖ / ‖τ‖ with the true G, for random postures and efforts, (N,)."""
+    errors = []
+    rng = np.random.default_rng(9)
+    torque_control = TorqueControl(robot, Settings())
+    individual = Individual(robot, 0, NOMINAL)
+    limit = np.full(robot.muscle_count, robot.tension.limit)
+    for theta, least in holdable_postures(robot, individual, count, rng):
+        effort = rng.normal(0.0, TORQUE_SPREAD, robot.joint_count)
+        torque = robot.kinematics.holding_torque(theta) + effort
+        found = torque_control.exertion(mae, theta, torque, least, limit)
+        # Torque beyond the muscles is reported as missing and not promised.
+        promised = torque - found.missing_torque
+        exerted = -robot.routes.muscle_jacobian(theta).T @ found.tension
+        errors.append(np.linalg.norm(exerted - promised) / np.linalg.norm(promised))
+    return np.array(errors)
+
+
+def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> str:
+    """Return all three as text."""
+    count = QUICK if quick else POSTURES
+    lines = [f'{"posture, nominal body":30s}{"error [rad]":>12s}{"largest":>9s}{"‖T‖ [N]":>9s}']
+    for name, rows in posture_table(robot, mae, paper, count).items():
+        error, tension, bound = rows.T
+        lines.append(
+            f'{name:30s}{error.mean():12.4f}{error.max():9.4f}{tension.mean():9.1f}'
+            f'   {100.0 * (tension / bound).mean():.1f} % of the bound'
+        )
+    measured, predicted = stiffness_ratios(robot, mae, max(count // 5, 2)).T
+    off = measured / predicted - 1.0
+    lines.append(
+        f'stiffness: deflection ratio over predicted ratio − 1: mean {np.abs(off).mean():.3f}, '
+        f'largest {np.abs(off).max():.3f}, within 20 %: {100.0 * (np.abs(off) < 0.2).mean():.0f} %'
+    )
+    errors = torque_errors(robot, mae, count)
+    lines.append(
+        f'torque: relative error mean {errors.mean():.3f}, largest {errors.max():.3f}, '
+        f'within 10 %: {100.0 * (errors < 0.1).mean():.0f} %'
+    )
+    return '\n'.join(lines)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the simulated arm: at rest, and with a weight in the hand.
+
+    python -m bench.sim_pictures --checkpoint FILE [--out doc]
+
+writes sim_at_rest.png and sim_loaded.png. Of a running simulator, `render --topic sim/markers`
+makes the same picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from musculoskeletal_ae.control.length import first_command
+from musculoskeletal_ae.experiments.picture import Line, save_picture
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import nearest_tension
+from musculoskeletal_ae.simulation.simulation import Simulation
+
+BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
+BONE_COLOUR = (0.75, 0.75, 0.7)
+LOAD = -50.0  # [N] in z, as in the paper's simulation
+
+
+def lines(drawing: Drawing) -> list[Line]:
+    """Return the lines of an arm as a picture wants them."""
+    muscles = zip(drawing.muscles, drawing.colours.tolist(), strict=True)
+    return [Line(bone, BONE_WIDTH, BONE_COLOUR) for bone in drawing.bones] + [
+        Line(muscle, MUSCLE_WIDTH, tuple(colour)) for muscle, colour in muscles
+    ]
+
+
+def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
+    """Hold the middle of the joint range, then load the hand; return the files written."""
+    simulated = Simulation(robot, mae)
+    theta = 0.5 * (robot.lower + robot.upper)
+    tension = nearest_tension(
+        mae.muscle_jacobian(theta, np.full(robot.muscle_count, robot.tension.bias)),
+        robot.kinematics.holding_torque(theta),
+        robot.tension.bias,
+        robot.tension.limit,
+    )
+    simulated.command = first_command(robot, mae, theta, tension)[None]
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, force, load in (
+        ('at_rest', 0.0, 'nothing in the hand'),
+        ('loaded', LOAD, f'{LOAD:g} N in z at the hand'),
+    ):
+        simulated.wrench = np.array([[0.0, 0.0, force, 0.0, 0.0, 0.0]])
+        state = simulated.settle()
+        drawing = draw_arm(robot, state.theta[0], state.tension[0])
+        title = (
+            f'simulated arm, {load}: '
+            f'{state.tension.min():.0f} to {state.tension.max():.0f} N '
+            '(green at bias, red at the limit)'
+        )
+        files.append(folder / f'sim_{name}.png')
+        save_picture(lines(drawing), files[-1], title)
+    return files
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Write both pictures."""
+    parser = argparse.ArgumentParser(description=__doc__, prog='sim_pictures')
+    parser.add_argument('--robot', default='musashi_left_arm')
+    parser.add_argument('--checkpoint', required=True)
+    parser.add_argument('--out', default='doc', type=Path)
+    args = parser.parse_args(argv)
+    robot = Robot.load(args.robot)
+    for file in save_both(robot, checkpoint.load(args.checkpoint, robot), args.out):
+        print(file)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A day of learning in an hour or two: does the error stay down, do memory and time stay flat?
+
+python -m bench.soak [--hours 24] [--quick]
+
+The emulated arm explores on and on; every message goes through the learner's collector. To fit a
+day into an hour or two it updates after every `--every`-th sample only (the first ones after each),
+where the node updates twice for each: so many fewer updates are judged than a day would bring. One
+line per report: robot time, samples, held-out error, d's threshold, memory, time of an update.
+
+Exit status 1 if the error ever rose by more than a fifth over its least, memory by more than a
+fifth over what it was after two hours, or the median time of an update in the last quarter to more
+than one and a half of that in the first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.experiments.online_learning import HELD_OUT_STREAM, held_out_error
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
+from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+
+PART = 300.0  # [s] of robot time that is recorded and learned at once
+REPORT = 1800.0  # [s] of robot time
+#: the network is still finding the body out until then [s]
+SETTLED = 1800.0
+TOLERATED = 1.2
+#: memory is compared with what it was then [s]: imports, the store and the reservoir fill it before
+FILLED = 7200.0
+SLOWER = 1.5  # the last quarter's updates against the first's
+
+
+def memory() -> float:
+    """Return what this process holds now [MB]."""
+    pages = int(Path('/proc/self/statm').read_text('ascii').split()[1])
+    return pages * 4096 / 1e6
+
+
+def judged(worst: float, filled: float, most: float, times: list[float]) -> list[str]:
+    """Return what was not tolerable, in words.
+
+    Args:
+        worst: Highest error over the least before it.
+        filled: Memory after two hours [MB]; 0 in a shorter run, which does not judge it.
+        most: Highest memory since [MB].
+        times: Time of every update, in order [s].
+    """
+    problems = []
+    if worst > TOLERATED:
+        problems.append(f'the error rose to {worst:.2f} of its least')
+    if most > TOLERATED * filled:
+        problems.append(f'memory rose from {filled:.0f} to {most:.0f} MB')
+    quarter = len(times) // 4
+    if quarter:
+        first, last = np.median(times[:quarter]), np.median(times[-quarter:])
+        if last > SLOWER * first:
+            problems.append(f'an update took {first:.2f} s at first and {last:.2f} s at last')
+    return problems
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the soak."""
+    parser = argparse.ArgumentParser(prog='learning_soak', description=__doc__)
+    parser.add_argument('--robot', default='musashi_left_arm')
+    parser.add_argument('--hours', type=float, default=24.0, help='of robot time')
+    parser.add_argument('--quick', action='store_true', help='two hours, to try things out')
+    parser.add_argument('--every', type=int, default=20, help='samples between updates')
+    parser.add_argument('--steps', type=int, default=STEPS, help='of training per update')
+    parser.add_argument('--seed', type=int, default=0, help='which individual')
+    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    robot = Robot.load(args.robot)
+    mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
+    held_out = record(EmulatedArm(robot, args.seed), motion(robot, mae, HELD_OUT_STREAM, PART))
+    learner = OnlineLearner(robot, mae, seed=args.seed, steps=args.steps)
+    arm = EmulatedArm(robot, args.seed)
+    least, worst, waiting, changed = np.inf, 0.0, 0, 0
+    times: list[float] = []
+    reported: list[float] = []
+    filled = most = 0.0
+    for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
+        stream = record(arm, motion(robot, mae, part, PART))
+        for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
+            sample = learner.collector.step(tension, length, SAMPLE_TIME, theta)
+            waiting += sample is not None
+            # The first samples are learned as they come.
+            if sample is not None and waiting >= min(args.every, 1 + learner.updates // 4):
+                begun, waiting = time.process_time(), 0
+                update = learner.update()
+                times.append(time.process_time() - begun)
+                changed += bool(update and update.changed)
+        now = PART * (part + 1)
+        error = held_out_error(learner.mae, held_out, 10)
+        if now >= SETTLED:
+            least, worst = min(least, error), max(worst, error / least)
+        if now == FILLED:
+            filled = memory()
+        if now >= FILLED:
+            most = max(most, memory())
+        if now % REPORT == 0.0:
+            anomaly = learner.mae.anomaly
+            threshold = anomaly.thresholds.get(DISTANCE, np.nan) if anomaly else np.nan
+            print(
+                f'{now / 3600.0:5.1f} h  samples {len(learner.collector.store)} '
+                f'({learner.collector.store.accepted} accepted)  error {error:.4f} rad  '
+                f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {changed}  '
+                f'{memory():.0f} MB  update {np.median(times):.2f} s',
+                flush=True,
+            )
+            reported += times
+            times.clear()
+    problems = judged(worst, filled, most, reported + times)
+    print('; '.join(problems) or 'all within what is tolerated')
+    return int(bool(problems))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does the torque balance at rest, g(θ) + G(θ)ᵀ T = 0, hold for what was learned, and add to it?
+
+python -m bench.torque_residual [--robot …] [--seeds 0,1] [--minutes 10]
+
+(PIMBS learns a body image from this residual at rest.) For the samples of an exploration it prints
+the residual with the true G, with that of the learnt body and with the geometric model's, and how
+far the last two are from the truth. What the true body leaves is friction, and joints that lean on
+their limits. Where the learnt body leaves as little, the residual is met and has no more to say:
+the lengths have told G already, and far more exactly than the torques could.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.experiments.online_learning import EXPLORATION_STREAM
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
+from musculoskeletal_ae.experiments.suite.limits import LearntLeastSquares
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
+from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+UPDATES = 3  # each goes on fitting from where the last one ended
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
+    """Return the lines of one individual."""
+    stream = record(
+        EmulatedArm(robot, seed), motion(robot, mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
+    )
+    learner = OnlineLearner(robot, mae, seed=seed)
+    for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
+        learner.collector.step(tension, length, SAMPLE_TIME, theta)
+    for _ in range(UPDATES):
+        learner.update()
+    assert isinstance(learner.updater, BodyUpdater)  # preset default
+    seen = learner.collector.store.observations()
+    holding = np.array([robot.kinematics.holding_torque(theta) for theta in seen.theta])
+    true = Individual(robot, seed).muscle_jacobian(seen.theta)
+    learnt = LearntLeastSquares(robot, learner.updater.body).muscle_jacobian(seen.theta)
+    nominal = np.array([robot.routes.muscle_jacobian(theta) for theta in seen.theta])
+    lines = [f'individual {seed}, {len(seen)} samples, holding torque {rms(holding):.2f} N·m']
+    for name, jacobian in (('true', true), ('learnt', learnt), ('geometric', nominal)):
+        residual = holding + np.einsum('nmd,nm->nd', jacobian, seen.tension)
+        lines.append(
+            f'  {name:10s} residual {rms(residual):.3f} N·m, '
+            f'error of G {1e3 * rms(jacobian - true):.2f} mm/rad'
+        )
+    return '\n'.join(lines)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog='torque_residual', description=__doc__)
+    parser.add_argument('--robot', default='musashi_left_arm')
+    parser.add_argument('--seeds', default='0', help='individuals')
+    parser.add_argument('--minutes', type=float, default=10.0, help='of exploration')
+    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    robot = Robot.load(args.robot)
+    mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
+    for seed in map(int, args.seeds.split(',')):
+        print(table(robot, mae, seed, args.minutes), flush=True)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Control as a whole: targets in, safe commands out, and why the arm must not move.
+
+    target ─→ posture_control (lengths) or torque_control (tensions) ─→ safety ─→ command
+
+A stop latches on missing or old sensor data, an anomaly, an unfit checkpoint, a fault of control's
+own, or on request (INTERFACE, Stop and resume). `reset` clears it once no cause is left; then the
+last target is resumed by a ramp from where the arm is. Exploration is not resumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.posture import PostureControl
+from musculoskeletal_ae.control.safety import (
+    LENGTH,
+    TENSION,
+    Command,
+    Muscles,
+    SafetyFilter,
+    thermal_limit,
+    unchanging,
+)
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.torque import TorqueControl
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
+
+
+class Controller:
+    """Steps everything between a target and a command. Times are of one steady clock [s].
+
+    Attributes:
+        settings: What the user chose.
+        posture: Length commands.
+        torque: Tension commands.
+        safety: The latch and the limits.
+        limit: Tension limit of each muscle, lowered by heat [N], shape (M,).
+        clamped: Joints whose target lay beyond the limits.
+        stepped_at: When it was stepped last [s].
+    """
+
+    def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
+        """Control `robot`; `seed` is the exploration's."""
+        self._robot, self._seed = robot, seed
+        self.settings = settings
+        self.posture = PostureControl(robot, settings)
+        self.torque = TorqueControl(robot, settings)
+        self.safety = SafetyFilter(robot, settings)
+        self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
+        self.clamped: tuple[str, ...] = ()
+        self._mae: Mae | None = None
+        self._exploration: Exploration | None = None
+        self._muscles: Muscles | None = None
+        self._estimate: Array | None = None
+        self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
+        self._anomaly = False
+        self._method = ''
+
+    # -- what comes in --------------------------------------------------------------------------
+
+    def use(self, mae: Mae) -> None:
+        """Take a checked network."""
+        self._mae = mae
+        self.posture.use(mae)
+
+    def muscles(self, muscles: Muscles, now: float) -> None:
+        """Take muscle_states."""
+        self._muscles, self._muscles_at = muscles, now
+        highest = self.settings.temperature_limit
+        self.limit = thermal_limit(self._robot, muscles.temperature, highest)
+
+    def estimated(self, theta: Array, now: float) -> None:
+        """Take estimated_joint_states [rad], shape (D,)."""
+        self._estimate, self._estimate_at = theta, now
+
+    def anomaly(self, detected: bool) -> None:
+        """Take anomaly_detected."""
+        self._anomaly = detected
+        if detected:
+            self.stop('anomaly_detected')
+
+    def target(self, found: Mapping[str, tuple[float, float]]) -> None:
+        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs.
+
+        Raises:
+            MessageError: If it leaves joints out of whose posture nothing is known yet.
+        """
+        robot = self._robot
+        kept = self.posture.theta if self.posture.theta is not None else self._estimate
+        if kept is None and len(found) < robot.joint_count:
+            raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
+        theta = np.zeros(robot.joint_count) if kept is None else kept.copy()
+        effort = self.posture.effort.copy()
+        for i, name in enumerate(robot.joints):
+            if name in found:
+                theta[i], effort[i] = found[name]
+        inside = np.clip(theta, robot.lower, robot.upper)
+        self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
+        self.posture.set_target(inside, effort)
+
+    # -- what is asked --------------------------------------------------------------------------
+
+    def explore(self, wanted: bool) -> str:
+        """Explore, or end it and hold; return why not, or ''."""
+        if wanted and self.safety.cause:
+            return f'stopped: {self.safety.cause}'
+        # One stream for the life of the controller: after a pause it brings new postures.
+        self._exploration = self._exploration or Exploration(self._robot, self._seed)
+        if wanted != self.posture.exploring:
+            self._exploration.begin_cycle()
+            self.posture.explore(self._exploration if wanted else None)
+            self.posture.theta = None
+        return ''
+
+    def stop(self, cause: str) -> None:
+        """Latch a safe stop."""
+        self.explore(False)
+        self.safety.stop(cause)
+
+    def reset(self, now: float) -> str:
+        """Clear a stop and go on to the last target; return why not, or ''."""
+        cause = self.present_cause(now)
+        if not cause and self.safety.cause:
+            self.safety.reset()
+            self._method = ''
+        return cause
+
+    def present_cause(self, now: float) -> str:
+        """Return why the arm must not move now, or ''."""
+        if self._mae is None:
+            return 'no checkpoint'
+        if self._anomaly:
+            return 'anomaly_detected; call estimator/reset when it is mended'
+        for what, arrival in (
+            ('muscle_states', self._muscles_at),
+            ('estimated_joint_states', self._estimate_at),
+        ):
+            if now - arrival > self.settings.max_age:
+                return f'{what} older than {self.settings.max_age:g} s'
+        return ''
+
+    # -- time -----------------------------------------------------------------------------------
+
+    def step(self, now: float) -> Command | None:
+        """Return the command of this moment, or None while nothing was ever commanded."""
+        since = now - self.stepped_at if self.stepped_at > -math.inf else 0.0
+        dt = min(max(since, 0.0), LONGEST_STEP)
+        self.stepped_at = now
+        muscles, cause = self._muscles, self.present_cause(now)
+        if muscles is None:
+            return None
+        # Before the first command there is nothing to stop.
+        if cause and self.safety.command is not None:
+            self.stop(cause)
+        wished = None
+        if not cause and not self.safety.cause:
+            try:
+                wished = self._wish(muscles, dt)
+            except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
+                self.stop(f'fault of control: {type(error).__name__}: {error}')
+        fresh = now - self._muscles_at <= self.settings.max_age
+        return self.safety.step(wished, muscles, self.limit, dt, fresh)
+
+    def _wish(self, muscles: Muscles, dt: float) -> Command | None:
+        assert self._mae is not None and self._estimate is not None  # no present cause
+        posture, method = self.posture, self.settings.method
+        method = 'exploration' if posture.exploring else method
+        if method != self._method:
+            self._start(method, muscles)
+        planned = np.minimum(self.limit, self._robot.tension.limit)
+        if method != 'tension':
+            length = posture.step(muscles.tension, self._estimate, planned, dt)
+            return None if length is None else Command(LENGTH, length)
+        if posture.theta is None:
+            return None
+        target, effort = posture.theta, posture.effort
+        tension = self.torque.step(self._mae, self._estimate, target, effort, planned, dt)
+        return Command(TENSION, tension)
+
+    def _start(self, method: str, muscles: Muscles) -> None:
+        """Go over to a method from how the muscles pull at this moment."""
+        self._method = method
+        kind = TENSION if method == 'tension' else LENGTH
+        command = self.safety.command
+        if command is None or command.kind != kind:
+            command = unchanging(self._robot, kind, muscles)
+        if kind == TENSION:
+            self.torque.start_from(command.value)
+        else:
+            self.posture.start_from(command.value)

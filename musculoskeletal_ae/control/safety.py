@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every command passes before it leaves: rate limit, saturation, finite check, safe stop.
+
+Order: model → rate limit → saturate → finite check last. MSC pulls with T_bias + K (l − l_target),
+so the tension limit of a muscle is a length limit,
+
+    l_target ≥ l − (T_limit − T_bias)/K_stiff,
+
+which may pay a muscle out faster than the rate limit, never wind it in. l is the median of the last
+three readings there, so that a glitch of a sensor lets no muscle go. The limit of a muscle whose
+module runs hot falls smoothly from tension.max to T_bias.
+
+A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
+limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.robot import Robot
+
+LENGTH, TENSION = 'length', 'tension'
+
+# Width of the band below the highest temperature in which a muscle's tension limit falls.
+COOLING_BAND = 15.0  # [°C]
+#: [m] by which a true muscle, or its sensor, may be longer than the model's
+LENGTH_MARGIN = 0.03
+
+
+class Command(NamedTuple):
+    """What the modules are to follow: LENGTH [m] or TENSION [N], values of shape (M,)."""
+
+    kind: str
+    value: Array
+
+
+class Muscles(NamedTuple):
+    """The last muscle_states: l [m], T [N], temperature [°C], each of shape (M,)."""
+
+    length: Array
+    tension: Array
+    temperature: Array
+
+
+def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
+    """Return each muscle's tension limit [N] (M,) for module temperatures [°C] (M,).
+
+    A smooth step from tension.max, at COOLING_BAND below `highest`, to T_bias at `highest`.
+    """
+    share = np.clip((highest - temperature) / COOLING_BAND, 0.0, 1.0)
+    smooth = share * share * (3.0 - 2.0 * share)
+    limit: Array = robot.tension.bias + smooth * (robot.tension.max - robot.tension.bias)
+    return limit
+
+
+def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:
+    """Return the command of a kind under which the muscles pull as they do now."""
+    tension = np.maximum(muscles.tension, robot.tension.bias)
+    if kind == TENSION:
+        return Command(TENSION, tension)
+    return Command(LENGTH, muscles.length - (tension - robot.tension.bias) / robot.stiffness)
+
+
+class SafetyFilter:
+    """Latched stop and limits of the commands.
+
+    Attributes:
+        cause: Why the arm was stopped, or ''.
+        command: Last command that left, or None.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        """Guard `robot`; the owner may change `settings` at any time."""
+        self._robot, self._settings = robot, settings
+        self.cause = ''
+        self.command: Command | None = None
+        self._held = 0.0
+        self._readings: deque[Array] = deque(maxlen=3)
+        postures = robot.random_postures(200, np.random.default_rng(0))
+        longest = robot.routes.relative_lengths(postures).max(axis=0)
+        self._longest: Array = longest + LENGTH_MARGIN
+
+    def stop(self, cause: str) -> None:
+        """Latch a stop; the first cause is kept."""
+        if not self.cause:
+            self.cause, self._held = cause, 0.0
+
+    def reset(self) -> None:
+        """Clear the stop."""
+        self.cause = ''
+
+    def step(
+        self, wished: Command | None, muscles: Muscles, limit: Array, dt: float, fresh: bool = True
+    ) -> Command | None:
+        """Return the command that may leave, or None if nothing was ever commanded.
+
+        Args:
+            wished: What control wants; None to keep the last command.
+            muscles: The last muscle_states that came.
+            limit: Tension limit of each muscle [N], shape (M,).
+            dt: Time since the step before [s].
+            fresh: Whether `muscles` still says where the muscles are.
+        """
+        if not self._readings or muscles.length is not self._readings[-1]:
+            self._readings.append(muscles.length)
+        if not self.cause:
+            wished = wished or self.command
+            if wished is None:
+                return None
+            limited = self._limited(wished, muscles, limit, dt)
+            if np.isfinite(limited.value).all():
+                self.command = limited
+                return limited
+            self.stop('the computed command is not finite')
+        if self.command is not None:
+            self.command = self._released(self.command, muscles, dt, fresh)
+        return self.command
+
+    def _rate(self, kind: str) -> float:
+        rate = self._settings.rate_limit
+        return rate if kind == LENGTH else rate * self._robot.stiffness
+
+    def _limited(self, wished: Command, muscles: Muscles, limit: Array, dt: float) -> Command:
+        kind, robot = wished.kind, self._robot
+        before = self.command
+        if before is None or before.kind != kind:
+            before = unchanging(robot, kind, muscles)
+            if kind == LENGTH:
+                before = Command(kind, np.minimum(before.value, self._longest))
+        change = self._rate(kind) * dt
+        value = before.value + np.clip(wished.value - before.value, -change, change)
+        if kind == TENSION:
+            return Command(kind, np.clip(value, robot.tension.bias, limit))
+        length = np.minimum(np.median(self._readings, axis=0), self._longest)
+        shortest = length - (limit - robot.tension.bias) / robot.stiffness
+        return Command(kind, np.maximum(value, shortest))
+
+    def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
+        self._held += dt
+        if self._held <= self._settings.hold_time:
+            return command
+        kind, value = command
+        change = self._rate(kind) * dt
+        if kind == TENSION:
+            bias = self._robot.tension.bias
+            return Command(kind, np.maximum(bias, value - change))
+        # At the measured length MSC pulls with T_bias only; where that is not known, out to the
+        # longest the muscle can be.
+        end = muscles.length if fresh else np.maximum(muscles.length, self._longest)
+        return Command(kind, np.minimum(value + change, np.maximum(end, value)))

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint torque by muscle tension: the method `tension`.
+
+    τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
+    T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
+
+with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the estimate,
+smoothed. With both gains zero the arm's weight is carried and `effort` is exerted, nothing more:
+such an arm floats and keeps no posture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import Exertion, least_tension
+
+SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
+
+
+class TorqueControl:
+    """Tensions for a torque, moment by moment.
+
+    Attributes:
+        missing_torque: What the tensions of the last step do not deliver [N·m], shape (D,).
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        """Control `robot`; the owner may change `settings` at any time."""
+        self._robot, self._settings = robot, settings
+        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self.start_from(np.full(robot.muscle_count, robot.tension.bias))
+
+    def start_from(self, tension: Array) -> None:
+        """Continue from tensions [N] (M,), at the start, after a stop or another method."""
+        self._command: Array = np.maximum(tension, self._robot.tension.bias)
+        self._smooth: Array | None = None
+
+    def step(
+        self, mae: Mae, theta: Array, target: Array, effort: Array, limit: Array, dt: float
+    ) -> Array:
+        """Return the tensions to command [N], shape (M,).
+
+        Args:
+            mae: The network.
+            theta: Estimated posture [rad], shape (D,).
+            target: θ_target [rad], shape (D,).
+            effort: Torque beyond holding the weight [N·m], shape (D,).
+            limit: Highest tension of each muscle [N], shape (M,).
+            dt: Time since the step before [s].
+        """
+        before = theta if self._smooth is None else self._smooth
+        smooth = before + dt / (dt + SMOOTHING) * (theta - before)
+        self._smooth = smooth
+        velocity = (theta - smooth) / SMOOTHING
+        chosen = self._settings
+        torque = self._robot.kinematics.holding_torque(smooth) + effort
+        torque = torque + chosen.position_gain * (target - smooth)
+        torque = torque - chosen.velocity_gain * velocity
+        found = self.exertion(mae, smooth, torque, self._command, limit)
+        self.missing_torque = found.missing_torque
+        # All muscles change by the same share: between two tensions that hold the arm, it is held.
+        change = found.tension - self._command
+        fastest = self._robot.stiffness * chosen.rate_limit * dt
+        self._command = self._command + change * min(
+            1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9)
+        )
+        return self._command.copy()
+
+    def exertion(
+        self, mae: Mae, theta: Array, torque: Array, tension: Array, limit: Array
+    ) -> Exertion:
+        """Return the tensions for a torque τ [N·m] (D,) at (θ, T)."""
+        jacobian = mae.muscle_jacobian(theta, tension)
+        return least_tension(jacobian, torque, self._robot.tension.bias, limit)

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Notice that the body is not the one the network knows, and say which muscle it is.
+
+    A = ‖T_est − T‖₂ + ‖l_est − l‖₂          scaled units (paper, section "State Estimation")
+    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),  e = (T_est − T, l_est − l)
+
+A is published as it is. Its healthy size differs from posture to posture, so the decision rests on
+d, in which every muscle's residual is measured in units of its healthy spread (detector printed in
+arXiv 2407.08050). Healthy statistics come from the real arm; those of the geometric model would
+call most healthy postures anomalous, so without calibrated ones nothing is latched from d.
+
+Physics needs no statistics: a module holds at least T_bias, so a muscle whose tension stays near
+zero while much is commanded has no wire.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.mae import Mae, State
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE
+from musculoskeletal_ae.robot.robot import Robot
+
+#: Name of the distance threshold among the thresholds of the checkpoint.
+DISTANCE = 'distance'
+
+IN_A_ROW = 5  # messages beyond the threshold that make a decision
+DEAD_SHARE = 0.2  # of the demanded tension; less counts as no tension at all
+DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
+
+
+class Verdict(NamedTuple):
+    """What one message says.
+
+    Attributes:
+        anomaly: A, scaled units.
+        distance: d, in healthy standard deviations; NaN without statistics.
+        suspect: Index of the most suspect muscle.
+        cause: Why this message completes a detection, or ''.
+    """
+
+    anomaly: float
+    distance: float
+    suspect: int
+    cause: str
+
+
+class AnomalyDetector:
+    """Decides message by message; keeps only its counters. The caller latches.
+
+    Attributes:
+        threshold: A beyond which an anomaly is detected, 0 for the calibrated detector.
+    """
+
+    def __init__(self, robot: Robot, threshold: float = 0.0) -> None:
+        """Watch `robot`."""
+        self._robot = robot
+        self.threshold = threshold
+        self._statistics: AnomalyStatistics | None = None
+        self._whiten: Array | None = None
+        self._demand: Array | None = None
+        self._command: Array | None = None
+        self._torn = np.zeros(robot.muscle_count)
+        self._beyond = 0
+
+    def use(self, mae: Mae) -> None:
+        """Take the healthy statistics of a checkpoint."""
+        whiten = None
+        if mae.anomaly is not None:
+            whiten = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
+            self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
+        self._statistics, self._whiten = mae.anomaly, whiten
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the checkpoint's statistics come from the real arm."""
+        return self._statistics is not None and self._statistics.calibrated
+
+    def reset(self) -> None:
+        """Forget counts, as after a jump of the clock or a reset by the user."""
+        self._torn[:] = 0.0
+        self._beyond = 0
+
+    def commanded_length(self, length: Array | None) -> None:
+        """Note the target lengths [m] (M,) that the modules follow; None when they follow none."""
+        self._command, self._demand = length, None
+
+    def commanded_tension(self, tension: Array) -> None:
+        """Note the target tensions [N] (M,) that the modules follow."""
+        self._command, self._demand = None, tension
+
+    def step(self, state: State, tension: Array, length: Array, dt: float) -> Verdict:
+        """Judge one message.
+
+        Args:
+            state: (θ, T, l) restored from it by ②.
+            tension: Measured [N], shape (M,).
+            length: Measured [m], shape (M,).
+            dt: Time since the message before [s].
+        """
+        tension_error = TENSION_SCALE * (state.tension - tension)
+        length_error = LENGTH_SCALE * (state.length - length)
+        anomaly = float(np.sqrt(tension_error @ tension_error))
+        anomaly += float(np.sqrt(length_error @ length_error))
+        error = np.concatenate([tension_error, length_error])
+        distance = float('nan')
+        share = error
+        if self._statistics is not None and self._whiten is not None:
+            centred = error - self._statistics.mean
+            white = self._whiten @ centred
+            distance = float(np.sqrt(white @ white))
+            share = centred / self._spread
+        muscles = len(tension)
+        score = share[:muscles] ** 2 + share[muscles:] ** 2
+        dead = self._dead(tension, length, dt)
+        # A muscle without tension is the one, whatever the others' residuals make of it.
+        slack = tension < DEAD_SHARE * self._robot.tension.bias
+        suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
+        if dead is not None:
+            return Verdict(anomaly, distance, dead, 'no tension where the command demands it')
+        return Verdict(anomaly, distance, suspect, self._beyond_threshold(anomaly, distance))
+
+    def _beyond_threshold(self, anomaly: float, distance: float) -> str:
+        limit, value, what = self.threshold, anomaly, 'A'
+        if self.threshold <= 0.0:
+            if self._statistics is None or not self._statistics.calibrated:
+                return ''
+            limit = self._statistics.thresholds.get(DISTANCE, np.inf)
+            value, what = distance, 'd'
+        self._beyond = self._beyond + 1 if value > limit else 0
+        if self._beyond < IN_A_ROW:
+            return ''
+        return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running'
+
+    def _dead(self, tension: Array, length: Array, dt: float) -> int | None:
+        bias = self._robot.tension.bias
+        if self._command is not None:
+            pulled = self._robot.stiffness * (length - self._command)
+            demand = bias + np.maximum(0.0, pulled)
+        elif self._demand is not None:
+            demand = self._demand
+        else:
+            self._torn[:] = 0.0
+            return None
+        torn = (tension < DEAD_SHARE * demand) & (demand >= bias)
+        self._torn = np.where(torn, self._torn + dt, 0.0)
+        worst = int(np.argmax(self._torn))
+        return worst if self._torn[worst] >= DEAD_TIME else None

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The learned body as a simulator."""

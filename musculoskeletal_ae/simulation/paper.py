@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of N simulated arms, preset `paper`: descent as printed (section "Simulation").
+
+    z = ②(T_sim, l_sim),  L_sim,1 = w₄‖T‖ + w₅‖l − l_sim‖ + w₆‖τ_target + Gᵀ(θ_sim, T_sim) T‖
+    z = ③(θ_sim, l_sim),  L_sim,2 = w₄‖T‖ + w₅‖l − l_sim‖ + w₇‖θ − θ_fix‖   where joints are forced
+    (θ_sim, T_sim) ← f_decode(z) after the descent
+
+The paper leaves open what l_sim is. Here it is what the modules make of the command: the length at
+which MSC carries T_sim, l_sim = l_target − l_comp(T_sim); a muscle that MSC holds at T_bias may be
+shorter. τ_target = g(θ_sim) − JᵀF. The result is clipped to what joints and modules can do, which
+the print does not say; without it nothing bounds the iteration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.length import msc_compensation
+from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
+from musculoskeletal_ae.simulation.load import Load
+
+TENSION_WEIGHT, LENGTH_WEIGHT, TORQUE_WEIGHT, POSTURE_WEIGHT = 0.1, 1.0, 0.001, 1.0  # w₄ … w₇
+SEARCH = StepSearch(largest_step=0.2, candidates=10, epochs=3)
+
+
+class PaperDescent:
+    """The descent above for one robot and one network; arguments as for `QuasiStatics`."""
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        """Take a robot and a network."""
+        self._robot, self._mae, self._load = robot, mae, Load(robot.kinematics)
+
+    def step(
+        self,
+        state: ArmState,
+        command: Array,
+        h: float,  # noqa: ARG002 (the print knows no time: one step is one descent)
+        wrench: Array | None = None,
+        fixed: Array | None = None,
+    ) -> ArmState:
+        """Return the arms after one descent each."""
+        bias = self._robot.tension.bias
+        load, _ = self._load(state.theta, wrench)
+        length = command - msc_compensation(self._robot, np.maximum(state.tension, bias))
+        slack = (state.tension <= bias) | (command == PAID_OUT)
+        length = np.where(slack, np.minimum(length, state.length), length)
+        # A bound that no command in its senses meets: no muscle is wound in by its whole length.
+        whole = self._robot.routes.length_at_zero
+        length = np.clip(length, -whole, whole)
+        rows = [
+            self._descend(
+                state.theta[i],
+                state.tension[i],
+                length[i],
+                load[i],
+                None if fixed is None or np.isnan(fixed[i]).all() else fixed[i],
+            )
+            for i in range(len(length))
+        ]
+        theta, tension, reached = (np.stack(part) for part in zip(*rows, strict=True))
+        return ArmState(theta, tension, reached, command, np.zeros_like(theta))
+
+    def _descend(
+        self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array | None
+    ) -> tuple[Array, Array, Array]:
+        robot, mae = self._robot, self._mae
+        joints, muscles = robot.joint_count, robot.muscle_count
+        row = np.eye(joints + 2 * muscles)
+        pull, wind = row[joints : joints + muscles], row[joints + muscles :]
+        terms = [
+            Term(TENSION_WEIGHT, pull, np.zeros(muscles)),
+            Term(LENGTH_WEIGHT, wind, LENGTH_SCALE * length),
+        ]
+        if fixed is None:
+            jacobian = mae.muscle_jacobian_difference(theta, tension)
+            terms.append(Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque))
+            z = mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length)
+        else:
+            given = np.flatnonzero(np.isfinite(fixed))
+            terms.append(Term(POSTURE_WEIGHT, row[given], fixed[given]))
+            z = mae.encode(Mask.THETA_LENGTH, theta=theta, length=length)
+        state = mae.decode(descend(mae, z, terms, SEARCH))
+        return (
+            np.clip(state.theta, robot.lower, robot.upper),
+            np.clip(state.tension, robot.tension.bias, robot.tension.max),
+            state.length,
+        )

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The learnt body as a simulator: joint angles and muscle tensions from commanded lengths.
+
+(Paper, section "Simulation Using Musculoskeletal AutoEncoder".) The simulated arms follow the same
+muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
+l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
+command rests at T_bias. One arm or thousands are the same array operations; `sim_step` has the
+equations of preset `default`, `sim_paper` the printed descent.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState, QuasiStatics
+from musculoskeletal_ae.simulation.paper import PaperDescent
+from musculoskeletal_ae.simulation.threads import on_all_cores
+
+LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
+#: arms whose arrays fit into a core's cache together
+CHUNK = 256
+SETTLING_STEP, SETTLING_STEPS = 0.1, 300  # [s], for `settle`
+SETTLED = 1e-6  # [rad] moved in a step
+
+# Below these a stop or a module at its end does not count as a limit reached.
+STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
+
+
+class Simulation:
+    """N simulated arms of one robot.
+
+    Attributes:
+        state: The arms now; assign it to go back to a state kept before.
+        command: l_target [m], shape (N, M).
+        wrench: On the end effectors, axes of the root link [N, N·m], shape (N, 6).
+        fixed: Angles joints are forced to [rad], shape (N, D); nan for a free joint.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae, preset: str = 'default', arms: int = 1) -> None:
+        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
+
+        Args:
+            robot: For masses, limits, K_stiff and T_bias.
+            mae: The learnt body.
+            preset: 'default' or 'paper'.
+            arms: N.
+        """
+        self.robot, self.preset = robot, preset
+        self.command: Array = np.full((arms, robot.muscle_count), PAID_OUT)
+        self.wrench: Array = np.zeros((arms, 6))
+        self.fixed: Array = np.full((arms, robot.joint_count), np.nan)
+        self.use(mae)
+        self.start_from(np.zeros((arms, robot.joint_count)))
+
+    def use(self, mae: Mae) -> None:
+        """Take a new network; the arms move on to its equilibrium from where they are."""
+        self._mae = mae
+        kind = PaperDescent if self.preset == 'paper' else QuasiStatics
+        self._body: PaperDescent | QuasiStatics = kind(self.robot, mae)
+
+    def start_from(self, theta: Array) -> None:
+        """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten."""
+        robot = self.robot
+        theta = np.clip(theta, robot.lower, robot.upper)
+        tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
+        self.command = np.full_like(tension, PAID_OUT)
+        length = self._mae.lengths(theta, tension)
+        self.state = ArmState(theta, tension, length, length, np.zeros_like(theta))
+
+    def step(self, dt: float) -> ArmState:
+        """Let time pass [s]; return the arms."""
+        substeps = max(1, int(np.ceil(dt / LONGEST_STEP - 1e-9)))
+        for _ in range(substeps):
+            self._advance(dt / substeps)
+        return self.state
+
+    def settle(self) -> ArmState:
+        """Go on to the equilibrium of the command, in long steps; return the arms.
+
+        Arms that find none within SETTLING_STEPS are returned as they are then.
+        """
+        for _ in range(SETTLING_STEPS):
+            before = self.state
+            self._advance(SETTLING_STEP)
+            moved = np.abs(self.state.theta - before.theta).max()
+            if max(moved, 1e-3 * np.abs(self.state.tension - before.tension).max()) < SETTLED:
+                break
+        return self.state
+
+    def limits(self, arm: int = 0) -> list[str]:
+        """Return the joints and muscles of one arm that are at the end of what they can do."""
+        robot, state = self.robot, self.state
+        stopped = np.abs(state.holding[arm]) > STOP_TORQUE
+        stopped &= np.isnan(self.fixed[arm])
+        forced = self.fixed[arm]
+        stopped |= (forced < robot.lower) | (forced > robot.upper)
+        full = state.tension[arm] > robot.tension.max - TENSION_MARGIN
+        return [robot.joints[i] for i in np.flatnonzero(stopped)] + [
+            robot.muscles[i] for i in np.flatnonzero(full)
+        ]
+
+    def _advance(self, h: float) -> None:
+        count = len(self.command)
+        wrench = self.wrench if self.wrench.any() else None
+        fixed = self.fixed if np.isfinite(self.fixed).any() else None
+        if count <= CHUNK:
+            self.state = self._body.step(self.state, self.command, h, wrench, fixed)
+            return
+
+        def advance(start: int) -> ArmState:
+            rows = slice(start, start + CHUNK)
+            return self._body.step(
+                ArmState(*(part[rows] for part in self.state)),
+                self.command[rows],
+                h,
+                None if wrench is None else wrench[rows],
+                None if fixed is None else fixed[rows],
+            )
+
+        parts = on_all_cores(advance, range(0, count, CHUNK))
+        self.state = ArmState(*(np.concatenate(part) for part in zip(*parts, strict=True)))

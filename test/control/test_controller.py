@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Control as a whole, without an arm: sensor data is made up, time is counted by the test."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from exact_mae import ExactMae, rest_readings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.report import control_report
+from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
+from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+DT = 0.01
+REST = np.array([-0.3, -1.0])
+OTHER = np.array([0.1, -0.5])
+
+
+class Bench:
+    """A controller that is fed healthy sensor data unless told otherwise."""
+
+    def __init__(self, mae=None, **chosen):
+        self.settings = Settings(**chosen)
+        self.core = Controller(ROBOT, self.settings)
+        self.mae = mae or ExactMae(ROBOT)
+        self.core.use(self.mae)
+        self.now, self.theta, self.tension = 100.0, REST, None
+        self.blind = set()
+
+    def step(self, count=1):
+        """Return the commands of some steps."""
+        sent = []
+        for _ in range(count):
+            self.now += DT
+            if 'muscles' not in self.blind:
+                self.core.muscles(
+                    Muscles(*rest_readings(ROBOT, self.theta, self.tension)), self.now
+                )
+            if 'estimate' not in self.blind:
+                self.core.estimated(self.theta, self.now)
+            sent.append(self.core.step(self.now))
+        return sent
+
+    def target(self, theta, effort=(0.0, 0.0)):
+        self.core.target(dict(zip(ROBOT.joints, zip(theta, effort))))
+
+    def report(self):
+        return control_report(ROBOT, self.core, self.now)
+
+
+def values(commands):
+    return np.array([command.value for command in commands])
+
+
+EVENTS = {
+    'target': lambda bench: bench.target(OTHER),
+    'back': lambda bench: bench.target(REST, (0.5, -0.2)),
+    'explore': lambda bench: bench.core.explore(True),
+    'end': lambda bench: bench.core.explore(False),
+    'stop': lambda bench: bench.core.stop('asked'),
+    'reset': lambda bench: bench.core.reset(bench.now),
+    'swap': lambda bench: bench.core.use(shifted()),
+    'moved': lambda bench: setattr(bench, 'theta', REST + 0.1),
+    **{
+        name: lambda bench, name=name: setattr(bench.settings, 'method', name)
+        for name in METHODS
+        if name != 'tension'
+    },
+}
+
+
+def shifted():
+    mae = ExactMae(ROBOT)
+    mae.offset = 0.01
+    return mae
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 150)), max_size=8))
+def test_whatever_happens_lengths_are_finite_and_never_faster_than_the_rate_limit(events):
+    bench = Bench(first_duration=1.0, second_duration=0.5)
+    bench.target(REST)
+    sent = bench.step()
+    for name, steps in events:
+        EVENTS[name](bench)
+        sent += bench.step(steps)
+    lengths = values(sent)
+    assert np.isfinite(lengths).all()
+    if len(lengths) > 1:
+        assert np.abs(np.diff(lengths, axis=0)).max() <= bench.settings.rate_limit * DT + 1e-9
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_every_method_arrives_at_its_command_and_stays_there(method):
+    bench = Bench(method=method, first_duration=1.0, second_duration=0.5)
+    bench.target(REST)
+    sent = bench.step(400)
+    kind = TENSION if method == 'tension' else LENGTH
+    assert {command.kind for command in sent} == {kind}
+    np.testing.assert_allclose(sent[-1].value, sent[-2].value, atol=1e-6 if kind == LENGTH else 0.1)
+    assert bench.report().message == 'holding'
+
+
+def test_the_first_command_pulls_as_the_muscles_do_at_that_moment():
+    bench = Bench()
+    bench.tension = np.linspace(35.0, 90.0, ROBOT.muscle_count)
+    bench.target(OTHER)
+    first = bench.step()[0].value
+    length = ROBOT.muscle_lengths(REST, bench.tension)
+    np.testing.assert_allclose(first, length - (bench.tension - 30.0) / ROBOT.stiffness, atol=1e-4)
+
+
+def test_second_runs_after_first_and_reads_the_tension_once():
+    bench = Bench(method='second', first_duration=1.0, second_duration=0.5)
+    bench.target(REST)
+    bench.step(95)
+    bench.tension = np.full(ROBOT.muscle_count, 80.0)
+    done = bench.step(200)[-1].value
+    wanted = ROBOT.muscle_lengths(REST, bench.tension) - 50.0 / ROBOT.stiffness
+    np.testing.assert_allclose(done, wanted, atol=1e-9)
+    # A new network solves the held goal anew, with the tension that was read.
+    bench.tension = np.full(ROBOT.muscle_count, 150.0)
+    bench.core.use(shifted())
+    np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
+
+
+def test_constant_tension_is_that_of_first():
+    bench = Bench(method='first', first_duration=1.0, constant_tension=70.0)
+    bench.target(REST)
+    wanted = ROBOT.muscle_lengths(REST, np.full(ROBOT.muscle_count, 70.0)) - 40.0 / ROBOT.stiffness
+    np.testing.assert_allclose(bench.step(200)[-1].value, wanted, atol=1e-9)
+
+
+def test_going_over_to_tensions_and_back_changes_no_pull_by_a_step():
+    bench = Bench(first_duration=1.0)
+    bench.tension = np.linspace(40.0, 80.0, ROBOT.muscle_count)
+    bench.target(REST)
+    bench.step(200)
+    bench.settings.method = 'tension'
+    first = bench.step()[0]
+    assert first.kind == TENSION
+    most = ROBOT.stiffness * bench.settings.rate_limit * DT
+    assert np.abs(first.value - bench.tension).max() <= most + 1e-9
+    bench.settings.method = 'proposed'
+    first = bench.step()[0]
+    pull = 30.0 + ROBOT.stiffness * (ROBOT.muscle_lengths(REST, bench.tension) - first.value)
+    np.testing.assert_allclose(pull, bench.tension, atol=most)
+
+
+def test_effort_is_exerted_by_proposed_and_said_to_be_ignored_where_it_is():
+    bench = Bench(first_duration=1.0)
+    bench.target(REST)
+    plain = bench.step(200)[-1].value
+    bench.target(REST, (1.0, 0.0))
+    assert np.abs(bench.step(200)[-1].value - plain).max() > 1e-4
+    bench.settings.method = 'first'
+    bench.step()
+    assert 'exerts no effort' in bench.report().message
+
+
+def test_a_target_beyond_the_limits_is_clamped_and_said_and_a_subset_keeps_the_others():
+    bench = Bench()
+    bench.target([-0.2, -0.7])
+    bench.core.target({ROBOT.joints[1]: (-9.0, 0.0)})
+    np.testing.assert_array_equal(bench.core.posture.theta, [-0.2, ROBOT.lower[1]])
+    bench.step()
+    assert bench.report().values['target clamped at'] == ROBOT.joints[1]
+    bench.core.target({ROBOT.joints[1]: (-1.0, 0.0)})
+    assert 'target clamped at' not in bench.report().values
+
+
+@pytest.mark.parametrize('what', ['muscles', 'estimate'])
+def test_old_sensor_data_stops_it_and_reset_is_refused_while_it_lasts(what):
+    bench = Bench(max_age=0.2)
+    bench.target(REST)
+    bench.step(50)
+    bench.blind = {what}
+    bench.step(15)
+    assert not bench.core.safety.cause
+    assert None not in bench.step(10)  # keeps commanding
+    assert 'older than 0.2 s' in bench.core.safety.cause
+    assert 'older than' in bench.core.reset(bench.now)
+    bench.blind = set()
+    bench.step(2)
+    assert bench.core.safety.cause
+    assert bench.core.reset(bench.now) == ''
+    assert not bench.core.safety.cause
+
+
+def test_an_anomaly_stops_it_even_before_the_first_command():
+    bench = Bench()
+    bench.core.anomaly(True)
+    bench.target(REST)
+    assert bench.step(3) == [None] * 3
+    bench.core.anomaly(False)
+    assert bench.step(3) == [None] * 3
+    assert bench.core.reset(bench.now) == ''
+    assert None not in bench.step(3)
+
+
+@pytest.mark.parametrize('fault', [ValueError('broken'), ZeroDivisionError(), MemoryError()])
+def test_a_fault_of_its_own_stops_it_and_it_lives_on(fault):
+    mae = ExactMae(ROBOT)
+    bench = Bench(mae, first_duration=0.5)
+    bench.target(REST)
+    bench.step(100)
+    mae.fail = fault
+    bench.target(OTHER)
+    assert None not in bench.step(100)
+    assert type(fault).__name__ in bench.core.safety.cause
+    mae.fail = None
+    assert bench.core.reset(bench.now) == ''
+    np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
+    bench.step(300)
+    assert bench.report().message == 'holding'
+
+
+def test_a_network_that_says_nan_stops_it_and_no_nan_leaves():
+    bench = Bench(first_duration=0.5)
+    bench.target(REST)
+    bench.step(100)
+    broken = ExactMae(ROBOT)
+    broken.offset = np.nan
+    bench.core.use(broken)
+    assert np.isfinite(values(bench.step(100))).all()
+    assert bench.core.safety.cause
+    bench.core.use(ExactMae(ROBOT))
+    assert bench.core.reset(bench.now) == ''
+    bench.step(300)
+    assert not bench.core.safety.cause
+
+
+def test_after_reset_the_last_target_is_resumed_by_a_ramp():
+    bench = Bench(first_duration=1.0, feedback_gain=0.0)
+    bench.target(OTHER)
+    goal = bench.step(300)[-1].value
+    bench.core.stop('asked')
+    bench.step(300)
+    assert bench.core.reset(bench.now) == ''
+    np.testing.assert_allclose(bench.step(300)[-1].value, goal, atol=1e-9)
+
+
+def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
+    bench = Bench()
+    assert bench.core.explore(True) == ''
+    bench.step(10)
+    assert bench.report().message == 'exploring'
+    bench.target(REST)
+    assert not bench.core.posture.exploring
+    bench.core.explore(True)
+    bench.core.stop('asked')
+    assert not bench.core.posture.exploring
+    assert 'asked' in bench.core.explore(True)
+    assert bench.core.reset(bench.now) == ''
+    assert bench.core.posture.theta is None  # exploration is not resumed
+
+
+def test_exploration_goes_on_with_its_stream_instead_of_repeating_it():
+    bench = Bench()
+    seen = []
+    for _ in range(3):
+        bench.core.explore(True)
+        bench.core.explore(True)  # asking twice starts nothing anew
+        bench.step(5)
+        seen.append(bench.core.posture.theta)
+        bench.core.explore(False)
+        bench.step(5)
+    assert len({tuple(theta) for theta in seen}) == 3
+
+
+def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
+    bench = Bench()
+    with pytest.raises(MessageError, match='no posture yet'):
+        bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
+    bench.step()
+    bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
+    np.testing.assert_allclose(bench.core.posture.theta, [0.1, REST[1]])
+
+
+def test_heat_moves_the_load_to_other_muscles_and_is_said():
+    robot = Robot.load('musashi_left_arm')
+    theta = np.array([0.2, -0.6, 0.1, -1.2, 0.0])
+    core = Controller(robot, Settings(first_duration=1.0))
+    core.use(ExactMae(robot))
+    core.target(dict(zip(robot.joints, ((v, 0.0) for v in theta))))
+    length, tension, temperature = rest_readings(robot, theta)
+    planned = []
+    for step in range(1200):
+        if step == 300:
+            strongest = int(np.argmax(core.posture.solution.tension))
+            temperature[strongest] = 84.0
+        core.muscles(Muscles(length, tension, temperature), 0.01 * step)
+        core.estimated(theta, 0.01 * step)
+        core.step(0.01 * step)
+        planned.append(core.posture.solution.tension if core.posture.solution else None)
+    limit = core.limit[strongest]
+    assert limit < planned[299][strongest]
+    assert planned[-1][strongest] <= limit + 1e-6
+    said = control_report(robot, core, 12.0)
+    assert said.level == 'warn'
+    assert robot.muscles[strongest] in said.values['tension limited by heat']
+
+
+def test_the_correction_is_bounded_and_waits_until_the_arm_rests():
+    bench = Bench(first_duration=1.0, feedback_gain=2.0)
+    bench.target(OTHER)  # the made-up arm never moves there
+    moving = bench.step(60)
+    assert not bench.core.posture.feedback.correction.any()
+    assert np.abs(np.diff(values(moving), axis=0)).max() > 0.0
+    bench.step(2000)
+    assert np.abs(bench.core.posture.feedback.correction).max() == pytest.approx(0.3)
+    bench.target(REST)
+    bench.step(10)
+    assert not bench.core.posture.feedback.correction.any()
+
+
+def test_a_new_network_keeps_the_correction_so_that_the_arm_does_not_sway():
+    bench = Bench(first_duration=0.5)
+    bench.target(OTHER)
+    before = bench.step(1500)[-1].value
+    bench.settings.feedback_gain = 0.0
+    bench.core.use(ExactMae(ROBOT))
+    np.testing.assert_allclose(values(bench.step(300)), before[None].repeat(300, 0), atol=1e-9)
+
+
+@pytest.mark.parametrize('chosen', [{'method': 'stiffness'}, {'method': 'second'}])
+def test_a_push_is_not_worked_against_where_stiffness_or_the_paper_rules(chosen):
+    bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
+    bench.target(REST)
+    still = bench.step(400)[-1].value
+    bench.theta = REST + 0.1
+    bench.core.estimated(bench.theta, bench.now)
+    np.testing.assert_allclose(bench.step(300)[-1].value, still, atol=1e-9)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What control does while the arm rests: it corrects the posture and sheds needless tension."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.control.feedback import CORRECTION, DEADBAND, RELIEF, SETTLING, RestFeedback
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
+
+DT = 0.01
+GAIN = 0.5
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('arm26')
+
+
+def rested(robot):
+    feedback = RestFeedback(robot)
+    while not step(feedback, robot, np.zeros(robot.joint_count), holding(robot)):
+        pass
+    return feedback
+
+
+def jacobian(robot):
+    return robot.routes.muscle_jacobian(0.5 * (robot.lower + robot.upper))
+
+
+def holding(robot, wish=0.0):
+    torque = robot.kinematics.holding_torque(0.5 * (robot.lower + robot.upper))
+    return holding_tension(jacobian(robot), torque, robot.tension.bias, robot.tension.limit, wish)
+
+
+def step(feedback, robot, error, tension, gain=GAIN):
+    limit = np.full(robot.muscle_count, robot.tension.limit)
+    return feedback.step(error, jacobian(robot), tension, limit, gain, DT)
+
+
+def test_it_waits_until_the_arm_has_settled(robot):
+    feedback = RestFeedback(robot)
+    error = np.full(robot.joint_count, 0.1)
+    steps = 1
+    while not step(feedback, robot, error, holding(robot)):
+        assert not feedback.correction.any()
+        steps += 1
+    assert steps * DT == pytest.approx(SETTLING, abs=2 * DT)
+
+
+def test_least_tension_is_left_alone(robot):
+    feedback = rested(robot)
+    step(feedback, robot, np.zeros(robot.joint_count), holding(robot))
+    assert feedback.relief == pytest.approx(np.zeros(robot.muscle_count), abs=1e-9)
+
+
+def test_relief_pays_out_what_pulls_against_each_other_and_exerts_no_torque(robot):
+    feedback = rested(robot)
+    needless = holding(robot, wish=90.0)
+    before = feedback.relief
+    step(feedback, robot, np.zeros(robot.joint_count), needless)
+    change = feedback.relief - before
+    expected = GAIN * DT * (needless - holding(robot)) / robot.stiffness
+    assert change == pytest.approx(expected, abs=1e-9)
+    assert jacobian(robot).T @ change == pytest.approx(np.zeros(robot.joint_count), abs=1e-9)
+    assert change @ needless > 0.0
+
+
+def test_both_are_bounded(robot):
+    feedback = rested(robot)
+    error = np.full(robot.joint_count, 1.0)
+    for _ in range(3000):
+        step(feedback, robot, error, holding(robot, wish=150.0))
+    assert np.abs(feedback.correction).max() == pytest.approx(CORRECTION)
+    assert np.abs(feedback.relief).max() == pytest.approx(RELIEF)
+    feedback.reset()
+    assert not feedback.correction.any()
+    assert not feedback.relief.any()
+
+
+def test_errors_within_the_estimates_own_are_left_alone(robot):
+    feedback = rested(robot)
+    error = np.full(robot.joint_count, 0.9 * DEADBAND)
+    step(feedback, robot, error, holding(robot))
+    assert not feedback.correction.any()
+    step(feedback, robot, 2.0 * error, holding(robot))
+    assert feedback.correction == pytest.approx(GAIN * DT * 2.0 * error)
+
+
+def test_without_gain_nothing_is_corrected(robot):
+    feedback = RestFeedback(robot)
+    for _ in range(200):
+        assert not step(feedback, robot, np.ones(robot.joint_count), holding(robot), gain=0.0)
+    assert not feedback.correction.any()

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What leaves is never faster, stronger or less finite than allowed, whatever control wishes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.control.safety import (
+    COOLING_BAND,
+    LENGTH,
+    LENGTH_MARGIN,
+    TENSION,
+    Command,
+    Muscles,
+    SafetyFilter,
+    thermal_limit,
+    unchanging,
+)
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias, ROBOT.tension.max
+COLD = np.full(COUNT, 25.0)
+LIMIT = np.full(COUNT, MAX)
+DT = 0.01
+
+
+def muscles(length=0.0, tension=BIAS):
+    return Muscles(np.full(COUNT, length), np.full(COUNT, tension), COLD)
+
+
+def vectors(low, high):
+    return st.lists(st.floats(low, high), min_size=COUNT, max_size=COUNT).map(np.array)
+
+
+@given(
+    st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
+    st.floats(0.001, 1.0),
+)
+def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_the_limit(
+    wishes, rate
+):
+    guard, before = SafetyFilter(ROBOT, Settings(rate_limit=rate)), None
+    for wish, length, limit in wishes:
+        # What two readings of three say is believed.
+        for _ in range(2):
+            now = Muscles(length.copy(), np.full(COUNT, BIAS), COLD)
+            sent = guard.step(Command(LENGTH, wish), now, limit, DT).value
+            if before is None:
+                before = unchanging(ROBOT, LENGTH, now).value
+            assert (sent - before >= -rate * DT - 1e-12).all()
+            last, before = before, sent
+        demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
+        assert (demanded <= limit + 1e-6).all()
+        # Paying out faster is what the tension limit may do, and nothing else.
+        assert ((sent - last)[demanded < limit - 1e-6] <= rate * DT + 1e-12).all()
+
+
+@pytest.mark.parametrize('glitch', [2.0, 1e308, -1e308])
+def test_one_wrong_reading_lets_no_muscle_go(glitch):
+    settings = Settings()
+    guard = SafetyFilter(ROBOT, settings)
+    wish = Command(LENGTH, np.full(COUNT, -0.01))
+    before = [guard.step(wish, muscles(), LIMIT, DT).value for _ in range(30)][-1]
+    for length in (0.0, glitch, 0.0, 0.0):
+        sent = guard.step(wish, muscles(length), LIMIT, DT).value
+        assert np.abs(sent - before).max() <= settings.rate_limit * DT + 1e-12
+        before = sent
+
+
+def test_a_sensor_that_stays_wrong_pays_out_to_the_longest_the_muscle_can_be_at_most():
+    guard = SafetyFilter(ROBOT, Settings())
+    for _ in range(10):
+        sent = guard.step(unchanging(ROBOT, LENGTH, muscles()), muscles(5.0), LIMIT, DT).value
+    theta = ROBOT.random_postures(2000, np.random.default_rng(3))
+    assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
+
+
+@given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))
+def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(wishes):
+    settings = Settings()
+    guard, before = SafetyFilter(ROBOT, settings), np.full(COUNT, BIAS)
+    for wish, limit in wishes:
+        sent = guard.step(Command(TENSION, wish), muscles(), limit, DT).value
+        assert (sent >= BIAS).all()
+        assert (sent <= limit).all()
+        assert (sent - before <= ROBOT.stiffness * settings.rate_limit * DT + 1e-9).all()
+        before = sent
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('kind', [LENGTH, TENSION])
+def test_a_command_that_is_not_finite_stops_the_arm_and_the_last_one_stays(kind, value):
+    guard = SafetyFilter(ROBOT, Settings())
+    good = guard.step(unchanging(ROBOT, kind, muscles()), muscles(), LIMIT, DT)
+    bad = good.value.copy()
+    bad[2] = value
+    sent = guard.step(Command(kind, bad), muscles(), LIMIT, DT)
+    assert np.isfinite(sent.value).all()
+    if np.isnan(value):
+        assert 'not finite' in guard.cause
+        np.testing.assert_array_equal(sent.value, good.value)
+
+
+def test_a_stop_holds_then_pays_out_to_the_measured_length_and_keeps_commanding():
+    settings = Settings(hold_time=0.1, rate_limit=0.1)
+    guard = SafetyFilter(ROBOT, settings)
+    guard.command = Command(LENGTH, np.full(COUNT, -0.012))
+    guard.stop('first')
+    guard.stop('second')
+    assert guard.cause == 'first'
+    sent = [guard.step(None, muscles(), LIMIT, DT).value[0] for _ in range(60)]
+    assert sent[8] == -0.012
+    assert np.diff(sent).max() <= 0.001 + 1e-12
+    assert np.diff(sent).min() >= 0.0
+    assert sent[-1] == 0.0  # MSC pulls with T_bias where command and length are equal
+
+
+def test_without_fresh_lengths_a_stop_pays_out_to_the_longest_the_muscle_can_be():
+    guard = SafetyFilter(ROBOT, Settings(hold_time=0.0))
+    guard.command = Command(LENGTH, np.full(COUNT, -0.05))
+    guard.stop('muscle_states are old')
+    for _ in range(1000):
+        sent = guard.step(None, muscles(-0.05), LIMIT, DT, fresh=False).value
+    theta = ROBOT.random_postures(500, np.random.default_rng(3))
+    assert (sent > ROBOT.routes.relative_lengths(theta).max(axis=0) - 0.01).all()
+
+
+def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
+    guard = SafetyFilter(ROBOT, Settings(hold_time=0.1))
+    guard.command = Command(TENSION, np.full(COUNT, 120.0))
+    guard.stop('asked')
+    sent = [guard.step(None, muscles(), LIMIT, DT).value[0] for _ in range(60)]
+    assert sent[8] == 120.0
+    assert -np.diff(sent).min() <= ROBOT.stiffness * 0.1 * DT + 1e-9
+    assert sent[-1] == BIAS
+
+
+@given(vectors(0.0, MAX), vectors(-0.2, 0.2))
+def test_the_unchanging_command_makes_msc_pull_as_the_muscles_do(tension, length):
+    now = Muscles(length, tension, COLD)
+    sent = unchanging(ROBOT, LENGTH, now).value
+    pull = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
+    np.testing.assert_allclose(pull, np.maximum(tension, BIAS))
+    np.testing.assert_array_equal(unchanging(ROBOT, TENSION, now).value, np.maximum(tension, BIAS))
+
+
+def test_heat_lowers_the_limit_smoothly_from_max_to_bias_and_never_below():
+    temperature = np.linspace(20.0, 120.0, 2001)[:, None]
+    limit = thermal_limit(ROBOT, temperature, 85.0)[:, 0]
+    assert limit[0] == MAX
+    assert (limit[temperature[:, 0] >= 85.0] == BIAS).all()
+    assert (limit[temperature[:, 0] <= 85.0 - COOLING_BAND] == MAX).all()
+    assert (np.diff(limit) <= 0.0).all()
+    assert np.abs(np.diff(limit)).max() <= 1.5 * (MAX - BIAS) / COOLING_BAND * 0.05 + 1e-9

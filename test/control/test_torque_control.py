@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque by tension: exact on an exact image, and honest beyond the muscles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from exact_mae import ExactMae
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.torque import TorqueControl
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('musashi_left_arm')
+MAE = ExactMae(ROBOT)
+THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
+LIMIT = np.full(ROBOT.muscle_count, 200.0)
+DT = 0.01
+
+
+def settled(control, target=THETA, effort=None, theta=THETA, limit=LIMIT):
+    effort = np.zeros(5) if effort is None else effort
+    for _ in range(300):
+        tension = control.step(MAE, theta, target, effort, limit, DT)
+    return tension
+
+
+def torque_of(tension):
+    return -MAE.muscle_jacobian(THETA, tension).T @ tension
+
+
+@settings(max_examples=15)
+@given(st.lists(st.floats(-1.0, 1.0), min_size=5, max_size=5))
+def test_weight_and_effort_appear_at_the_joints(effort):
+    tension = settled(TorqueControl(ROBOT, Settings()), effort=np.array(effort))
+    wanted = ROBOT.kinematics.holding_torque(THETA) + effort
+    np.testing.assert_allclose(torque_of(tension), wanted, atol=0.1 * np.linalg.norm(wanted))
+
+
+def test_with_gains_of_zero_the_target_does_not_matter():
+    control = TorqueControl(ROBOT, Settings(position_gain=0.0, velocity_gain=0.0))
+    tension = settled(control, target=THETA + 0.3)
+    np.testing.assert_allclose(torque_of(tension), ROBOT.kinematics.holding_torque(THETA), atol=0.1)
+
+
+def test_the_gain_pulls_towards_the_target():
+    control = TorqueControl(ROBOT, Settings(position_gain=4.0))
+    offset = np.array([0.1, -0.1, 0.1, 0.1, -0.1])
+    extra = torque_of(settled(control, THETA + offset)) - ROBOT.kinematics.holding_torque(THETA)
+    np.testing.assert_allclose(extra, 4.0 * offset, atol=0.1)
+
+
+def test_tensions_change_by_the_same_share_no_faster_than_the_limit():
+    control = TorqueControl(ROBOT, Settings(rate_limit=0.05))
+    control.start_from(np.full(ROBOT.muscle_count, 150.0))
+    before = np.full(ROBOT.muscle_count, 150.0)
+    for _ in range(50):
+        tension = control.step(MAE, THETA, THETA, np.zeros(5), LIMIT, DT)
+        assert np.abs(tension - before).max() <= ROBOT.stiffness * 0.05 * DT + 1e-9
+        before = tension
+
+
+def test_torque_beyond_the_muscles_is_told():
+    control = TorqueControl(ROBOT, Settings())
+    tension = settled(control, effort=np.array([0.0, 90.0, 0.0, 0.0, 0.0]))
+    assert (tension <= 200.0 + 1e-6).all()
+    assert control.missing_torque[1] == pytest.approx(90.0, abs=60.0)
+    assert control.missing_torque[1] > 10.0

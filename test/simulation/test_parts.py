@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulator stands on: gravity and pushes for many arms, slopes, threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.slopes import Slopes
+from musculoskeletal_ae.simulation.threads import on_all_cores
+
+
+def sliding_tree():
+    """Return a branching tree with a sliding joint, its joints listed in a foreign order."""
+    model = pin.Model()
+    rng = np.random.default_rng(1)
+
+    def add(parent, joint, name, body):
+        place = pin.SE3.Random()
+        index = model.addJoint(parent, joint, place, name)
+        model.lowerPositionLimit[-1], model.upperPositionLimit[-1] = -1.0, 1.0
+        inertia = pin.Inertia(1.0 + rng.uniform(), rng.normal(size=3) * 0.1, np.eye(3) * 0.01)
+        model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
+        model.addBodyFrame(body, index, pin.SE3.Random(), 0)
+        return index
+
+    pin.seed(0)
+    first = add(0, pin.JointModelRZ(), 'a', 'link_a')
+    second = add(first, pin.JointModelPY(), 'b', 'link_b')
+    add(first, pin.JointModelRX(), 'c', 'link_c')
+    add(second, pin.JointModelRY(), 'd', 'hand')
+    return Kinematics(model, ('c', 'a', 'd', 'b'), 'hand')
+
+
+@pytest.fixture(scope='module', params=['musashi_left_arm', 'arm26', 'sliding'])
+def kinematics(request):
+    return sliding_tree() if request.param == 'sliding' else Robot.load(request.param).kinematics
+
+
+def test_load_is_pinocchio_s_gravity_less_the_push(kinematics):
+    rng = np.random.default_rng(0)
+    theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
+    wrench = rng.normal(0.0, 20.0, (20, 6))
+    load, _ = Load(kinematics)(theta, wrench)
+    for i in range(20):
+        jacobian = kinematics.end_effector_jacobian(theta[i])
+        expected = kinematics.holding_torque(theta[i]) - jacobian.T @ wrench[i]
+        np.testing.assert_allclose(load[i], expected, atol=1e-9)
+    alone, _ = Load(kinematics)(theta)
+    np.testing.assert_allclose(alone, kinematics.holding_torque(theta), atol=1e-9)
+
+
+def test_the_slope_of_the_load_is_its_derivative(kinematics):
+    rng = np.random.default_rng(0)
+    theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
+    wrench = np.hstack([rng.normal(0.0, 20.0, (20, 3)), np.zeros((20, 3))])
+    load = Load(kinematics)
+    _, slope = load(theta, wrench)
+    for k, offset in enumerate(1e-6 * np.eye(theta.shape[1])):
+        change = load(theta + offset, wrench)[0] - load(theta - offset, wrench)[0]
+        np.testing.assert_allclose(slope[:, :, k], change / 2e-6, atol=1e-5)
+
+
+class Cubic:
+    """A body whose lengths are cubic in θ, so that the fit can be exact."""
+
+    def lengths(self, theta, tension):  # noqa: ARG002
+        a, b = theta.T
+        return np.stack([a**3 - a * b + 2.0 * b, a * b * b, 1.0 + a, b**2, a * a * b, b], axis=1)
+
+
+def test_slopes_are_the_derivatives_of_the_cubic_they_fit():
+    robot = Robot.load('arm26')
+    theta = robot.random_postures(7, np.random.default_rng(0))
+    tension = np.random.default_rng(1).uniform(30.0, 200.0, (7, 6))
+    jacobian, curvature = Slopes(robot, Cubic())(theta, tension)
+    a, b = theta.T
+    np.testing.assert_allclose(jacobian[:, 0], np.stack([3 * a * a - b, 2.0 - a], 1), atol=1e-8)
+    np.testing.assert_allclose(jacobian[:, 1], np.stack([b * b, 2.0 * a * b], 1), atol=1e-8)
+    expected = tension[:, 0] * 6.0 * a + tension[:, 4] * 2.0 * b
+    np.testing.assert_allclose(curvature[:, 0, 0], expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(curvature, curvature.swapaxes(1, 2), atol=1e-6)
+
+
+def test_pieces_keep_their_order_and_a_fault_in_one_is_told():
+    assert on_all_cores(lambda i: i * i, range(50)) == [i * i for i in range(50)]
+    with pytest.raises(ZeroDivisionError):
+        on_all_cores(lambda i: 1 // i, [1, 0])

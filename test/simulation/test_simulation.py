@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator on a body whose lengths are exact, so that only the simulator can be wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.nominal_rest import nominal_rest
+from bench.sim_responses import NOTICEABLE, responses
+from musculoskeletal_ae.experiments.simulation import random_commands
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation import simulation
+from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED, follow
+from musculoskeletal_ae.simulation.simulation import Simulation
+
+
+class GeometricBody:
+    """Answers as a network without any error would."""
+
+    def __init__(self, robot):
+        self.robot = robot
+
+    def lengths(self, theta, tension):
+        return self.robot.muscle_lengths(theta, tension)
+
+    def lengths_with_pullback(self, theta, tension):
+        jacobian = self.robot.routes.muscle_jacobian(theta)
+        return self.lengths(theta, tension), lambda g: np.einsum('nm,nmd->nd', g, jacobian)
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('musashi_left_arm')
+
+
+@pytest.fixture(scope='module')
+def body(robot):
+    return GeometricBody(robot)
+
+
+@pytest.fixture(scope='module')
+def commands(robot):
+    return random_commands(robot, 6, seed=4)
+
+
+def settled(robot, body, commands):
+    arms = Simulation(robot, body, arms=len(commands))
+    arms.command = commands
+    arms.settle()
+    return arms
+
+
+def rest_of_body(robot, state, command, i, wrench=None, fixed=None):
+    rest = nominal_rest(
+        robot,
+        command,
+        state.theta[i],
+        state.tension[i],
+        np.zeros(6) if wrench is None else wrench,
+        np.full(robot.joint_count, np.nan) if fixed is None else fixed,
+    )
+    assert rest.residual < 1e-6
+    return rest
+
+
+def test_it_rests_where_the_equations_of_the_body_do(robot, body, commands):
+    arms = settled(robot, body, commands)
+    for i, command in enumerate(commands):
+        if arms.limits(i):
+            continue  # the body's stops are springs
+        rest = rest_of_body(robot, arms.state, command, i)
+        np.testing.assert_allclose(arms.state.theta[i], rest.theta, atol=1e-4)
+        np.testing.assert_allclose(arms.state.tension[i], rest.tension, atol=0.1)
+
+
+def test_at_rest_tension_is_what_stiffness_control_makes_of_the_command(robot, body, commands):
+    state = settled(robot, body, commands).state
+    wound = robot.stiffness * (state.length - commands)
+    np.testing.assert_allclose(
+        state.tension, robot.tension.bias + np.maximum(0.0, wound), atol=0.01
+    )
+    np.testing.assert_allclose(
+        state.length, robot.muscle_lengths(state.theta, state.tension), atol=1e-6
+    )
+
+
+def test_a_held_command_keeps_it_still_for_a_thousand_steps(robot, body, commands):
+    arms = settled(robot, body, commands)
+    rest = arms.state
+    for _ in range(1000):
+        state = arms.step(0.01)
+    assert np.abs(state.theta - rest.theta).max() < 1e-4
+    assert np.abs(state.tension - rest.tension).max() < 0.05
+
+
+def test_a_push_bends_it_as_it_bends_the_body(robot, body, commands):
+    arms = settled(robot, body, commands)
+    wrench = np.array([5.0, 10.0, -15.0, 0.5, 0.0, -0.5])
+    arms.wrench = np.tile(wrench, (len(commands), 1))
+    arms.settle()
+    for i, command in enumerate(commands):
+        if not arms.limits(i):
+            rest = rest_of_body(robot, arms.state, command, i, wrench)
+            np.testing.assert_allclose(arms.state.theta[i], rest.theta, atol=1e-4)
+    arms.wrench = np.zeros_like(arms.wrench)
+    np.testing.assert_allclose(
+        arms.settle().theta, settled(robot, body, commands).state.theta, atol=1e-3
+    )
+
+
+def test_forced_joints_go_there_and_the_others_follow(robot, body, commands):
+    arms = settled(robot, body, commands)
+    forced = np.full(robot.joint_count, np.nan)
+    forced[[1, 3]] = -0.3, -1.0
+    arms.fixed = np.tile(forced, (len(commands), 1))
+    state = arms.settle()
+    np.testing.assert_allclose(state.theta[:, [1, 3]], np.tile([-0.3, -1.0], (len(commands), 1)))
+    for i, command in enumerate(commands):
+        if not arms.limits(i):
+            rest = rest_of_body(robot, state, command, i, fixed=forced)
+            np.testing.assert_allclose(state.theta[i], rest.theta, atol=1e-4)
+
+
+def test_it_gives_way_to_the_paper_s_pushes_and_forced_joint_as_the_body_does(robot, body):
+    for answer in responses(robot, body, 'default'):
+        moved = np.abs(answer.body) > NOTICEABLE
+        assert moved.any()
+        np.testing.assert_allclose(answer.simulated[moved], answer.body[moved], rtol=0.1)
+        assert np.linalg.norm(answer.simulated_tension - answer.body_tension) < 10.0
+
+
+def test_without_a_command_every_muscle_is_at_the_bias(robot, body):
+    state = Simulation(robot, body).settle()
+    np.testing.assert_array_equal(state.tension, robot.tension.bias)
+
+
+def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
+    arms = Simulation(robot, body)
+    assert not any(name in robot.muscles for name in arms.limits())
+    shortest = robot.muscle_lengths(robot.random_postures(500, np.random.default_rng(0)),
+                                    np.zeros((500, robot.muscle_count))).min(axis=0)  # fmt: skip
+    arms.command = (shortest - 0.1)[None]
+    state = arms.settle()
+    assert state.tension.max() == robot.tension.max
+    assert np.all((state.theta >= robot.lower) & (state.theta <= robot.upper))
+    assert set(arms.limits()) & set(robot.muscles)
+    arms.command = np.full((1, robot.muscle_count), -1e9)
+    assert np.isfinite(arms.settle().theta).all()
+    # Nothing has wound up meanwhile: half a second later the tension is gone.
+    arms.command = np.full((1, robot.muscle_count), 1e9)
+    assert arms.step(0.5).tension.max() < robot.tension.bias + 1.0
+
+
+def test_a_joint_forced_beyond_its_limits_stops_there_and_says_so(robot, body):
+    arms = Simulation(robot, body)
+    arms.fixed[0, 0] = 9.0
+    assert arms.settle().theta[0, 0] == robot.upper[0]
+    assert robot.joints[0] in arms.limits()
+
+
+def test_motion_is_smooth_however_far_the_command_jumps(robot, body, commands):
+    arms = settled(robot, body, commands)
+    arms.command = commands[::-1]
+    before = arms.state
+    for _ in range(100):
+        state = arms.step(0.01)
+        assert np.abs(state.theta - before.theta).max() <= JOINT_SPEED * 0.01 + 1e-12
+        assert np.abs(state.tension - before.tension).max() < 25.0  # 0.25 m/s · K_stiff · 10 ms
+        before = state
+
+
+def test_a_long_step_is_as_good_as_many_short_ones(robot, body, commands):
+    one, many = settled(robot, body, commands), settled(robot, body, commands)
+    one.command = many.command = commands[::-1]
+    one.step(0.05)
+    for _ in range(5):
+        many.step(0.01)
+    np.testing.assert_allclose(one.state.theta, many.state.theta, rtol=0, atol=1e-12)
+
+
+def test_one_arm_and_a_batch_agree(robot, body, commands, monkeypatch):
+    monkeypatch.setattr(simulation, 'CHUNK', 5)  # uneven pieces, on all cores
+    rng = np.random.default_rng(0)
+    wrench = rng.normal(0.0, 8.0, (len(commands), 6))
+    fixed = np.where(rng.uniform(size=(len(commands), 5)) < 0.2, -0.2, np.nan)
+    batch = Simulation(robot, body, arms=len(commands))
+    batch.command, batch.wrench, batch.fixed = commands, wrench, fixed
+    batch.step(0.5)
+    for i in range(len(commands)):
+        single = Simulation(robot, body)
+        single.command, single.wrench, single.fixed = commands[[i]], wrench[[i]], fixed[[i]]
+        state = single.step(0.5)
+        for ours, theirs in zip(state, batch.state, strict=True):
+            np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
+
+
+def test_modules_wind_at_a_limited_speed_and_never_far_beyond_what_counts():
+    followed = np.array([[0.0, 0.0, 0.0]])
+    command = np.array([[0.5, -0.5, 1e-4]])
+    length = np.zeros((1, 3))
+    np.testing.assert_allclose(follow(command, followed, length, 0.05, 0.01), [[0.01, -0.01, 1e-4]])
+    for _ in range(100):
+        followed = follow(command, followed, length, 0.05, 0.01)
+    np.testing.assert_allclose(followed, [[0.01, -0.05, 1e-4]])
