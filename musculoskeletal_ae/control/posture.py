@@ -26,6 +26,7 @@ from musculoskeletal_ae.control.ramp import Ramp
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stiffness import StiffnessSolution, stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
@@ -178,10 +179,10 @@ class PostureControl:
             wish[: len(self._settings.joint_stiffness)] = self._settings.joint_stiffness
             self.stiffness = stiffness_command(robot, mae, theta, torque, wish, limit)
             self.solution = self.stiffness.command
-        elif self._settings.preset == 'paper':
-            self.solution = control.proposed_paper(robot, mae, theta, torque, current)
-        else:
+        elif PRESETS[self._settings.preset].equilibrium:
             self.solution = control.proposed(robot, mae, theta, torque, current, limit)
+        else:
+            self.solution = control.proposed_paper(robot, mae, theta, torque, current)
         self.missing_torque = self.solution.missing_torque
         return self.solution.length
 
@@ -189,7 +190,8 @@ class PostureControl:
         """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""
         chosen, solution = self._settings, self.solution
         # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
-        if self._method != 'proposed' or chosen.preset == 'paper' or solution is None:
+        by_balance = self._method == 'proposed' and PRESETS[chosen.preset].equilibrium
+        if not by_balance or solution is None:
             return
         assert self._mae is not None and self.theta is not None  # they gave the solution
         if self._jacobian is None:

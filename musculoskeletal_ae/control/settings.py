@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.presets import PRESETS
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
-PRESETS = ('paper', 'default')
 
 
 def choice(default: str, legal: tuple[str, ...], meaning: str) -> Any:
@@ -37,7 +37,7 @@ class Settings:
     """
 
     method: str = choice('proposed', METHODS, 'how a target posture becomes a command')
-    preset: str = choice('default', PRESETS, 'of the method proposed')
+    preset: str = choice('default', tuple(PRESETS), 'of the method proposed')
     first_duration: float = quantity(5.0, 0.1, 60.0, 'of a movement [s]')
     second_duration: float = quantity(
         2.0, 0.1, 60.0, 'of the second movement of second, and after a new checkpoint [s]'

@@ -12,15 +12,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.collector import Collector
 from musculoskeletal_ae.learning.paper_updater import PaperUpdater
 from musculoskeletal_ae.learning.update import Job, Update, Updater
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-PRESETS = ('default', 'paper')
 STEPS = 100  # of training in one update of preset default
 
 
@@ -30,11 +29,8 @@ def make_updater(robot: Robot, mae: Mae, preset: str, seed: int = 0) -> Updater:
     Raises:
         MusculoskeletalError: If it names none.
     """
-    if preset == 'default':
-        return BodyUpdater(robot, mae, seed)
-    if preset == 'paper':
-        return PaperUpdater(robot, mae, seed)
-    raise MusculoskeletalError(f'preset {preset!r} is unknown; legal: {", ".join(PRESETS)}')
+    kind = BodyUpdater if preset_named(preset).corrected_body else PaperUpdater
+    return kind(robot, mae, seed)
 
 
 class OnlineLearner:

@@ -13,18 +13,18 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError, StateError
+from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.answer_values import answer_values
 from musculoskeletal_ae.learning.collector import Collector
 from musculoskeletal_ae.learning.handout import LEAST_INTERVAL, Handout
 from musculoskeletal_ae.learning.journal import Journal
-from musculoskeletal_ae.learning.online import PRESETS
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.supervisor import Supervisor
 from musculoskeletal_ae.learning.update import Job
 from musculoskeletal_ae.learning.worker_process import Answer, Start
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 #: updates that a new sample is worth: its own, and one more of training
@@ -63,11 +63,9 @@ class Session:
         Raises:
             MusculoskeletalError: If the preset is unknown or the directory cannot be used.
         """
-        if preset not in PRESETS:
-            raise MusculoskeletalError(f'preset {preset!r} is unknown; legal: {", ".join(PRESETS)}')
         self._robot, self._collector = robot, collector
         self._handout = Handout(publish)
-        self._preset, self._seed, self._steps = preset, seed, steps
+        self._preset, self._seed, self._steps = preset_named(preset), seed, steps
         self.data: bytes | None = None
         self.saved: Mae | None = None
         self._version = 0
@@ -99,7 +97,7 @@ class Session:
         return Start(
             self._robot.description.directory,
             self.data,
-            self._preset,
+            self._preset.name,
             self._seed,
             None if self._journal is None else self._journal.network.path,
         )
@@ -238,7 +236,7 @@ class Session:
 
     def _begin(self, now: float) -> None:
         # Going on without new samples is the corrected body's way, not the paper's.
-        self._due = self._due - 1 if self._preset == 'default' else 0
+        self._due = self._due - 1 if self._preset.corrected_body else 0
         self._last_start = now
         self._version += 1
         collector = self._collector
@@ -283,7 +281,7 @@ class Session:
             'accepted': str(self._collector.store.accepted),
             'checkpoints': str(self._handout.count),
             'checkpoint version': str(self._version),
-            'preset': self._preset,
+            'preset': self._preset.name,
             'healthy time': f'{self._collector.reservoir.time:.0f} s',
             'training process restarts': str(self._training.restarts),
         }

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from musculoskeletal_ae.mae.evaluation import geometric_anomaly
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import TRAINING_PRESETS, Progress, initial_training
+from musculoskeletal_ae.mae.training import Progress, initial_training
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -37,7 +38,7 @@ def initial_mae(
         steps: Fewer or more mini-batches than the preset's.
     """
     network, losses = initial_training(robot, preset, seed, progress, steps)
-    settings = TRAINING_PRESETS[preset]
+    settings = PRESETS[preset].training
     history = (
         f'initial training on the geometric model of {robot.description.directory.name}: '
         f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {settings.batch} '

@@ -16,9 +16,9 @@ from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae.layers import ACTIVATIONS
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import UNITS
+from musculoskeletal_ae.presets import PRESETS
 
 FORMAT_VERSION = 1
-PRESETS = ('paper', 'default')
 KEYS = (
     'format_version',
     'joints',
@@ -130,7 +130,7 @@ def from_text(entries: object) -> Metadata:
         muscles=muscles,
         layer_sizes=_layer_sizes(values['layer_sizes'], len(joints), len(muscles)),
         activation=_legal('activation', values['activation'], tuple(ACTIVATIONS)),
-        preset=_legal('preset', values['preset'], PRESETS),
+        preset=_legal('preset', values['preset'], tuple(PRESETS)),
         version=_count(values['version'], 'version'),
         training=training,
         anomaly_calibrated=calibrated,

@@ -10,7 +10,6 @@ enters the first layer.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,34 +18,11 @@ from torch import Tensor, nn
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask, visible
+from musculoskeletal_ae.presets import PRESETS, NetworkSettings
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     'tanh': torch.tanh,
     'silu': nn.functional.silu,
-}
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """Shape of a network.
-
-    Attributes:
-        hidden: Units of the encoder's hidden layers; the decoder has them in reverse.
-        activation: After every layer but the latent and the last one, which are linear.
-        standardise: Subtract the mean of the training data and divide by its spread at the input,
-            and the other way round at the output.
-    """
-
-    hidden: tuple[int, ...]
-    activation: str
-    standardise: bool
-
-
-# The paper prints the layers but not the activation. tanh is our choice for it: smooth, as descent
-# through the decoder wants it. The latent layer is linear, so that z is not confined to a cube.
-PRESETS = {
-    'paper': NetworkSettings(hidden=(200, 30), activation='tanh', standardise=False),
-    'default': NetworkSettings(hidden=(200, 100), activation='silu', standardise=True),
 }
 
 
@@ -147,7 +123,7 @@ def from_mae(mae: Mae) -> Network:
     settings = NetworkSettings(
         hidden=tuple(len(bias) for _, bias in mae.encoder[:-1]),
         activation=mae.activation,
-        standardise=PRESETS[mae.preset].standardise,
+        standardise=PRESETS[mae.preset].network.standardise,
     )
     network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std)
     with torch.no_grad():

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,8 +20,9 @@ from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae import samples
-from musculoskeletal_ae.mae.network import PRESETS, Network
+from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimisers import Adam, Muon
+from musculoskeletal_ae.presets import TrainingSettings, preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 # Keeps the gradient of a norm finite at zero.
@@ -31,63 +32,6 @@ LEAST_SPREAD = 1e-4
 #: step size of Muon's matrices for a step size of 1 of the biases
 MUON_MATRIX_RATIO = 12.5
 
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How to train.
-
-    Attributes:
-        steps: Mini-batches in all.
-        batch: Samples in a mini-batch.
-        samples: Samples drawn from the geometric model, then shuffled epoch by epoch.
-        optimiser: 'adam' or 'muon'.
-        step_size: Adam's; with Muon that of the biases.
-        annealed: Raise the step size over the first twentieth, then lower it to zero by a cosine.
-        every_mask: Enter each sample by all three masks instead of one at random.
-        weights: w_θ, w_T, w_l.
-        standard_norms: Take each norm in units of the spread of the data.
-        slope_weight: w_G of the slope ∂l/∂θ through ① (`slope_loss`); needs samples in twins.
-    """
-
-    steps: int
-    batch: int
-    samples: int
-    optimiser: str
-    step_size: float
-    annealed: bool
-    every_mask: bool
-    weights: tuple[float, float, float]
-    standard_norms: bool
-    slope_weight: float = 0.0
-
-
-# The paper prints 30 epochs and w = (1, 10, 10). Its "number of batches 100" is read as the size
-# of a mini-batch of 10 000 samples; the step size is Adam's own default.
-TRAINING_PRESETS = {
-    'paper': TrainingSettings(
-        steps=30 * 100,
-        batch=100,
-        samples=10_000,
-        optimiser='adam',
-        step_size=1e-3,
-        annealed=False,
-        every_mask=False,
-        weights=(1.0, 10.0, 10.0),
-        standard_norms=False,
-    ),
-    'default': TrainingSettings(
-        steps=3000,
-        batch=128,
-        samples=200_000,
-        optimiser='muon',
-        step_size=4e-3,
-        annealed=True,
-        every_mask=True,
-        weights=(1.0, 1.0, 1.0),
-        standard_norms=True,
-        slope_weight=1.0,
-    ),
-}
 
 #: told (step, loss) after every mini-batch
 Progress = Callable[[int, float], None]
@@ -203,13 +147,14 @@ def initial_training(
     Returns:
         The network, and the loss of every mini-batch.
     """
-    settings = TRAINING_PRESETS[preset]
+    chosen = preset_named(preset)
+    settings = chosen.training
     if steps is not None:
         settings = replace(settings, steps=steps)
     rng = np.random.default_rng(seed)
     width = robot.joint_count + 2 * robot.muscle_count
     mean, std = np.zeros(width), np.ones(width)
-    if PRESETS[preset].standardise:
+    if chosen.network.standardise:
         drawn = samples.overload_samples(robot, settings.samples, rng)
         mean, std = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), LEAST_SPREAD)
         if settings.slope_weight > 0.0:
@@ -218,7 +163,7 @@ def initial_training(
         drawn = samples.geometric_samples(robot, settings.samples, rng, robot.tension.max)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = Network(robot.joint_count, robot.muscle_count, PRESETS[preset], mean, std)
+        network = Network(robot.joint_count, robot.muscle_count, chosen.network, mean, std)
     batches = samples.shuffled(drawn, settings.batch, rng)
     return network, fit(network, batches, settings, seed, progress)
 

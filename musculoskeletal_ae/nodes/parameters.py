@@ -6,8 +6,7 @@ from __future__ import annotations
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.mae.metadata import PRESETS
+from musculoskeletal_ae.presets import PRESETS, preset_named
 
 
 def text(description: str, read_only: bool = False) -> ParameterDescriptor:
@@ -29,9 +28,7 @@ def declare_preset(node: Node, meaning: str) -> str:
     """
     descriptor = text(f'{meaning}; one of: {", ".join(PRESETS)}', read_only=True)
     preset = str(node.declare_parameter('preset', 'default', descriptor).value)
-    if preset not in PRESETS:
-        raise MusculoskeletalError(f'parameter preset: {preset!r}; legal: {", ".join(PRESETS)}')
-    return preset
+    return preset_named(preset).name
 
 
 def number(

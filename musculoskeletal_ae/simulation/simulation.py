@@ -14,6 +14,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState, QuasiStatics
 from musculoskeletal_ae.simulation.paper import PaperDescent
@@ -58,7 +59,7 @@ class Simulation:
     def use(self, mae: Mae) -> None:
         """Take a new network; the arms move on to its equilibrium from where they are."""
         self._mae = mae
-        kind = PaperDescent if self.preset == 'paper' else QuasiStatics
+        kind = QuasiStatics if preset_named(self.preset).equilibrium else PaperDescent
         self._body: PaperDescent | QuasiStatics = kind(self.robot, mae)
 
     def start_from(self, theta: Array) -> None:

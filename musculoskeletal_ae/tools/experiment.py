@@ -19,7 +19,8 @@ from musculoskeletal_ae.experiments.report.publish import publish
 from musculoskeletal_ae.experiments.report.readme import update_readme
 from musculoskeletal_ae.experiments.suite.registry import NAMES
 from musculoskeletal_ae.experiments.suite.run import run, total_weight
-from musculoskeletal_ae.experiments.suite.study import PRESETS, Study
+from musculoskeletal_ae.experiments.suite.study import Study
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -89,7 +90,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         '--preset',
-        choices=PRESETS,
+        choices=tuple(PRESETS),
         default='default',
         help='whose networks are measured; preset paper is always shown beside (default)',
     )

@@ -17,8 +17,8 @@ from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.evaluation import OUTPUTS, PairError, pair_errors, unseen_states
 from musculoskeletal_ae.mae.initial import Trained, initial_mae
-from musculoskeletal_ae.mae.training import TRAINING_PRESETS
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _steps(args: argparse.Namespace) -> int:
-    return TRAINING_PRESETS[args.preset].steps // (10 if args.quick else 1)
+    return PRESETS[args.preset].training.steps // (10 if args.quick else 1)
 
 
 def _from_bags(robot: Robot, args: argparse.Namespace) -> int:
@@ -121,7 +121,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         '--preset',
-        choices=tuple(TRAINING_PRESETS),
+        choices=tuple(PRESETS),
         default='default',
         help='paper: network and training as printed; default: the best measured (default)',
     )

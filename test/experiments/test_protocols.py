@@ -25,7 +25,8 @@ from musculoskeletal_ae.experiments.suite.scenario import (
     GraspAndCut,
     ScriptedArm,
 )
-from musculoskeletal_ae.experiments.suite.study import PRESETS, Study
+from musculoskeletal_ae.experiments.suite.study import Study
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -11,7 +11,7 @@ from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.mae.evaluation import jacobian_error, pair_errors, unseen_states
 from musculoskeletal_ae.mae.initial import initial_mae
-from musculoskeletal_ae.mae.network import PRESETS, Network, from_mae, to_mae
+from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimisers import orthogonal
 from musculoskeletal_ae.mae.samples import (
     POSTURE_MARGIN,
@@ -19,8 +19,9 @@ from musculoskeletal_ae.mae.samples import (
     overload_samples,
     shuffled,
 )
-from musculoskeletal_ae.mae.training import TRAINING_PRESETS, annealing, fit, initial_training, loss
+from musculoskeletal_ae.mae.training import annealing, fit, initial_training, loss
 from musculoskeletal_ae.mae.units import Mask, scale_vector
+from musculoskeletal_ae.presets import PAPER, PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -31,11 +32,11 @@ def test_paper_preset_has_the_layers_of_the_paper():
 
 
 def test_paper_preset_trains_as_the_paper_does():
-    paper = TRAINING_PRESETS['paper']
+    paper = PAPER.training
     assert paper.weights == (1.0, 10.0, 10.0)
     assert paper.steps * paper.batch == 30 * paper.samples == 30 * 10_000
     assert (paper.optimiser, paper.step_size, paper.annealed) == ('adam', 1e-3, False)
-    assert not PRESETS['paper'].standardise and not paper.standard_norms
+    assert not PAPER.network.standardise and not paper.standard_norms
 
 
 def test_paper_preset_enters_scaled_units_as_they_are(trained):
@@ -45,19 +46,19 @@ def test_paper_preset_enters_scaled_units_as_they_are(trained):
 
 def test_loss_is_the_weighted_sum_of_plain_norms(robot):
     values = geometric_samples(robot, 5, np.random.default_rng(0), 500.0)
-    network = Network(2, 6, PRESETS['paper'], np.zeros(14), np.ones(14))
+    network = Network(2, 6, PAPER.network, np.zeros(14), np.ones(14))
     tensor, mask = torch.tensor(values, dtype=torch.float32), torch.tensor([0, 1, 2, 0, 1])
     error = network(tensor, mask).detach().numpy() - values
     norms = [np.linalg.norm(error[:, a:b], axis=1).mean() for a, b in ((0, 2), (2, 8), (8, 14))]
-    got = loss(network, tensor, mask, TRAINING_PRESETS['paper']).item()
+    got = loss(network, tensor, mask, PAPER.training).item()
     assert got == pytest.approx(norms[0] + 10 * norms[1] + 10 * norms[2], rel=1e-5)
 
 
 def test_loss_has_a_finite_gradient_where_nothing_is_wrong():
-    network = Network(1, 2, PRESETS['paper'], np.zeros(5), np.ones(5))
+    network = Network(1, 2, PAPER.network, np.zeros(5), np.ones(5))
     for parameter in network.parameters():
         torch.nn.init.zeros_(parameter)
-    value = loss(network, torch.zeros(3, 5), torch.arange(3), TRAINING_PRESETS['paper'])
+    value = loss(network, torch.zeros(3, 5), torch.arange(3), PAPER.training)
     value.backward()
     gradients = [p.grad for p in network.parameters() if p.grad is not None]
     assert gradients and all(torch.isfinite(g).all() for g in gradients)
@@ -124,7 +125,7 @@ def test_training_leaves_the_callers_random_state_and_threads_alone(robot):
 def test_training_goes_on_from_given_weights(robot, trained):
     rng = np.random.default_rng(2)
     batches = shuffled(geometric_samples(robot, 2000, rng, 200.0), 64, rng)
-    settings = replace(TRAINING_PRESETS['paper'], steps=200, step_size=3e-4)
+    settings = replace(PAPER.training, steps=200, step_size=3e-4)
     before = trained['paper']
     network = from_mae(before)
     seen: list[int] = []
@@ -152,7 +153,7 @@ def test_orthogonalised_matrix_has_singular_values_near_one(shape):
 
 
 def check_trains(arm: Robot) -> None:
-    for preset in TRAINING_PRESETS:
+    for preset in PRESETS:
         mae = initial_mae(arm, preset, steps=100).mae
         states = unseen_states(arm, 50, np.random.default_rng(0), 0.0, arm.tension.max)
         assert all(np.isfinite(e.norm) for e in pair_errors(mae, states))

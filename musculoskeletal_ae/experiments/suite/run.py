@@ -18,7 +18,8 @@ from typing import Any
 
 from musculoskeletal_ae.experiments.suite.learning import learn_individual, train_initial
 from musculoskeletal_ae.experiments.suite.registry import AFTERWARDS, LEARNING, LEARNING_WEIGHT
-from musculoskeletal_ae.experiments.suite.study import PRESETS, Measured, Study
+from musculoskeletal_ae.experiments.suite.study import Measured, Study
+from musculoskeletal_ae.presets import PRESETS
 
 TRAINING_WEIGHT = 1.0
 POLL = 0.5  # [s] between looks at the progress

@@ -22,7 +22,6 @@ from musculoskeletal_ae.robot.robot import Robot
 #: told which share of an experiment's work has been done since it was told last
 Progress = Callable[[float], None]
 
-PRESETS = ('default', 'paper')
 HEALTHY_HOUR = 3600.0  # [s] of motion for false alarms, over all individuals
 
 

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two presets: one record each, the only place where they differ.
+
+`paper` is what the paper prints (network layout, learning procedure, solvers, constants); `default`
+is the best that this project can measure. Code asks a field of the record, never for a name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Shape of a network.
+
+    Attributes:
+        hidden: Units of the encoder's hidden layers; the decoder has them in reverse.
+        activation: After every layer but the latent and the last one, which are linear.
+        standardise: Subtract the mean of the training data and divide by its spread at the input,
+            and the other way round at the output.
+    """
+
+    hidden: tuple[int, ...]
+    activation: str
+    standardise: bool
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a network is trained on the geometric model.
+
+    Attributes:
+        steps: Mini-batches in all.
+        batch: Samples in a mini-batch.
+        samples: Samples drawn from the geometric model, then shuffled epoch by epoch.
+        optimiser: 'adam' or 'muon'.
+        step_size: Adam's; with Muon that of the biases.
+        annealed: Raise the step size over the first twentieth, then lower it to zero by a cosine.
+        every_mask: Enter each sample by all three masks instead of one at random.
+        weights: w_θ, w_T, w_l.
+        standard_norms: Take each norm in units of the spread of the data.
+        slope_weight: w_G of the slope ∂l/∂θ through ①; needs samples in twins.
+    """
+
+    steps: int
+    batch: int
+    samples: int
+    optimiser: str
+    step_size: float
+    annealed: bool
+    every_mask: bool
+    weights: tuple[float, float, float]
+    standard_norms: bool
+    slope_weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Everything in which two presets differ.
+
+    Attributes:
+        name: Of the parameter `preset`.
+        network: Shape of the network.
+        training: Initial training.
+        corrected_body: Learn online by fitting the corrected body; else on the samples alone.
+        equilibrium: Control and simulate by the balance of torques, solved; else by the printed
+            descent in the latent space.
+    """
+
+    name: str
+    network: NetworkSettings
+    training: TrainingSettings
+    corrected_body: bool
+    equilibrium: bool
+
+
+DEFAULT = Preset(
+    name='default',
+    network=NetworkSettings(hidden=(200, 100), activation='silu', standardise=True),
+    training=TrainingSettings(
+        steps=3000,
+        batch=128,
+        samples=200_000,
+        optimiser='muon',
+        step_size=4e-3,
+        annealed=True,
+        every_mask=True,
+        weights=(1.0, 1.0, 1.0),
+        standard_norms=True,
+        slope_weight=1.0,
+    ),
+    corrected_body=True,
+    equilibrium=True,
+)
+
+PAPER = Preset(
+    name='paper',
+    # The paper prints the layers but not the activation. tanh is our choice for it: smooth, as
+    # descent through the decoder wants it. The latent layer is linear, so that z is not confined.
+    network=NetworkSettings(hidden=(200, 30), activation='tanh', standardise=False),
+    # 30 epochs and w = (1, 10, 10) are printed. "Number of batches 100" is read as the size of a
+    # mini-batch of 10 000 samples; the step size is Adam's own default.
+    training=TrainingSettings(
+        steps=30 * 100,
+        batch=100,
+        samples=10_000,
+        optimiser='adam',
+        step_size=1e-3,
+        annealed=False,
+        every_mask=False,
+        weights=(1.0, 10.0, 10.0),
+        standard_norms=False,
+    ),
+    corrected_body=False,
+    equilibrium=False,
+)
+
+PRESETS = {preset.name: preset for preset in (DEFAULT, PAPER)}
+
+
+def preset_named(name: str) -> Preset:
+    """Return the preset of that name.
+
+    Raises:
+        MusculoskeletalError: If there is none.
+    """
+    if name not in PRESETS:
+        raise MusculoskeletalError(f'preset {name!r} is unknown; legal: {", ".join(PRESETS)}')
+    return PRESETS[name]
