@@ -8,66 +8,57 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.parameters import PRESET, Parameter
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 
 
-def choice(default: str, legal: tuple[str, ...], meaning: str) -> Any:
-    """Return the field of a setting that is one of a few words."""
-    return field(default=default, metadata={'meaning': meaning, 'legal': legal})
-
-
-def quantity(default: float, low: float, high: float, meaning: str) -> Any:
-    """Return the field of a setting that is a number within [low, high]."""
-    return field(default=default, metadata={'meaning': meaning, 'range': (low, high)})
+def _number(default: float, meaning: str, unit: str, low: float, high: float) -> Any:
+    return Parameter(default, meaning, unit, (low, high), settable=True).field()
 
 
 @dataclass
 class Settings:
-    """Settings of control; the owner may change them at any time.
+    """Settings of control; the owner may change them at any time."""
 
-    Attributes are described by their own `meaning`, except for
-    joint_stiffness: wished diagonal entries of the joint stiffness [N·m/rad], one for each joint,
-        0 as it comes; empty for all as they come.
-    """
-
-    method: str = choice('proposed', METHODS, 'how a target posture becomes a command')
-    preset: str = choice('default', tuple(PRESETS), 'of the method proposed')
-    first_duration: float = quantity(5.0, 0.1, 60.0, 'of a movement [s]')
-    second_duration: float = quantity(
-        2.0, 0.1, 60.0, 'of the second movement of second, and after a new checkpoint [s]'
+    method: str = Parameter(
+        'proposed', 'how a target posture becomes a command', legal=METHODS, settable=True
+    ).field()
+    preset: str = replace(PRESET, settable=True).field()
+    joint_stiffness: tuple[float, ...] = Parameter(
+        (0.0,),
+        'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
+        'N·m/rad',
+        settable=True,
+    ).field(default=())
+    first_duration: float = _number(5.0, 'movement duration', 's', 0.1, 60.0)
+    second_duration: float = _number(
+        2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
     )
-    constant_tension: float = quantity(
-        0.0, 0.0, 1000.0, 'T_const of first [N], within [T_bias, T_limit]'
+    constant_tension: float = _number(
+        0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
-    rate_limit: float = quantity(
-        0.1, 0.001, 1.0, 'fastest change of a commanded length [m/s]; of a tension K_stiff times it'
+    rate_limit: float = _number(
+        0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
     )
-    position_gain: float = quantity(
-        10.0, 0.0, 200.0, 'method tension: torque towards the target [N·m/rad]; 0: torque only'
+    position_gain: float = _number(
+        10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
     )
-    velocity_gain: float = quantity(
-        0.5, 0.0, 20.0, 'method tension: damping torque [N·m·s/rad]; 0: torque only'
+    velocity_gain: float = _number(0.5, 'damping torque, method `tension`', 'N·m·s/rad', 0.0, 20.0)
+    feedback_gain: float = _number(
+        0.5, 'correction at rest of error and needless tension, `proposed`', '1/s', 0.0, 2.0
     )
-    feedback_gain: float = quantity(
-        0.5,
-        0.0,
-        2.0,
-        'proposed, default: correction of error and needless tension at rest [1/s]; 0: none',
+    max_age: float = _number(
+        0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
     )
-    max_age: float = quantity(
-        0.2, 0.01, 10.0, 'older muscle_states or estimated_joint_states stop the arm [s]'
+    hold_time: float = _number(0.5, 'how long a stop holds the last command', 's', 0.0, 60.0)
+    temperature_limit: float = _number(
+        85.0, 'a module this hot pulls with T_bias only', '°C', 40.0, 200.0
     )
-    hold_time: float = quantity(0.5, 0.0, 60.0, 'a stop holds the last command so long [s]')
-    temperature_limit: float = quantity(
-        85.0, 40.0, 200.0, 'a module this hot pulls with T_bias only [°C]'
-    )
-    joint_stiffness: tuple[float, ...] = ()
 
 
 def read_stiffness(wished: Iterable[Any], joints: int) -> tuple[float, ...]:
