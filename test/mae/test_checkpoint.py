@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 from musculoskeletal_ae.mae.checkpoint import from_bytes, load, save, to_bytes
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -7,11 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from robots import read_muscles, write_muscles, write_robot
-
 from musculoskeletal_ae.mae.evaluation import jacobian_error, pair_errors, unseen_states
-from musculoskeletal_ae.mae.initial import initial_mae
-from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimisers import orthogonal
 from musculoskeletal_ae.mae.samples import (
     POSTURE_MARGIN,
@@ -19,7 +15,10 @@ from musculoskeletal_ae.mae.samples import (
     overload_samples,
     shuffled,
 )
-from musculoskeletal_ae.mae.training import annealing, fit, initial_training, loss
+from robots import read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
+from musculoskeletal_ae.mae.training import annealing, fit, initial_mae, initial_training, loss
 from musculoskeletal_ae.mae.units import Mask, scale_vector
 from musculoskeletal_ae.presets import PAPER, PRESETS
 from musculoskeletal_ae.robot.robot import Robot

@@ -11,7 +11,7 @@ import pytest
 from bench import sim_pictures
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.simulation import compare, random_commands, rest_errors
-from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
