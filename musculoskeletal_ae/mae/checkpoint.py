@@ -231,7 +231,7 @@ def _json(text: Any, what: str) -> Any:
         raise CheckpointError(f'{what} is missing or not text')
     try:
         return msgspec.json.decode(text)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise CheckpointError(f'{what} is not valid JSON ({error}): {_short(text)}') from error
 
 

@@ -12,9 +12,8 @@ from musculoskeletal_ae.control.length import first_command, msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.mae.descent import descend, loss
-from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.mae.descent import Loss, descend
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
@@ -93,13 +92,12 @@ def test_the_command_lies_below_the_length_by_what_the_module_needs_to_pull(robo
 
 def test_preset_paper_lowers_the_printed_loss():
     robot = Robot.load('arm26')
-    network, _ = initial_training(robot, 'paper', steps=200)
-    mae = to_mae(network, robot.joints, robot.muscles, 'paper', 'briefly, for a test')
+    mae = initial_mae(robot, 'paper', steps=200).mae
     theta, torque, _ = holdable(robot, 0)
     tension = np.full(6, 100.0)
     terms = control.paper_terms(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)
     end = descend(mae, start, terms, control.SEARCH)
-    assert loss(terms, mae.decode_scaled(end)) < 0.9 * loss(terms, mae.decode_scaled(start))
+    assert Loss(terms)(mae.decode_scaled(end)) < 0.9 * Loss(terms)(mae.decode_scaled(start))
     found = control.proposed_paper(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(found.tension, mae.decode(end).tension)

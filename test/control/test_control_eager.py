@@ -8,16 +8,15 @@ import pytest
 
 from bench.timings_control import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control import proposed as control
-from musculoskeletal_ae.mae.network import from_mae, to_mae
-from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.mae.network import from_mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])
 def test_numpy_and_torch_command_the_same_lengths(preset):
     robot = Robot.load('arm26')
-    network, _ = initial_training(robot, preset, steps=100)
-    mae = to_mae(network, robot.joints, robot.muscles, preset, 'briefly, for a test')
+    mae = initial_mae(robot, preset, steps=100).mae
     eager = from_mae(mae)
     theta, tension = np.array([-0.4, -1.0]), np.full(6, 40.0)
     torque = robot.kinematics.holding_torque(theta)

@@ -8,8 +8,7 @@ import pytest
 
 from bench.control_nominal import nominal_arm, nominal_tables
 from musculoskeletal_ae.experiments.control import PROTOCOL, control_protocol
-from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -21,8 +20,7 @@ def robot():
 @pytest.fixture(scope='module')
 def networks(robot):
     def trained(preset):
-        network, _ = initial_training(robot, preset, steps=600)
-        return to_mae(network, robot.joints, robot.muscles, preset, 'briefly, for a test')
+        return initial_mae(robot, preset, steps=600).mae
 
     return trained('default'), trained('paper')
 

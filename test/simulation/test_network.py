@@ -47,15 +47,6 @@ def test_one_arm_and_a_batch_agree_to_a_millionth(robot, mae):
             np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
 
 
-def test_the_lengths_pullback_of_a_tension_is_its_torque(robot, mae):
-    theta = robot.random_postures(5, np.random.default_rng(0))
-    tension = np.random.default_rng(1).uniform(30.0, 200.0, (5, robot.muscle_count))
-    length, pullback = mae.lengths_with_pullback(theta, tension)
-    np.testing.assert_allclose(length, mae.lengths(theta, tension), atol=1e-12)
-    torque = np.einsum('nmd,nm->nd', mae.muscle_jacobian(theta, tension), tension)
-    np.testing.assert_allclose(pullback(tension), torque, atol=1e-10)
-
-
 @pytest.mark.parametrize('preset', ['default', 'paper'])
 def test_a_nonsense_network_moves_it_within_its_limits_only(robot, mae, preset):
     rng = np.random.default_rng(5)
