@@ -13,21 +13,21 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import proposed as control
-from musculoskeletal_ae.control.length import (
+from musculoskeletal_ae.control import methods as control
+from musculoskeletal_ae.control.methods import (
     first_command,
     geometric_command,
     msc_compensation,
 )
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stiffness import stiffness_command
-from musculoskeletal_ae.control.stiffness_model import push_deflection
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.experiments.holdable import holdable_postures
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import push_deflection
 
 POSTURES, QUICK = 50, 3
 SETTLING, PERIOD = 3.0, 0.02  # [s]
@@ -106,7 +106,7 @@ def stiffness_ratios(
         for quarter in QUARTERS:
             wish[joint] = low + quarter * (high - low)
             found = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
-            expected = push_deflection(robot, theta, found.stiffness, wrench)[joint]
+            expected = push_deflection(robot.kinematics, theta, found.stiffness, wrench)[joint]
             moved = _pushed(arm, theta, found.command.length, wrench)[joint]
             deflections.append((moved, expected))
         (soft, soft_expected), (stiff, stiff_expected) = deflections

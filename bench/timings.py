@@ -17,7 +17,7 @@ import torch
 
 from bench.timings_control import control_rows
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import first_command
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae.evaluation import unseen_states
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import proposed as control
-from musculoskeletal_ae.control.length import msc_compensation
+from musculoskeletal_ae.control import methods as control
+from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network

@@ -27,12 +27,12 @@ def quantity(default: float, low: float, high: float, meaning: str) -> Any:
     return field(default=default, metadata={'meaning': meaning, 'range': (low, high)})
 
 
-@dataclass
+@dataclass(frozen=True)
 class Settings:
-    """Settings of control; the owner may change them at any time.
+    """Settings of control; `Controller.configure` takes changed ones.
 
     Attributes are described by their own `meaning`, except for
-    joint_stiffness: wished diagonal entries of the joint stiffness [N·m/rad], one for each joint,
+    joint_stiffness: desired diagonal entries of the joint stiffness [N·m/rad], one for each joint,
         0 as it comes; empty for all as they come.
     """
 
@@ -69,21 +69,26 @@ class Settings:
     )
     joint_stiffness: tuple[float, ...] = ()
 
+    @property
+    def by_balance(self) -> bool:
+        """Whether `proposed` solves the balance of torques, instead of the printed descent."""
+        return PRESETS[self.preset].equilibrium
 
-def read_stiffness(wished: Iterable[Any], joints: int) -> tuple[float, ...]:
-    """Return the wish as `Settings` keeps it; nothing, or a single 0, is all as they come.
+
+def read_stiffness(desired: Iterable[Any], joints: int) -> tuple[float, ...]:
+    """Return joint stiffness as `Settings` keeps it; nothing, or a single 0, is all as they come.
 
     Raises:
         MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
     """
     try:
-        values = tuple(float(value) for value in wished)
+        values = tuple(float(value) for value in desired)
     except (TypeError, ValueError):
         values = (math.nan,)
     if values == (0.0,):
         return ()
     if len(values) not in (0, joints) or not all(0.0 <= value < math.inf for value in values):
         raise MusculoskeletalError(
-            f'joint stiffness {wished!r}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
+            f'joint stiffness {desired!r}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
         )
     return values

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import Field, fields
+from dataclasses import Field, fields, replace
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -18,10 +18,9 @@ from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.report import control_report, stiffness_values
+from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings, read_stiffness
-from musculoskeletal_ae.control.stiffness import StiffnessSolution
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import (
     QUANTITIES,
@@ -47,11 +46,9 @@ class Controller(Shell):
         super().__init__('controller')
         self.declare_parameter('explore', False, text('explore from the start', read_only=True))
         self.declare_parameter('seed', 0, whole('seed of the exploration'))
-        self.settings = Settings()
-        self.core = Core(self.robot, self.settings, self.get_parameter('seed').value)
+        self.core = Core(self.robot, seed=self.get_parameter('seed').value)
         self._declare_settings()
-        self.cause = ''
-        self.stiffness: StiffnessSolution | None = None
+        self.told: list[str] = []
         self.publishers_of = {
             LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
             TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
@@ -79,7 +76,7 @@ class Controller(Shell):
             'joint_stiffness',
             [0.0],
             ParameterDescriptor(
-                description='wished joint stiffness [N·m/rad], one per joint; 0 or []: as it comes',
+                description='desired stiffness of each joint [N·m/rad]; 0 or []: as it comes',
                 dynamic_typing=True,  # `[]` is an array of bytes to rclpy
             ),
             self._set_stiffness,
@@ -96,13 +93,15 @@ class Controller(Shell):
         def setter(value: Any) -> None:
             if legal is not None and value not in legal:
                 raise MusculoskeletalError(f'{value!r}; legal: {", ".join(legal)}')
-            setattr(self.settings, name, value)
+            self._configure(name, value)
 
         self.settable(name, setting.default, descriptor, setter)
 
-    def _set_stiffness(self, wished: Iterable[Any]) -> None:
-        self.settings.joint_stiffness = read_stiffness(wished, self.robot.joint_count)
-        self.core.posture.start()
+    def _set_stiffness(self, desired: Iterable[Any]) -> None:
+        self._configure('joint_stiffness', read_stiffness(desired, self.robot.joint_count))
+
+    def _configure(self, name: str, value: Any) -> None:
+        self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
@@ -154,13 +153,13 @@ class Controller(Shell):
     def state(self) -> tuple[bytes, str, dict[str, str]]:
         """Return what /diagnostics shows, and log what has changed."""
         report = control_report(self.robot, self.core, time.monotonic())
-        cause, found = self.core.safety.cause, self.core.posture.stiffness
-        if cause and cause != self.cause:
-            self.get_logger().warning(f'stopped: {cause}')
-        if found is not None and found is not self.stiffness:
-            for what, said in stiffness_values(self.robot, self.settings, found).items():
-                self.get_logger().info(f'{what}: {said}')
-        self.cause, self.stiffness = cause, found
+        stopped = [report.message] if self.core.safety.cause else []
+        stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
+        for line in stopped + stiffness:
+            if line not in self.told:
+                log = self.get_logger().warning if line in stopped else self.get_logger().info
+                log(line)
+        self.told = stopped + stiffness
         return LEVELS[report.level], report.message, report.values
 
 

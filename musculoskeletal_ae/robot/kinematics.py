@@ -2,8 +2,8 @@
 """Kinematics and gravity of the arm, by pinocchio, in the order of θ that muscles.yaml gives.
 
 Pinocchio reads the URDF and answers for single postures. Training and simulation ask for the poses
-of thousands at once; those are computed here with numpy (a test holds the two together): the pose of
-a joint in its parent is its fixed placement times, by Rodrigues,
+of thousands at once; those are computed here with numpy (a test holds the two together). The pose
+of a joint in its parent is its fixed placement times, by Rodrigues,
 
     exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
 
@@ -59,44 +59,37 @@ class Kinematics:
         self.lower: Array = self.model.lowerPositionLimit[self.order].copy()
         self.upper: Array = self.model.upperPositionLimit[self.order].copy()
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
-        self._read_tree(ids)
-
-    def _read_tree(self, ids: list[int]) -> None:
-        joint_count = self.model.njoints
+        count = self.model.njoints
         self.parent = np.array(self.model.parents)
         self.placement_rotation = np.stack([m.rotation for m in self.model.jointPlacements])
         self.placement_translation = np.stack([m.translation for m in self.model.jointPlacements])
-        self.local_axis = np.zeros((joint_count, 3))
-        self.prismatic = np.zeros(joint_count, dtype=bool)
-        pin.computeJointJacobians(self.model, self.data, pin.neutral(self.model))
-        for i in range(1, joint_count):
-            local = pin.getJointJacobian(self.model, self.data, i, pin.ReferenceFrame.LOCAL)
-            # pinocchio returns one column as a plain vector
-            subspace = local.reshape(6, -1)[:, self.model.joints[i].idx_v]
-            self.prismatic[i] = self.model.joints[i].shortname() in PRISMATIC
-            self.local_axis[i] = subspace[:3] if self.prismatic[i] else subspace[3:]
+        self.prismatic = np.array([joint.shortname() in PRISMATIC for joint in self.model.joints])
+        self.local_axis = np.zeros((count, 3))
         # Pose in the parent = placement + a(θ) · first + b(θ) · second.
-        self._placement, self._first, self._second = np.zeros((3, joint_count, 4, 4))
-        for i in range(joint_count):
-            self._placement[i] = self.model.jointPlacements[i].homogeneous
-            turn, cross = self.placement_rotation[i], pin.skew(self.local_axis[i])
+        self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])
+        self._first, self._second = np.zeros((2, count, 4, 4))
+        for i, turn in enumerate(self.placement_rotation[1:], 1):
+            joint = self.model.joints[i].createData()
+            self.model.joints[i].calc(joint, pin.neutral(self.model))
+            axis = np.ravel(joint.S).reshape(2, 3)[0 if self.prismatic[i] else 1]
+            self.local_axis[i], cross = axis, pin.skew(axis)
             if self.prismatic[i]:
-                self._first[i, :3, 3] = turn @ self.local_axis[i]
+                self._first[i, :3, 3] = turn @ axis
             else:
                 self._first[i, :3, :3], self._second[i, :3, :3] = turn @ cross, turn @ cross @ cross
         #: position in θ of joint i of pinocchio's tree
-        self.theta_index = np.full(joint_count, -1)
+        self.theta_index = np.full(count, -1)
         self.theta_index[ids] = np.arange(len(ids))
         #: moved_by[i, k]: joint i of the tree hangs on joint k of θ
-        self.moved_by = np.zeros((joint_count, len(ids)), dtype=bool)
-        for i in range(1, joint_count):
+        self.moved_by = np.zeros((count, len(ids)), dtype=bool)
+        for i in range(1, count):
             self.moved_by[i] = self.moved_by[self.parent[i]]
             self.moved_by[i, self.theta_index[i]] = True
 
-    def link_attachment(self, link: str) -> tuple[int, Array, Array]:
-        """Return (joint of the tree, rotation, translation) that carries a link's frame."""
+    def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
+        """Return the joint of the tree that carries a link's point, and the point in its frame."""
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
-        return frame.parentJoint, frame.placement.rotation, frame.placement.translation
+        return frame.parentJoint, frame.placement.act(xyz)
 
     def transforms(self, theta: Array) -> Array:
         """Return the pose of every joint in the root link's frame.
@@ -147,9 +140,7 @@ class Kinematics:
         return columns
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return what each joint moves, the others held [kg·m² or kg]: (..., D) as θ."""
-        if theta.ndim > 1:
-            return np.stack([self.joint_inertia(row) for row in theta])
+        """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
         inertia: Array = np.diag(pin.crba(self.model, self.data, self._q(theta)))[self.order]
         return inertia
 

@@ -13,13 +13,13 @@ from musculoskeletal_ae import options
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import (
+    DESIRED_TENSION,
     REQUIRED_SHARE,
     REQUIRED_STIFFNESS,
-    WISHED_TENSION,
     RobotCheck,
     check_robot,
 )
-from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.moment_arms import MATTERS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -79,7 +79,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',
         '',
         f'{need}; a posture that is not held counts as not stiff',
-        f'held with {tension}, nearest to {WISHED_TENSION:g} N:  {100 * held.mean():.1f} %',
+        f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
         f'stiffness >= {REQUIRED_STIFFNESS:g} N·m/rad:  {100 * result.stiff.mean():.1f} %',
     ]
     if held.any():

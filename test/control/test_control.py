@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from exact_mae import ExactMae
 
-from musculoskeletal_ae.control import proposed as control
-from musculoskeletal_ae.control.length import first_command, msc_compensation
+from musculoskeletal_ae.control import methods as control
+from musculoskeletal_ae.control.methods import first_command, msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError

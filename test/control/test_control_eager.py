@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.timings_control import eager_proposed, eager_proposed_paper
-from musculoskeletal_ae.control import proposed as control
+from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.mae.network import from_mae, to_mae
 from musculoskeletal_ae.mae.training import initial_training
 from musculoskeletal_ae.robot.robot import Robot

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from musculoskeletal_ae.control.stiffness_model import gravity_gradient, stiffness_model
 
 from bench.control_nominal import stiffness_ratios
 from musculoskeletal_ae.control.stiffness import MARGINS, stiffness_command
-from musculoskeletal_ae.control.stiffness_model import gravity_gradient, stiffness_model
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_stiffness
 
