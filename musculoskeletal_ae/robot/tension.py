@@ -18,6 +18,9 @@ import quadprog
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 
+# [N] left between the limits of a muscle that is held at one value (hot, ruptured): without any,
+# quadprog takes its own rounding for infeasibility.
+ROOM = 1e-8
 SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of some hundred N
 
 
@@ -55,8 +58,8 @@ class TensionProgramme:
         count = len(muscle_jacobian)
         eye = np.eye(count)
         self._constraints = np.hstack([-muscle_jacobian, eye, -eye])
-        limits = np.broadcast_to(low, count), -np.broadcast_to(high, count)
-        self._bounds = np.concatenate([torque, *limits])
+        low = np.broadcast_to(low, count)
+        self._bounds = np.concatenate([torque, low, -np.maximum(high, low + ROOM)])
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
