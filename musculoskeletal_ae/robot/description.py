@@ -15,9 +15,10 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.entries import Entry, listed, read_text, read_yaml
+from musculoskeletal_ae.robot.entries import Entry, listed, refusal
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_urdf
 
@@ -86,9 +87,10 @@ def load_description(robot: str | Path) -> RobotDescription:
         RobotDescriptionError: Naming the file, the entry and the legal values.
     """
     directory = find_robot(robot)
-    urdf = read_text(directory / 'robot.urdf')
-    model = read_urdf(directory / 'robot.urdf', urdf)
-    top = read_yaml(directory / 'muscles.yaml').mapping(
+    urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
+    urdf = read_text(urdf_file, refusal)
+    model = read_urdf(urdf_file, urdf)
+    top = Entry(muscle_file, 'top level', read_yaml(muscle_file, refusal), '').mapping(
         'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector'
     )
     joints = _read_joints(top['joints'], model)

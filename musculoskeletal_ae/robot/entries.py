@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entries of the files of a robot directory; every complaint names the file and the entry."""
+"""Entries of muscles.yaml; every complaint names the file and the entry."""
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Hashable, Iterable
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import yaml
+from typing import Any
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-
-MAX_FILE_BYTES = 5_000_000
 
 
 class Entry:
@@ -93,8 +89,8 @@ class Entry:
 
     def unique(self, names: list[str]) -> tuple[str, ...]:
         """Return the names in this entry, none of which may be there twice."""
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise self.fail(f'{name!r} is listed twice; names must be unique')
         return tuple(names)
 
@@ -104,64 +100,7 @@ def listed(names: Iterable[str]) -> str:
     return ', '.join(names)
 
 
-def read_text(file: Path) -> str:
-    """Return the text of one file of a robot directory."""
-    try:
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise RobotDescriptionError(f'{file}: larger than {MAX_FILE_BYTES} bytes')
-        return file.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise RobotDescriptionError(
-            f'{file}: cannot be read ({error}); a robot directory holds robot.urdf and muscles.yaml'
-        ) from error
-
-
-class UniqueKeyLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key written twice, which YAML would silently override."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
-        """Refuse a repeated key, then build the mapping."""
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f'key {key!r} is written twice', node.start_mark
-                )
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(file: Path) -> Entry:
-    """Return the top level of a YAML file."""
-    try:
-        value = yaml.load(read_text(file), Loader=UniqueKeyLoader)  # noqa: S506 (is safe)
-    # A ValueError is what PyYAML lets pass for a date that is none, or an endless integer.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise RobotDescriptionError(f'{file}: not valid YAML: {error}') from error
-    return Entry(file, 'top level', value, '')
-
-
-class Row(NamedTuple):
-    """A line of a table: where it stands, its cells, and its text."""
-
-    where: str
-    cells: list[str]
-    text: str
-
-
-def read_rows(file: Path, columns: list[str]) -> list[Row]:
-    """Return the lines of a CSV file below its header; blank lines and comments (#) are left out.
-
-    Raises:
-        RobotDescriptionError: If it cannot be read or its header is another one.
-    """
-    text = read_text(file)
-    lines = [(i, s) for i, s in enumerate(text.splitlines(), 1) if s.strip() and s[0] != '#']
-    cells = [[cell.strip() for cell in row] for row in csv.reader(s for _, s in lines)]
-    if not cells or cells[0] != columns:
-        found = lines[0][1] if lines else 'nothing'
-        raise RobotDescriptionError(
-            f'{file}: expected the columns {",".join(columns)}, got {found}'
-        )
-    return [
-        Row(f'{file}: line {i}', row, s) for (i, s), row in zip(lines[1:], cells[1:], strict=True)
-    ]
+def refusal(file: Path, problem: str) -> RobotDescriptionError:
+    """Return the error that says what is wrong with a file of a robot directory."""
+    remedy = 'a robot directory holds robot.urdf and muscles.yaml'
+    return RobotDescriptionError(f'{file}: {problem}; {remedy}')

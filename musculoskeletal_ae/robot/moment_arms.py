@@ -11,14 +11,16 @@ even where the arm could still hold itself.
 
 from __future__ import annotations
 
+import os
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription
-from musculoskeletal_ae.robot.entries import listed, read_rows
+from musculoskeletal_ae.robot.entries import listed, refusal
 
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
@@ -49,9 +51,12 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     file = description.directory / DECLARATION_FILE
     legal = (description.muscles, description.joints, ('+', '-'))
     actions: dict[tuple[int, int], int] = {}
-    for where, cells, text in read_rows(file, COLUMNS) if file.is_file() else ():
+    if not os.path.lexists(file):
+        return actions
+    for line, text, cells in read_csv(file, COLUMNS, refusal):
+        where = f'{file}: line {line}'
         if len(cells) != len(COLUMNS):
-            raise RobotDescriptionError(f'{where}: expected 3 values, got {text!r}')
+            raise RobotDescriptionError(f'{where}: expected 3 values, got {text.strip()!r}')
         row = [*cells[:2], cells[2].replace('−', '-')]
         for column, cell, names in zip(COLUMNS, row, legal, strict=True):
             if cell not in names:
