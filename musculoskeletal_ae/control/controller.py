@@ -70,7 +70,12 @@ class Controller:
     # -- what comes in --------------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; another method starts from how the muscles pull at that moment."""
+        """Take new settings; another method starts from how the muscles pull at that moment.
+
+        Raises:
+            MusculoskeletalError: If the joint stiffness does not fit the robot.
+        """
+        settings.desired_stiffness(self._robot.joint_count)
         before, self.settings = self.settings, settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
         if settings.method != before.method and not self.posture.exploring:

@@ -215,7 +215,7 @@ class PostureControl:
             return Solution(length, tension, nothing)
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':
-            desired = np.array(self.settings.joint_stiffness or nothing)
+            desired = np.array(self.settings.desired_stiffness(robot.joint_count))
             self.stiffness = stiffness_command(robot, mae, theta, torque, desired, limit)
             return self.stiffness.command
         if self.settings.by_balance:

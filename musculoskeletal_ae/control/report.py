@@ -67,13 +67,13 @@ def _missing_torque(control: Controller) -> Array:
 
 def _stiffness_values(robot: Robot, control: Controller) -> dict[str, str]:
     """Return each joint's expected and reachable stiffness, and whether the desired one is not."""
-    solution, chosen = control.posture.stiffness, control.settings.joint_stiffness
+    solution = control.posture.stiffness
     if solution is None:
         return {}
     values = {}
     rows = zip(
         robot.joints,
-        chosen or np.zeros(robot.joint_count),
+        control.settings.desired_stiffness(robot.joint_count),
         solution.stiffness.diagonal(),
         solution.lowest,
         solution.highest,
