@@ -75,12 +75,13 @@ class Controller:
         Raises:
             MusculoskeletalError: If the joint stiffness does not fit the robot.
         """
-        settings.desired_stiffness(self._robot.joint_count)
-        before, self.settings = self.settings, settings
+        before, joints = self.settings, self._robot.joint_count
+        stiffness = settings.desired_stiffness(joints)
+        self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
         if settings.method != before.method and not self.posture.exploring:
             self._starts = True
-        elif settings.method == 'stiffness' and settings.joint_stiffness != before.joint_stiffness:
+        elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
             self.posture.start()
 
     def use(self, mae: Mae) -> None:

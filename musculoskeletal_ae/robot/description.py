@@ -22,11 +22,6 @@ from musculoskeletal_ae.robot.entries import Entry, listed, refusal
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_urdf
 
-ELASTIC_DEFAULT = {
-    'force': series_elastic.DEFAULT_FORCE,
-    'rate': series_elastic.DEFAULT_RATE,
-    'wire_stretch': series_elastic.DEFAULT_WIRE_STRETCH,
-}
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
 
@@ -94,7 +89,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector'
     )
     joints = _read_joints(top['joints'], model)
-    default = _read_elastic(top.get('series_elastic'), ELASTIC_DEFAULT)
+    default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
     names, routes, elastic = [], [], []
     for item in top['muscles'].items(1, 'muscles'):
         entry = item.mapping('name', 'route', 'series_elastic')
@@ -110,7 +105,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         muscles=top['muscles'].unique(names),
         routes=tuple(routes),
         series_elastic=SeriesElastic(
-            **{key: np.array([row[key] for row in elastic]) for key in ELASTIC_DEFAULT}
+            **{key: np.array([row[key] for row in elastic]) for key in series_elastic.DEFAULT}
         ),
         stiffness=top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0),
         tension=_read_tension(top.get('tension', {})),
@@ -149,7 +144,7 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
 def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     if entry.value is None:
         return default
-    given = entry.mapping(*ELASTIC_DEFAULT)
+    given = entry.mapping(*series_elastic.DEFAULT)
     force, rate = (given.get(key, default[key]).number(above=0.0) for key in ('force', 'rate'))
     stretch = given.get('wire_stretch', default['wire_stretch']).number(least=0.0)
     return {'force': force, 'rate': rate, 'wire_stretch': stretch}
