@@ -17,7 +17,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import Exertion, least_tension
+from musculoskeletal_ae.robot.tension import least_tension
 
 SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
@@ -62,9 +62,9 @@ class TorqueControl:
         torque = self._robot.kinematics.holding_torque(smooth) + effort
         torque = torque + chosen.position_gain * (target - smooth)
         torque = torque - chosen.velocity_gain * velocity
-        tension, self.missing_torque = torque_exertion(
-            self._robot, mae, smooth, torque, self._command, limit
-        )
+        jacobian = mae.muscle_jacobian(smooth, self._command)
+        bias = self._robot.tension.bias
+        tension, self.missing_torque = least_tension(jacobian, torque, bias, limit)
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
         change = tension - self._command
         fastest = self._robot.stiffness * chosen.rate_limit * dt
@@ -72,11 +72,3 @@ class TorqueControl:
             1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9)
         )
         return self._command.copy()
-
-
-def torque_exertion(
-    robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, limit: Array
-) -> Exertion:
-    """Return the tensions for a torque τ [N·m] (D,), with G at (θ, T)."""
-    jacobian = mae.muscle_jacobian(theta, tension)
-    return least_tension(jacobian, torque, robot.tension.bias, limit)

@@ -78,27 +78,8 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     jacobian = robot.routes.muscle_jacobian(theta)
     torque = robot.kinematics.holding_torque(theta)
-    low, high = robot.tension.bias, robot.tension.limit
-    faults = moment_arm_faults(robot.description, -jacobian) + _inertia_faults(robot, theta)
-    tension = np.full((postures, robot.muscle_count), np.nan)
-    missing = np.zeros((postures, robot.joint_count))
-    stiffness, one_sided = np.full((2, postures), np.nan)
-    softest = np.full(postures, -1)
-    for n in range(postures):
-        programme = TensionProgramme(jacobian[n], torque[n], low, high)
-        try:
-            tension[n] = programme.nearest(DESIRED_TENSION)
-        except InfeasibleError:
-            missing[n] = programme.compromise().missing_torque
-            continue
-        hessian = muscle_hessian(robot.routes.muscle_jacobian, theta[n])
-        k = robot.muscle_stiffness(theta[n], tension[n])
-        values, vectors = np.linalg.eigh(joint_stiffness(jacobian[n], hessian, k, tension[n]))
-        stiffness[n], softest[n] = values[0], np.abs(vectors[:, 0]).argmax()
-        taut = np.where(tension[n] > low + SLACK_MARGIN, k, 0.0)
-        one_sided[n] = np.linalg.eigvalsh(joint_stiffness(jacobian[n], hessian, taut, tension[n]))[
-            0
-        ]
+    measured = [_measure(robot, *at) for at in zip(theta, jacobian, torque, strict=True)]
+    tension, missing, stiffness, softest, one_sided = map(np.array, zip(*measured, strict=True))
     return RobotCheck(
         postures=theta,
         moment_arms=-jacobian,
@@ -106,9 +87,33 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         missing_torque=missing,
         stiffness=stiffness,
         one_sided=one_sided,
-        faults=(*faults, *_holding_faults(robot, stiffness, softest, missing)),
+        faults=(
+            *moment_arm_faults(robot.description, -jacobian),
+            *_inertia_faults(robot, theta),
+            *_holding_faults(robot, stiffness, softest, missing),
+        ),
         warnings=tuple(moment_arm_warnings(robot.description, -jacobian)),
     )
+
+
+def _measure(
+    robot: Robot, theta: Array, jacobian: Array, torque: Array
+) -> tuple[Array, Array, float, int, float]:
+    """Return tension, missing torque, stiffness, softest joint, one-sided stiffness at θ (D,)."""
+    bias = robot.tension.bias
+    programme = TensionProgramme(jacobian, torque, bias, robot.tension.limit)
+    try:
+        tension = programme.nearest(DESIRED_TENSION)
+    except InfeasibleError:
+        missing = programme.compromise().missing_torque
+        return np.full(robot.muscle_count, np.nan), missing, np.nan, -1, np.nan
+    hessian = muscle_hessian(robot.routes.muscle_jacobian, theta)
+    k = robot.muscle_stiffness(theta, tension)
+    taut = np.where(tension > bias + SLACK_MARGIN, k, 0.0)
+    values, vectors = np.linalg.eigh(joint_stiffness(jacobian, hessian, k, tension))
+    one_sided = np.linalg.eigvalsh(joint_stiffness(jacobian, hessian, taut, tension))[0]
+    softest = int(np.abs(vectors[:, 0]).argmax())
+    return tension, np.zeros(robot.joint_count), values[0], softest, one_sided
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> list[Finding]:

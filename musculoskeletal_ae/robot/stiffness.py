@@ -15,7 +15,6 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.robot.kinematics import Kinematics
 
 
 def muscle_stiffness(module: float, compliance: Array) -> Array:
@@ -55,17 +54,3 @@ def joint_stiffness(
     elastic = muscle_jacobian.T @ (stiffness[:, None] * muscle_jacobian)
     joint: Array = elastic + np.einsum('m,mij->ij', tension, hessian)
     return joint
-
-
-def push_deflection(kinematics: Kinematics, theta: Array, stiffness: Array, wrench: Array) -> Array:
-    """Return by how much a small push turns the joints, (K_θ + ∂g/∂θ)⁻¹ Jᵀ F [rad], shape (D,).
-
-    Args:
-        kinematics: Weight and end effector.
-        theta: Where the arm rests [rad], shape (D,).
-        stiffness: K_θ [N·m/rad], shape (D, D).
-        wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
-    """
-    torque = kinematics.end_effector_jacobian(theta).T @ wrench
-    turn: Array = np.linalg.inv(stiffness + kinematics.gravity_gradient(theta)) @ torque
-    return turn

@@ -9,9 +9,7 @@ import os
 import pytest
 from graph import Graph
 
-from musculoskeletal_ae.mae import checkpoint, evaluation
-from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 
 _counter = itertools.count(1)
@@ -23,15 +21,10 @@ def arm26() -> Robot:
 
 
 @pytest.fixture(scope='session')
-def trained(arm26, tmp_path_factory) -> str:
-    """Return a checkpoint file of arm26, trained for a few seconds."""
-    from dataclasses import replace
-
-    network, _ = initial_training(arm26, 'default', steps=600)
-    mae = to_mae(network, arm26.joints, arm26.muscles, 'default', 'briefly, for a test')
-    mae = replace(mae, anomaly=evaluation.geometric_anomaly(mae, arm26, seed=0))
+def trained(trained, tmp_path_factory) -> str:
+    """Return a checkpoint file of arm26."""
     path = tmp_path_factory.mktemp('checkpoint') / 'arm26.safetensors'
-    checkpoint.save(mae, path)
+    checkpoint.save(trained['default'], path)
     return str(path)
 
 
