@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may choose about control: every setting with its meaning, unit and range.
-
-One table for the core and the node, which declares a parameter for each field here.
-"""
+"""What a user may choose about control: one table for the core and the node's parameters."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, Parameter
+from musculoskeletal_ae.presets import PRESETS
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 
@@ -21,9 +18,9 @@ def _number(default: float, meaning: str, unit: str, low: float, high: float) ->
     return Parameter(default, meaning, unit, (low, high), settable=True).field()
 
 
-@dataclass
+@dataclass(frozen=True)
 class Settings:
-    """Settings of control; the owner may change them at any time."""
+    """Settings of control; `Controller.configure` takes changed ones."""
 
     method: str = Parameter(
         'proposed', 'how a target posture becomes a command', legal=METHODS, settable=True
@@ -34,7 +31,7 @@ class Settings:
         'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
         'N·m/rad',
         settable=True,
-    ).field(default=())
+    ).field()
     first_duration: float = _number(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = _number(
         2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
@@ -48,9 +45,11 @@ class Settings:
     position_gain: float = _number(
         10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
     )
-    velocity_gain: float = _number(0.5, 'damping torque, method `tension`', 'N·m·s/rad', 0.0, 20.0)
+    velocity_gain: float = _number(
+        0.5, 'damping torque, method `tension` (0: none)', 'N·m·s/rad', 0.0, 20.0
+    )
     feedback_gain: float = _number(
-        0.5, 'correction at rest of error and needless tension, `proposed`', '1/s', 0.0, 2.0
+        0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
     )
     max_age: float = _number(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
@@ -60,21 +59,22 @@ class Settings:
         85.0, 'a module this hot pulls with T_bias only', '°C', 40.0, 200.0
     )
 
+    @property
+    def by_balance(self) -> bool:
+        """Whether `proposed` solves the balance of torques, instead of the printed descent."""
+        return PRESETS[self.preset].equilibrium
 
-def read_stiffness(wished: Iterable[Any], joints: int) -> tuple[float, ...]:
-    """Return the wish as `Settings` keeps it; nothing, or a single 0, is all as they come.
+    def desired_stiffness(self, joints: int) -> tuple[float, ...]:
+        """Return `joint_stiffness` for so many joints; nothing, or a single 0, is all as they come.
 
-    Raises:
-        MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
-    """
-    try:
-        values = tuple(float(value) for value in wished)
-    except (TypeError, ValueError):
-        values = (math.nan,)
-    if values == (0.0,):
-        return ()
-    if len(values) not in (0, joints) or not all(0.0 <= value < math.inf for value in values):
-        raise MusculoskeletalError(
-            f'joint stiffness {wished!r}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
-        )
-    return values
+        Raises:
+            MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
+        """
+        values = self.joint_stiffness
+        if values in ((), (0.0,)):
+            return (0.0,) * joints
+        if len(values) != joints or not all(0.0 <= value < math.inf for value in values):
+            raise MusculoskeletalError(
+                f'{list(values)}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
+            )
+        return values

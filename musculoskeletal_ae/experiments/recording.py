@@ -10,7 +10,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
-from musculoskeletal_ae.control.length import first_command, ramp
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -76,7 +76,8 @@ def record(
     for goal in goals:
         start = command
         for tick in range(round(goal.duration / SAMPLE_TIME)):
-            command = ramp(start, goal.length, (tick + 1) * SAMPLE_TIME, RAMP_SHARE * goal.duration)
+            share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * goal.duration))
+            command = start + share * (goal.length - start)
             arm.command_length(command)
             arm.step(SAMPLE_TIME)
             read = arm.sense()

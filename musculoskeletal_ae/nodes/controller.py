@@ -8,6 +8,7 @@ muscle_length_command, or muscle_tension_command with method `tension`.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,10 +17,9 @@ from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.report import control_report, stiffness_values
+from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
-from musculoskeletal_ae.control.settings import Settings, read_stiffness
-from musculoskeletal_ae.control.stiffness import StiffnessSolution
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.messages import (
     QUANTITIES,
     array_message,
@@ -41,12 +41,10 @@ class Controller(Shell):
     def __init__(self, **options: Any) -> None:
         """Declare topics and services; options are those of Node."""
         super().__init__('controller', **options)
-        self.settings = Settings()
-        self.core = Core(self.robot, self.settings, self.parameter('seed'))
+        self.core = Core(self.robot, seed=self.parameter('seed'))
         for name in parameters_of(Settings):
-            self.follow_parameter(name, partial(self._change, name))
-        self.cause = ''
-        self.stiffness: StiffnessSolution | None = None
+            self.follow_parameter(name, partial(self._configure, name))
+        self.told: list[str] = []
         self.publishers_of = {
             LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
             TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
@@ -66,11 +64,8 @@ class Controller(Shell):
         if self.parameter('explore'):
             self.core.explore(True)
 
-    def _change(self, name: str, value: Any) -> None:
-        if name == 'joint_stiffness':
-            value = read_stiffness(value, self.robot.joint_count)
-            self.core.posture.start()
-        setattr(self.settings, name, value)
+    def _configure(self, name: str, value: Any) -> None:
+        self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
@@ -122,11 +117,11 @@ class Controller(Shell):
     def state(self) -> tuple[bytes, str, dict[str, str]]:
         """Return what /diagnostics shows, and log what has changed."""
         report = control_report(self.robot, self.core, time.monotonic())
-        cause, found = self.core.safety.cause, self.core.posture.stiffness
-        if cause and cause != self.cause:
-            self.get_logger().warning(f'stopped: {cause}')
-        if found is not None and found is not self.stiffness:
-            for what, said in stiffness_values(self.robot, self.settings, found).items():
-                self.get_logger().info(f'{what}: {said}')
-        self.cause, self.stiffness = cause, found
+        stopped = [report.message] if self.core.safety.cause else []
+        stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
+        for line in stopped + stiffness:
+            if line not in self.told:
+                log = self.get_logger().warning if line in stopped else self.get_logger().info
+                log(line)
+        self.told = stopped + stiffness
         return LEVELS[report.level], report.message, report.values

@@ -21,7 +21,7 @@ from musculoskeletal_ae.experiments.suite.registry import NAMES
 from musculoskeletal_ae.experiments.suite.run import run, total_weight
 from musculoskeletal_ae.experiments.suite.study import Study
 from musculoskeletal_ae.presets import PRESETS
-from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.

@@ -25,7 +25,7 @@ from musculoskeletal_ae.mae.training import (
 )
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets import PRESETS
-from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from musculoskeletal_ae.control.length import first_command
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.messages import array_message, bytes_message, read_array
 from musculoskeletal_ae.nodes.qos import LATCHED

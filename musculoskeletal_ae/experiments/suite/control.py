@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.proposed import proposed
+from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import InfeasibleError
