@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a part of the system says of itself, for people and for /diagnostics."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+
+class Report(NamedTuple):
+    """How it is, in one line and in named values."""
+
+    level: Literal['ok', 'warn', 'error']
+    message: str
+    values: dict[str, str]
