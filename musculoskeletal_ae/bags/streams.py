@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,11 +16,11 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.selection import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.messages import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.pairing import Paired, Pairing
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import LATE, QUANTITIES, SourceOrder, read_array, read_posture
 
 # A source time that lies further back than this is another publisher's clock, not a reordering.
-_REORDERING = 1_000_000_000  # [ns]
 
 
 class Series(NamedTuple):
@@ -56,25 +58,35 @@ class Streams:
     rejected: Counter[str]
 
     def pairs(self, period: float | None = None) -> Pairs:
-        """Pair each (T, l) with the nearest θ, if that is within half a period.
+        """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.pairing`).
 
         Args:
             period: Of muscle_states [s]; None for the median one of the recording.
         """
-        time, joint_time = self.muscles.time, self.joints.time
         if period is None:
-            period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        if not len(joint_time):
-            found = nearest = np.zeros(0, dtype=int)
-        else:
-            right = np.searchsorted(joint_time, time).clip(0, len(joint_time) - 1)
-            left = (right - 1).clip(0)
-            closer_left = np.abs(time - joint_time[left]) <= np.abs(time - joint_time[right])
-            nearest = np.where(closer_left, left, right)
-            found = np.flatnonzero(np.abs(time - joint_time[nearest]) <= period / 2)
-        chosen = self.muscles.values[found]
-        theta = self.joints.values[nearest[found]]
-        return Pairs(time[found], theta, chosen[:, 0], chosen[:, 1])
+            period = (
+                float(np.median(np.diff(self.muscles.time))) if len(self.muscles.time) > 1 else 0.0
+            )
+        pairing = Pairing(period)
+        joints = ((time, 0, row) for row, time in enumerate(self.joints.time))
+        muscles = ((time, 1, row) for row, time in enumerate(self.muscles.time))
+        paired: list[Paired | None] = []
+        for time, kind, row in heapq.merge(joints, muscles):
+            if kind == 0:
+                pairing.joints(time, self.joints.values[row])
+            else:
+                length, tension, _ = self.muscles.values[row]
+                paired.append(pairing.muscles(time, tension, length))
+        if paired:
+            paired.append(pairing.muscles(math.inf, tension, length))  # gives out the last one
+        found = [one for one in paired if one is not None and one.theta is not None]
+        muscle_count, joint_count = self.muscles.values.shape[2], self.joints.values.shape[1]
+        return Pairs(
+            np.array([one.time for one in found]),
+            np.array([one.theta for one in found]).reshape(-1, joint_count),
+            np.array([one.length for one in found]).reshape(-1, muscle_count),
+            np.array([one.tension for one in found]).reshape(-1, muscle_count),
+        )
 
 
 def read_streams(
@@ -92,44 +104,39 @@ def read_streams(
         BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
     muscles = robot.muscle_count
-    topics = interface_topics(bag, namespace)
+    streams: dict[str, tuple[tuple[int, ...], Callable[[Any], Array]]] = {
+        joint_topic: ((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
+        'muscle_states': ((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
+        'muscle_length_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
+        'muscle_tension_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
+    }
+    recorded = interface_topics(bag, namespace)
+    names = {recorded[name]: name for name in streams if name in recorded}
+    times: dict[str, list[float]] = {name: [] for name in streams}
+    values: dict[str, list[Array]] = {name: [] for name in streams}
+    orders = {topic: SourceOrder() for topic in names}
     rejected: Counter[str] = Counter()
-
-    def series(topic: str, shape: tuple[int, ...], read: Callable[[Any], Array]) -> Series:
-        return _series(bag, topics.get(topic), shape, read, rejected)
-
-    return Streams(
-        series(joint_topic, (robot.joint_count,), lambda m: read_posture(m, robot.joints)),
-        series('muscle_states', (3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
-        series('muscle_length_command', (muscles,), lambda m: read_array(m, 1, muscles)),
-        series('muscle_tension_command', (muscles,), lambda m: read_array(m, 1, muscles)),
-        rejected,
-    )
-
-
-def _series(
-    bag: Bag,
-    topic: str | None,
-    shape: tuple[int, ...],
-    read: Callable[[Any], Array],
-    rejected: Counter[str],
-) -> Series:
-    times: list[float] = []
-    values: list[Array] = []
-    last_source, why = 0, ''
-    for message in bag.messages([topic]) if topic else ():
-        # As nodes do: of messages that come twice or late, the later ones are dropped.
-        if 0 <= last_source - message.publish_time < _REORDERING and message.publish_time:
-            rejected[f'{topic}: repeated or reordered'] += 1
+    problems: dict[str, str] = {}
+    for message in bag.messages(names):
+        topic, name = message.topic, names[message.topic]
+        if orders[topic].is_late(message.publish_time):
+            rejected[f'{topic}: {LATE}'] += 1
             continue
-        last_source = message.publish_time
+        orders[topic].take(message.publish_time)
         try:
-            values.append(read(bag.decode(message)))
-            times.append((message.log_time - bag.start) / 1e9)
+            values[name].append(streams[name][1](bag.decode(message)))
+            times[name].append((message.log_time - bag.start) / 1e9)
         except MessageError as error:
             rejected[f'{topic}: {error.reason}'] += 1
-            why = str(error)
-    if why and not values:
-        problem = f'no message of {topic} fits the robot ({why})'
-        raise BagError(bag.path, None, problem, 'choose the robot it was recorded from')
-    return Series(np.array(times), np.array(values).reshape(len(values), *shape))
+            problems[topic] = str(error)
+    for topic, name in names.items():
+        if topic in problems and not values[name]:
+            problem = f'no message of {topic} fits the robot ({problems[topic]})'
+            raise BagError(bag.path, None, problem, 'choose the robot it was recorded from')
+    return Streams(
+        *(
+            Series(np.array(times[name]), np.array(values[name]).reshape(-1, *shape))
+            for name, (shape, _) in streams.items()
+        ),
+        rejected,
+    )

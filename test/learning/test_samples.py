@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.learning.collector import MARGIN, Collector
-from musculoskeletal_ae.learning.pairing import Pairing
 from musculoskeletal_ae.learning.rest import RestDetector, RestSettings
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.sliding import SlidingTracker
 from musculoskeletal_ae.learning.store import SampleStore
+from musculoskeletal_ae.pairing import Pairing
 
 DT = 0.01
 

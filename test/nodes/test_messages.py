@@ -14,13 +14,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.messages import (
-    array_message,
-    read_array,
-    read_joints,
-    read_posture,
-    read_wrench,
-)
+from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.validity import read_array, read_joints, read_posture, read_wrench
 
 JOINTS = ('a', 'b')
 
