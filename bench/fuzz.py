@@ -120,7 +120,7 @@ def attempt(path: Path, base: Base, content: list[samples.Sample], unfinished: b
         outcome = f'crash: {type(error).__name__}: {error}'
     else:
         read = [message[:4] for message in messages]
-        checked = all(found.checked for found in bag.scans)
+        checked = all(file.checked for file in bag.files)
         if not checked:
             sound = len(read) == len(expected) or bool(bag.unfinished)
         else:

@@ -7,14 +7,14 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.selection import interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.pairing import Paired, Pairing
 from musculoskeletal_ae.robot.robot import Robot
@@ -104,39 +104,46 @@ def read_streams(
         BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
     muscles = robot.muscle_count
-    streams: dict[str, tuple[tuple[int, ...], Callable[[Any], Array]]] = {
-        joint_topic: ((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
-        'muscle_states': ((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
-        'muscle_length_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
-        'muscle_tension_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
+    streams = {
+        joint_topic: _Stream((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
+        'muscle_states': _Stream((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
+        'muscle_length_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
+        'muscle_tension_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
     }
     recorded = interface_topics(bag, namespace)
-    names = {recorded[name]: name for name in streams if name in recorded}
-    times: dict[str, list[float]] = {name: [] for name in streams}
-    values: dict[str, list[Array]] = {name: [] for name in streams}
-    orders = {topic: SourceOrder() for topic in names}
-    rejected: Counter[str] = Counter()
-    problems: dict[str, str] = {}
-    for message in bag.messages(names):
-        topic, name = message.topic, names[message.topic]
-        if orders[topic].is_late(message.publish_time):
+    topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
+    start, rejected = bag.start, Counter[str]()
+    for message in bag.messages(topics):
+        topic, stream = message.topic, topics[message.topic]
+        if stream.order.is_late(message.publish_time):
             rejected[f'{topic}: {LATE}'] += 1
             continue
-        orders[topic].take(message.publish_time)
+        stream.order.take(message.publish_time)
         try:
-            values[name].append(streams[name][1](bag.decode(message)))
-            times[name].append((message.log_time - bag.start) / 1e9)
+            stream.values.append(stream.read(bag.decode(message)))
+            stream.times.append((message.log_time - start) / 1e9)
         except MessageError as error:
             rejected[f'{topic}: {error.reason}'] += 1
-            problems[topic] = str(error)
-    for topic, name in names.items():
-        if topic in problems and not values[name]:
-            problem = f'no message of {topic} fits the robot ({problems[topic]})'
+            stream.problem = str(error)
+    for topic, stream in topics.items():
+        if stream.problem and not stream.values:
+            problem = f'no message of {topic} fits the robot ({stream.problem})'
             raise BagError(bag.path, None, problem, 'choose the robot it was recorded from')
-    return Streams(
-        *(
-            Series(np.array(times[name]), np.array(values[name]).reshape(-1, *shape))
-            for name, (shape, _) in streams.items()
-        ),
-        rejected,
-    )
+    joints, states, lengths, tensions = (stream.series for stream in streams.values())
+    return Streams(joints, states, lengths, tensions, rejected)
+
+
+@dataclass
+class _Stream:
+    """A topic that is being read: the shape of its values, and what was wrong with the last one."""
+
+    shape: tuple[int, ...]
+    read: Callable[[Any], Array]
+    order: SourceOrder = field(default_factory=SourceOrder)
+    times: list[float] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
+    problem: str = ''
+
+    @property
+    def series(self) -> Series:
+        return Series(np.array(self.times), np.array(self.values).reshape(-1, *self.shape))
