@@ -260,7 +260,7 @@ class _Source:
             # One byte of opcode is read first; what is read as a whole is the magic.
             self.begin = self.offset
             self._end += _HEAD if count == 1 else count
-        if self.exhausted:
+        if self._end > self.size:
             raise EOFError('a record reaches beyond the end')
         if not 0 <= count <= self._end - self.offset:
             raise ValueError('the lengths in a record do not fit')
@@ -273,6 +273,8 @@ class _Source:
             raise ValueError(f'record {data[0]:#04x} does not belong here')
         if self.offset == self.begin + _HEAD:
             self._end = self.offset + int.from_bytes(data, 'little')
+            if self._end == self.offset:
+                raise ValueError('the lengths in a record do not fit: it is empty')
         return data
 
 

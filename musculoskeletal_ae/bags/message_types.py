@@ -79,4 +79,6 @@ def contradiction(type_name: str, encoding: str, text: bytes, recorded_hash: str
 @lru_cache(maxsize=100)
 def _fields(type_name: str, text: str) -> dict[str, Any]:
     """Return the fields of a type and all it contains, constants and defaults left out."""
+    # The parser takes neither comments everywhere nor the line ends of Windows.
+    text = '\n'.join(line.split('#')[0].strip() for line in text.splitlines())
     return {name: fields for name, (_, fields) in get_types_from_msg(text, type_name).items()}

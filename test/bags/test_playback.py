@@ -5,10 +5,12 @@ import math
 
 import pytest
 
-from musculoskeletal_ae.bags import options, samples
-from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, latched_topics, window
+from bench import bag_samples as samples
+from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.nodes import record, replay
 
 SECOND = 1_000_000_000
 
@@ -85,23 +87,23 @@ def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_pat
 @pytest.mark.parametrize(
     ('parse', 'arguments', 'problem'),
     [
-        (options.parse_replay, [], 'BAG'),
-        (options.parse_replay, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
-        (options.parse_replay, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
-        (options.parse_replay, ['bag', '--rate', 'nan', '--clock'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--start', '-1'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--duration', 'inf'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--topics', ','], 'no topic is named'),
-        (options.parse_replay, ['bag', '--robot', 'arm26'], '--robot is for --check'),
-        (options.parse_replay, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
+        (replay.parse, [], 'BAG'),
+        (replay.parse, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
+        (replay.parse, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
+        (replay.parse, ['bag', '--rate', 'nan', '--clock'], 'not a number above 0'),
+        (replay.parse, ['bag', '--start', '-1'], 'not a number of at least 0'),
+        (replay.parse, ['bag', '--duration', 'inf'], 'not a number above 0'),
+        (replay.parse, ['bag', '--topics', ','], 'no name is given'),
+        (replay.parse, ['bag', '--robot', 'arm26'], '--robot is for --check'),
+        (replay.parse, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
         (
-            options.parse_record,
+            record.parse,
             ['--topics', 'muscle_states,nothing'],
             "'nothing' is none of joint_",
         ),
-        (options.parse_record, ['--duration', '0'], 'not a number above 0'),
-        (options.parse_record, ['a', '-o', 'b'], 'DIR is given twice'),
-        (options.parse_record, ['--compression', 'rar'], 'invalid choice'),
+        (record.parse, ['--duration', '0'], 'not a number above 0'),
+        (record.parse, ['a', '-o', 'b'], 'DIR is given twice'),
+        (record.parse, ['--compression', 'rar'], 'invalid choice'),
     ],
 )
 def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem, capsys):
