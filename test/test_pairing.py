@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from musculoskeletal_ae.pairing import Pairing
 
@@ -29,3 +33,46 @@ def test_a_clock_that_goes_back_starts_pairing_anew():
     after = pairing.muscles(0.01, np.ones(1), np.ones(1))
     assert after.dt == 0.0
     assert after.theta == [2.0]
+
+
+def paired_live(joints, muscles, period):
+    """Return for each muscle message the number of its θ, or None, in the order of arrival."""
+    pairing = Pairing(period)
+    given_out = []
+    for time, kind, number in sorted(
+        [(time, 0, n) for n, time in enumerate(joints)]
+        + [(time, 1, n) for n, time in enumerate([*muscles, math.inf])]
+    ):
+        if kind == 0:
+            pairing.joints(time, np.array([number]))
+        elif paired := pairing.muscles(time, np.ones(1), np.ones(1)):
+            given_out.append(None if paired.theta is None else int(paired.theta[0]))
+    return given_out
+
+
+def paired_by_definition(joints, muscles, period):
+    """The same from all times at once: who is nearest to whom."""
+    owners = [min(muscles, key=lambda m: abs(m - time), default=None) for time in joints]
+    return [
+        min(
+            (n for n, time in enumerate(joints) if owners[n] == m and abs(time - m) <= period / 2),
+            key=lambda n: abs(joints[n] - m),
+            default=None,
+        )
+        for m in muscles
+    ]
+
+
+times = st.lists(st.integers(0, 200), unique=True, max_size=30).map(sorted)
+
+
+@given(times, times, st.integers(2, 40))
+def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, muscles, period):
+    assert paired_live(joints, muscles, period) == paired_by_definition(joints, muscles, period)
+
+
+def test_what_is_kept_does_not_grow_while_one_stream_is_silent():
+    pairing = Pairing(0.01)
+    for n in range(1000):
+        pairing.joints(n * 0.001, np.zeros(1))
+        assert len(pairing._angles) <= 3

@@ -44,42 +44,24 @@ _LONGEST_NAME = 256
 
 @dataclass
 class BagTopic:
-    """A topic of a bag.
+    """A topic of a bag."""
 
-    Attributes:
-        name: Absolute, as recorded.
-        type: Message type.
-        qos: Offered QoS profiles, YAML as rosbag2 writes it.
-        refused: Why its messages cannot be used, '' if they can.
-        schema: The recorded definition, to be copied and never used.
-        message_count: Number of messages.
-    """
-
-    name: str
+    name: str  # absolute, as recorded
     type: str
-    qos: str
-    refused: str
-    schema: mcap.Schema
+    qos: str  # offered profiles, YAML as rosbag2 writes it
+    refused: str  # why its messages cannot be used, '' if they can
+    schema: mcap.Schema  # the recorded definition, to be copied and never used
     message_count: int = 0
 
 
 @dataclass
 class Block:
-    """A piece of the file that is read at once: a chunk, or a run of messages outside of chunks.
+    """A piece of the file that is read at once: a chunk, or a run of messages outside of chunks."""
 
-    Attributes:
-        offset: Where it begins.
-        stop: Where it ends.
-        start: Earliest log time [ns].
-        end: Latest log time [ns].
-        topics: Those it has messages of.
-        chunk: Whether it is a chunk.
-    """
-
-    offset: int
-    stop: int
-    start: int
-    end: int
+    offset: int  # where it begins
+    stop: int  # where it ends
+    start: int  # earliest log time [ns]
+    end: int  # latest log time [ns]
     topics: set[str]
     chunk: bool
 
@@ -176,6 +158,10 @@ class McapFile:
                     raise ValueError('the checksum of the summary does not fit')
             for inner in _contents(record):
                 match inner:
+                    case mcap.Message():
+                        self._add(inner, source, isinstance(record, mcap.Chunk))
+                        self.backward += inner.log_time < latest
+                        latest = inner.log_time
                     case mcap.Schema():
                         if inner.id == 0 or schemas.setdefault(inner.id, inner) != inner:
                             raise ValueError(f'schema {inner.id} is given twice and differs')
@@ -184,14 +170,18 @@ class McapFile:
                             raise ValueError(f'channel {inner.id} is given twice and differs')
                         if inner.id not in self.channels:
                             self.channels[inner.id] = _topic(inner, schemas)
-                    case mcap.Message():
-                        self._add(inner, source, isinstance(record, mcap.Chunk))
-                        self.backward += inner.log_time < latest
-                        latest = inner.log_time
         if source.offset != source.size:
             raise ValueError(f'{source.size - source.offset} bytes after the end')
         if statistics is not None:
-            self._compare(statistics)
+            total = sum(topic.message_count for topic in self.channels.values())
+            if statistics.message_count != total:
+                counted = statistics.message_count
+                raise ValueError(f'the summary counts {counted} messages, {total} were read')
+            for number, counted in statistics.channel_message_counts.items():
+                topic = self.channels.get(number)
+                if counted != (topic.message_count if topic else 0):
+                    raise ValueError(f'channel {number} has not the {counted} messages it says')
+            self.summarised = True
 
     def _add(self, message: mcap.Message, source: _Source, chunk: bool) -> None:
         """Take note of a message in the record that the source has just read."""
@@ -215,17 +205,6 @@ class McapFile:
             last.topics.add(topic.name)
         else:
             self.blocks.append(Block(begin, stop, time, time, {topic.name}, chunk))
-
-    def _compare(self, statistics: mcap.Statistics) -> None:
-        read = {key: n for key, topic in self.channels.items() if (n := topic.message_count)}
-        said = {key: n for key, n in statistics.channel_message_counts.items() if n}
-        total = sum(read.values())
-        if statistics.message_count != total:
-            problem = f'the summary counts {statistics.message_count} messages, {total} were read'
-            raise ValueError(problem)
-        if said and said != read:
-            raise ValueError('the summary counts other messages by topic than were read')
-        self.summarised = True
 
 
 class _Source:

@@ -63,29 +63,28 @@ class Streams:
         Args:
             period: Of muscle_states [s]; None for the median one of the recording.
         """
+        time = self.muscles.time
         if period is None:
-            period = (
-                float(np.median(np.diff(self.muscles.time))) if len(self.muscles.time) > 1 else 0.0
-            )
+            period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
         pairing = Pairing(period)
-        joints = ((time, 0, row) for row, time in enumerate(self.joints.time))
-        muscles = ((time, 1, row) for row, time in enumerate(self.muscles.time))
         paired: list[Paired | None] = []
-        for time, kind, row in heapq.merge(joints, muscles):
+        joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
+        muscles = ((came, 1, row) for row, came in enumerate(time))
+        # A muscle message at the end of time gives out the last one.
+        end = [(math.inf, 1, -1)] if len(time) else []
+        for came, kind, row in heapq.merge(joints, muscles, end):
             if kind == 0:
-                pairing.joints(time, self.joints.values[row])
+                pairing.joints(came, self.joints.values[row])
             else:
                 length, tension, _ = self.muscles.values[row]
-                paired.append(pairing.muscles(time, tension, length))
-        if paired:
-            paired.append(pairing.muscles(math.inf, tension, length))  # gives out the last one
+                paired.append(pairing.muscles(came, tension, length))
         found = [one for one in paired if one is not None and one.theta is not None]
-        muscle_count, joint_count = self.muscles.values.shape[2], self.joints.values.shape[1]
+        shape = -1, self.muscles.values.shape[2]
         return Pairs(
             np.array([one.time for one in found]),
-            np.array([one.theta for one in found]).reshape(-1, joint_count),
-            np.array([one.length for one in found]).reshape(-1, muscle_count),
-            np.array([one.tension for one in found]).reshape(-1, muscle_count),
+            np.array([one.theta for one in found]).reshape(-1, self.joints.values.shape[1]),
+            np.array([one.length for one in found]).reshape(shape),
+            np.array([one.tension for one in found]).reshape(shape),
         )
 
 

@@ -5,12 +5,10 @@ import math
 
 import pytest
 
-from bench import bag_samples as samples
 from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.nodes import record, replay
 
 SECOND = 1_000_000_000
 
@@ -77,39 +75,3 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     # They are due at once, and do not turn back recorded time.
     assert {m.log_time for m in found[:3]} == {content[40].log_time - 1}
     assert [m.data for m in found[3:]] == [sample.data for sample in content[40:]]
-
-
-def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
-    samples.write_mcap(tmp_path / 'a.mcap', content)
-    assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))
-
-
-@pytest.mark.parametrize(
-    ('parse', 'arguments', 'problem'),
-    [
-        (replay.parse, [], 'BAG'),
-        (replay.parse, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
-        (replay.parse, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
-        (replay.parse, ['bag', '--rate', 'nan', '--clock'], 'not a number above 0'),
-        (replay.parse, ['bag', '--start', '-1'], 'not a number of at least 0'),
-        (replay.parse, ['bag', '--duration', 'inf'], 'not a number above 0'),
-        (replay.parse, ['bag', '--topics', ','], 'no name is given'),
-        (replay.parse, ['bag', '--robot', 'arm26'], '--robot is for --check'),
-        (replay.parse, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
-        (
-            record.parse,
-            ['--topics', 'muscle_states,nothing'],
-            "'nothing' is none of joint_",
-        ),
-        (record.parse, ['--duration', '0'], 'not a number above 0'),
-        (record.parse, ['a', '-o', 'b'], 'DIR is given twice'),
-        (record.parse, ['--compression', 'rar'], 'invalid choice'),
-    ],
-)
-def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem, capsys):
-    with pytest.raises(SystemExit) as ended:
-        parse(arguments)
-    assert ended.value.code == 2
-    message = capsys.readouterr().err
-    assert problem in message
-    assert message.count('\n') == 1

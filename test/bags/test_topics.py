@@ -7,7 +7,14 @@ import pytest
 
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import SENT, TOPICS, interface_topics, namespaces, select
+from musculoskeletal_ae.bags.topics import (
+    SENT,
+    TOPICS,
+    interface_topics,
+    latched_topics,
+    namespaces,
+    select,
+)
 from musculoskeletal_ae.exceptions import BagError
 
 # INTERFACE.md, Bags.
@@ -122,3 +129,8 @@ def test_a_topic_of_the_wrong_type_is_refused(tmp_path):
     for use in (interface_topics, lambda bag: select(bag, ['all'], None, False)):
         with pytest.raises(BagError, match=r"/muscle_states has the type .*String', not 'std_msgs"):
             use(bag)
+
+
+def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
+    samples.write_mcap(tmp_path / 'a.mcap', content)
+    assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))
