@@ -32,7 +32,7 @@ from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.options import Parser
 
 ROBOT = 'musashi_left_arm'
-# One individual in all bags, so that what is learnt from one can be tried on another.
+# One individual in all bags, so that what is learned from one can be tried on another.
 INDIVIDUAL = 1
 RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
 TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'

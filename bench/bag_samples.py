@@ -81,13 +81,13 @@ def _basic(name: str, rng: random.Random) -> Any:
 def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
     """Return `count` messages in order, over all topics of the interface in turn."""
     rng = random.Random(seed)  # noqa: S311 - test data
-    found = []
+    content = []
     for i, name in zip(range(count), list(TOPICS) * (count // len(TOPICS) + 1), strict=False):
         data = encode(filled(TOPICS[name].type, rng), TOPICS[name].type)
         topic = name if name == DIAGNOSTICS else f'{namespace}/{name}'
         time = START + i * PERIOD
-        found.append(Sample(topic, TOPICS[name].type, time, time - rng.randrange(100_000), data))
-    return found
+        content.append(Sample(topic, TOPICS[name].type, time, time - rng.randrange(100_000), data))
+    return content
 
 
 def write_ours(path: Path, content: list[Sample], compression: str, finish: bool) -> None:

@@ -56,14 +56,14 @@ def bases(folder: Path, content: list[samples.Sample]) -> list[Base]:
         samples.write_ours(folder / compression, content, compression, finish=True)
     samples.write_ours(folder / 'killed', content, 'zstd', finish=False)
     samples.write_rosbags(folder / 'rosbags', content)
-    found = []
+    kinds = []
     for directory in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = {file.name: file.read_bytes() for file in sorted(directory.iterdir())}
-        found.append(Base(directory.name, files))
+        kinds.append(Base(directory.name, files))
     for name, options in samples.BARE.items():
         samples.write_mcap(folder / 'bare.mcap', content, **options)
-        found.append(Base(name, {'bare.mcap': (folder / 'bare.mcap').read_bytes()}))
-    return found
+        kinds.append(Base(name, {'bare.mcap': (folder / 'bare.mcap').read_bytes()}))
+    return kinds
 
 
 def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:

@@ -117,29 +117,29 @@ def read_joints(
         for name in names:
             if name not in listed:
                 raise MessageError('unknown joint', f'{name!r}; legal: {", ".join(joints)}')
-    found: dict[str, tuple[float, float]] = {}
+    values: dict[str, tuple[float, float]] = {}
     for i, name in enumerate(names):
         if name not in listed:
             continue
-        if name in found:
+        if name in values:
             raise MessageError('duplicate joint', repr(name))
         # Drivers say NaN for a velocity or effort they do not measure; only a target's counts.
         effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
-        found[name] = (message.position[i], effort)
-    if foreign_allowed and len(found) < len(joints):
-        missing = [name for name in joints if name not in found]
+        values[name] = (message.position[i], effort)
+    if foreign_allowed and len(values) < len(joints):
+        missing = [name for name in joints if name not in values]
         raise MessageError('missing joint', ', '.join(missing))
-    if not np.isfinite(list(found.values())).all() or not (
+    if not np.isfinite(list(values.values())).all() or not (
         foreign_allowed or np.isfinite(np.asarray(speeds, dtype=float)).all()
     ):
         raise MessageError('not finite', 'a position, effort or velocity')
-    return found
+    return values
 
 
 def read_posture(message: Any, joints: Sequence[str]) -> Array:
     """Return θ [rad] (D,) of a JointState that has all listed joints, others ignored."""
-    found = read_joints(message, joints, foreign_allowed=True)
-    return np.array([found[name][0] for name in joints])
+    values = read_joints(message, joints, foreign_allowed=True)
+    return np.array([values[name][0] for name in joints])
 
 
 def read_wrench(message: Any, root_link: str) -> Array:

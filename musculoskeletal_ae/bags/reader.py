@@ -24,7 +24,7 @@ UNCHECKED = 'no checksum protects what is left'
 _TIME_TOLERANCE = 1_000_000_000  # [ns]
 # Messages that may be held at once to bring them into order.
 _MOST_HELD = 256 << 20  # [bytes]
-_OVERHEAD = 300  # [bytes] of a message beside its data
+_OVERHEAD = 100  # [bytes] a message counts beside its data; one chunk always fits
 
 
 class BagMessage(NamedTuple):

@@ -78,13 +78,13 @@ class Streams:
             else:
                 length, tension, _ = self.muscles.values[row]
                 paired.append(pairing.muscles(came, tension, length))
-        found = [one for one in paired if one is not None and one.theta is not None]
+        matched = [one for one in paired if one is not None and one.theta is not None]
         shape = -1, self.muscles.values.shape[2]
         return Pairs(
-            np.array([one.time for one in found]),
-            np.array([one.theta for one in found]).reshape(-1, self.joints.values.shape[1]),
-            np.array([one.length for one in found]).reshape(shape),
-            np.array([one.tension for one in found]).reshape(shape),
+            np.array([one.time for one in matched]),
+            np.array([one.theta for one in matched]).reshape(-1, self.joints.values.shape[1]),
+            np.array([one.length for one in matched]).reshape(shape),
+            np.array([one.tension for one in matched]).reshape(shape),
         )
 
 

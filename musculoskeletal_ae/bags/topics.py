@@ -106,12 +106,12 @@ def select(
     else:
         chosen = []
         for name in wanted:
-            found = [
+            named = [
                 recorded for recorded, relative in names.items() if name in (recorded, relative)
             ]
-            if not found:
+            if not named:
                 raise BagError(bag.path, None, f'topic {name} is not in the bag', has)
-            chosen += found
+            chosen += named
     for name in chosen:
         _compare_type(bag, name, names[name])
     return {name: name if keep_names else names[name] for name in chosen}

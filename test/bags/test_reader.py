@@ -142,6 +142,12 @@ def test_messages_are_brought_into_order_holding_no_more_than_that_needs(tmp_pat
         list(bag.messages())
 
 
+def test_one_chunk_always_fits_into_what_may_be_held():
+    most_messages = mcap_file.LARGEST // 31  # bytes of a message without data
+    held = most_messages * reader_module._OVERHEAD
+    assert mcap_file.LARGEST < held < reader_module._MOST_HELD
+
+
 def test_equal_times_keep_the_order_of_the_file(tmp_path, content):
     same = [
         sample._replace(log_time=content[0].log_time + i // 9) for i, sample in enumerate(content)

@@ -17,7 +17,7 @@ from musculoskeletal_ae.bags.topics import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-# INTERFACE.md, Bags.
+# doc/interface.md, Bags.
 DEFAULT = {
     'joint_states',
     'muscle_states',
