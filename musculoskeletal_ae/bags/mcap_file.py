@@ -116,8 +116,8 @@ class McapFile:
                 file.cut = source.begin
         return file
 
-    def messages(self, block: Block) -> Iterator[mcap.Message]:
-        """Yield the messages of a block in the order they have in it.
+    def messages(self, block: Block) -> Iterator[tuple[str, mcap.Message]]:
+        """Yield (topic, message) of a block in the order they have in it.
 
         Raises:
             BagError: If the file has changed.
@@ -126,10 +126,12 @@ class McapFile:
             with open_regular(self.path, _unreadable) as stream:
                 stream.seek(block.offset)
                 data = stream.read(block.stop - block.offset)
+            if len(data) != block.stop - block.offset:
+                raise EOFError('it has become shorter')
             for record in _records(data, _ANYWHERE):
                 for inner in _contents(record):
                     if isinstance(inner, mcap.Message):
-                        yield inner
+                        yield self.channels[inner.channel_id].name, inner
         except Exception as error:
             raise BagError(self.path, block.offset, f'has changed: {error}', DAMAGED) from error
 

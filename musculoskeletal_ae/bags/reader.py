@@ -135,12 +135,10 @@ class Bag:
                 message = heapq.heappop(heap)[-1]
                 held -= len(message.data) + _OVERHEAD
                 yield message
-            for row, read in enumerate(file.messages(block)):
-                name, time = file.channels[read.channel_id].name, read.log_time
+            for row, (name, read) in enumerate(file.messages(block)):
+                time, sent, data = read.log_time, read.publish_time, read.data
                 if name in wanted and first <= time <= last:
-                    message = BagMessage(
-                        name, time, read.publish_time, read.data, file.path, block.offset
-                    )
+                    message = BagMessage(name, time, sent, data, file.path, block.offset)
                     heapq.heappush(heap, (time, number, row, message))
                     held += len(message.data) + _OVERHEAD
                 if held > _MOST_HELD:

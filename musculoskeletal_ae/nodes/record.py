@@ -114,7 +114,7 @@ def parse(arguments: list[str]) -> Namespace:
     parser.add_argument(
         '--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)'
     )
-    parser.add_argument('--duration', type=positive, metavar='S', help='end after so long [s]')
+    parser.add_argument('--duration', type=positive, metavar='S', help='stop after this time [s]')
     parser.add_argument(
         '--compression', choices=COMPRESSIONS, default='zstd', help='of the messages'
     )

@@ -210,13 +210,25 @@ def parse(arguments: list[str]) -> Namespace:
     )
     add('--keep-names', action='store_true', help='keep the recorded namespace')
     add('--from-namespace', metavar='NS', help='which arm, of a bag that has several')
-    add('--rate', type=positive, default=1.0, help='times the recorded speed; needs --clock')
+    add('--rate', type=positive, default=1.0, help='multiple of the recorded speed; needs --clock')
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again at the end')
-    add('--start', type=not_negative, default=0.0, metavar='S', help='begin so far into the bag')
-    add('--duration', type=positive, metavar='S', help='play so much of the bag [s]')
+    add(
+        '--start',
+        type=not_negative,
+        default=0.0,
+        metavar='S',
+        help='start this far into the bag [s]',
+    )
+    add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
     add('--paused', action='store_true', help='wait for replay/resume or replay/step')
-    add('--wait', type=not_negative, default=2.0, metavar='S', help='at most, for subscribers')
+    add(
+        '--wait',
+        type=not_negative,
+        default=2.0,
+        metavar='S',
+        help='longest wait for subscribers [s]',
+    )
     options = parser.parse_args(arguments)
     if options.rate != 1 and not options.clock:
         parser.error(

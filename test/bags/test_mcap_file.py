@@ -192,11 +192,18 @@ def test_a_lost_message_is_noticed_where_no_checksum_protects_it(tmp_path, conte
             Bag.open(path)
 
 
-def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path, content):
+@pytest.mark.parametrize('change', ['shorter', 'another channel', 'gone'])
+def test_a_file_that_changes_while_it_is_read_is_refused(change, tmp_path, content):
     path = tmp_path / 'a.mcap'
-    samples.write_mcap(path, content)
+    samples.write_mcap(path, content, use_chunking=False)
     messages = Bag.open(path).messages()
-    next(messages)
-    path.write_bytes(path.read_bytes()[:5000])
+    if change == 'shorter':
+        path.write_bytes(path.read_bytes()[:5000])
+    elif change == 'gone':
+        path.unlink()
+    else:
+        data = path.read_bytes()
+        at = data.index(content[30].data) - 22
+        path.write_bytes(_replace_after(data, at, b'\xff\xff'))
     with pytest.raises(BagError, match=r'a.mcap, byte \d+: has changed'):
         list(messages)
