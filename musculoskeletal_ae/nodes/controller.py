@@ -20,16 +20,11 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.messages import (
-    QUANTITIES,
-    array_message,
-    read_array,
-    read_joints,
-    read_posture,
-)
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
 from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
 
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
 LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}

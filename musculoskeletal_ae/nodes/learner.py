@@ -15,12 +15,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.collector import Collector
-from musculoskeletal_ae.learning.pairing import Pairing
 from musculoskeletal_ae.learning.session import Session
-from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
 from musculoskeletal_ae.nodes.learner_settings import read_settings
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 POLL = 0.05  # [s] between looks at the training process
 
