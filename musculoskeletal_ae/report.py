@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+Level = Literal['ok', 'warn', 'error']
+
 
 class Report(NamedTuple):
     """How it is, in one line and in named values."""
 
-    level: Literal['ok', 'warn', 'error']
+    level: Level
     message: str
     values: dict[str, str]
