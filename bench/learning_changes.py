@@ -34,7 +34,7 @@ from musculoskeletal_ae.experiments.online_learning import (
     held_out_error,
 )
 from musculoskeletal_ae.experiments.recording import Recording, motion, record
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
@@ -89,7 +89,7 @@ def streams(arm: EmulatedArm, mae: Mae, stream: int, minutes: float, held_out: f
     return Streams(exploring, record(arm, motion(arm.robot, mae, HELD_OUT_STREAM, held_out)))
 
 
-def going_on(learner: OnlineLearner, after: Streams, read_at: tuple[float, ...]) -> list[float]:
+def going_on(learner: Learner, after: Streams, read_at: tuple[float, ...]) -> list[float]:
     """Return the held-out error at once, and after so many minutes of learning on."""
     errors, begun = [held_out_error(learner.mae, after.held_out)], 0
     for minutes in read_at:
@@ -114,10 +114,10 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     before = streams(
         EmulatedArm(robot, seed, individual), mae, EXPLORATION_STREAM + seed, minutes, held_out
     )
-    learner = OnlineLearner(robot, mae, seed=seed)
+    learner = Learner(robot, mae, seed=seed)
     follow(learner, before)
     by_sensor = held_out_error(learner.mae, before.held_out)
-    watcher = OnlineLearner(robot, mae, seed=seed)
+    watcher = Learner(robot, mae, seed=seed)
     follow(watcher, before, camera(robot, before.exploring, seed))
     by_camera = held_out_error(watcher.mae, before.held_out)
     initial = held_out_error(mae, before.held_out)
@@ -136,9 +136,9 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
         lines.append(f'  {title:28s}{head}')
         lines.append(row('untold', going_on(copy.deepcopy(learner), after, read_at)))
         told = copy.deepcopy(learner)
-        told.relearn(muscle)
+        told.relearn([muscle])
         lines.append(row('told by relearn_muscles', going_on(told, after, read_at)))
-        anew = OnlineLearner(robot, mae, seed=seed)
+        anew = Learner(robot, mae, seed=seed)
         lines.append(row('starting over', going_on(anew, after, read_at)))
     return '\n'.join(lines)
 

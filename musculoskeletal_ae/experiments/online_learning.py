@@ -26,7 +26,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import mean_error, oracle
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, motion, record
-from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
+from musculoskeletal_ae.learning.learner import STEPS, Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
@@ -60,7 +60,7 @@ class Curve(NamedTuple):
         running: Error of each message, by the network of the moment, beside the sensor [rad].
     """
 
-    learner: OnlineLearner
+    learner: Learner
     samples: list[int]
     errors: list[float]
     running: Array
@@ -97,10 +97,10 @@ def learn(
     robot: Robot, mae: Mae, preset: str, recorded: Streams, seed: int = 0, steps: int = STEPS
 ) -> Curve:
     """Feed a recorded stream to a new learner, as the node would."""
-    return follow(OnlineLearner(robot, mae, preset, seed, steps), recorded)
+    return follow(Learner(robot, mae, preset, seed, steps=steps), recorded)
 
 
-def follow(learner: OnlineLearner, recorded: Streams, see: See | None = None) -> Curve:
+def follow(learner: Learner, recorded: Streams, see: See | None = None) -> Curve:
     """Feed a recorded stream to a learner.
 
     Args:
@@ -109,21 +109,20 @@ def follow(learner: OnlineLearner, recorded: Streams, see: See | None = None) ->
         see: Where θ comes from; the joint sensors by default.
     """
     mae = learner.mae
-    samples = [len(learner.collector.store)]
+    samples = [len(learner.samples)]
     errors = [held_out_error(mae, recorded.held_out, 10)]
     stream = recorded.exploring
     running = np.empty(len(stream.theta))
     start = 0
     for n in range(len(stream.theta)):
-        theta = stream.theta_sensor[n] if see is None else see(n, learner.mae)
-        update = learner.step(stream.tension[n], stream.length[n], SAMPLE_TIME, theta)
-        if update is not None or n == len(running) - 1:
+        theta = stream.theta_sensor[n] if see is None else see(n, mae)
+        learner.step(n * SAMPLE_TIME, theta, stream.tension[n], stream.length[n])
+        if learner.mae is not mae or n == len(running) - 1:
             part = slice(start, n + 1)
-            before = learner.mae if update is None else mae
-            estimate = before.estimate(stream.tension[part], stream.length[part]).theta
+            estimate = mae.estimate(stream.tension[part], stream.length[part]).theta
             running[part] = np.linalg.norm(estimate - stream.theta_sensor[part], axis=1)
             start, mae = n + 1, learner.mae
-            samples.append(len(learner.collector.store))
+            samples.append(len(learner.samples))
             errors.append(held_out_error(mae, recorded.held_out, 10))
     return Curve(learner, samples, errors, running)
 

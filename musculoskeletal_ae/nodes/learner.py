@@ -6,24 +6,29 @@ joint_states or vision_joint_states, muscle_states, anomaly_detected → mae_che
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.collector import Collector
-from musculoskeletal_ae.learning.pairing import Pairing
-from musculoskeletal_ae.learning.session import Session
+from musculoskeletal_ae.learning import learner
+from musculoskeletal_ae.learning.rest import RestSettings
+from musculoskeletal_ae.learning.samples import Novelty
+from musculoskeletal_ae.learning.training import TrainingProcess
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
-from musculoskeletal_ae.nodes.learner_settings import declare_settings
-from musculoskeletal_ae.nodes.parameters import text
+from musculoskeletal_ae.nodes.parameters import declare_preset, number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
 
 POLL = 0.05  # [s] between looks at the training process
+JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
+AUTO = 'auto'
 
 
 class Learner(Shell):
@@ -32,20 +37,10 @@ class Learner(Shell):
     def __init__(self) -> None:
         """Declare parameters and topics, and start the training process."""
         super().__init__('learner')
-        settings = declare_settings(self)
-        self.collector = Collector(self.robot, settings.rest, settings.novelty, settings.seed)
-        self.pairing = Pairing(1.0 / self.rate)
-        self.enabled, self.anomaly, self.running = True, False, False
+        joint_topic = self._declare_joint_topic()
+        self.core = self._declare_core()
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        self.session = Session(
-            self.robot,
-            self.collector,
-            settings.preset,
-            settings.seed,
-            settings.steps,
-            settings.directory,
-            lambda data: self.publisher.publish(bytes_message(data)),
-        )
+        self.running = False
         self.settable(
             'fresh', False, text('true: drop the saved state for `checkpoint`'), self._start_fresh
         )
@@ -62,7 +57,7 @@ class Learner(Shell):
             self._relearn,
         )
         self.running = True
-        self.listen(JointState, settings.joint_topic, self._joints, SENSOR)
+        self.listen(JointState, joint_topic, self._joints, SENSOR)
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         self.create_service(SetBool, 'learner/enable', self._enable)
@@ -71,11 +66,57 @@ class Learner(Shell):
 
     # -- parameters -----------------------------------------------------------------------------
 
+    def _declare_joint_topic(self) -> str:
+        meaning = f'where θ comes from: {tuple(JOINT_TOPICS)}'
+        source = self.declare_parameter('joint_source', 'sensor', text(meaning, True)).value
+        if source not in JOINT_TOPICS:
+            legal = ', '.join(JOINT_TOPICS)
+            raise MusculoskeletalError(f'parameter joint_source: {source!r}; legal: {legal}')
+        return JOINT_TOPICS[source]
+
+    def _declare_core(self) -> learner.Learner:
+        def positive(name: str, default: float, meaning: str, most: float) -> float:
+            value = self.declare_parameter(name, default, number(meaning, 0.0, most, True)).value
+            return float(value)
+
+        rest, novelty = RestSettings(), Novelty()
+        return learner.Learner(
+            self.robot,
+            preset=declare_preset(self, 'how to learn'),
+            seed=self.declare_parameter('seed', 0, whole('random seed')).value,
+            steps=self.declare_parameter(
+                'update_steps',
+                learner.STEPS,
+                text('steps of training per update, preset default', True),
+            ).value,
+            period=1.0 / self.rate,
+            rest=RestSettings(
+                positive('rest_time', rest.window, 'how long the arm has to be still [s]', 10.0),
+                positive('rest_joint_rate', rest.joint_rate, 'fastest joint at rest [rad/s]', 1.0),
+                positive('rest_length_rate', rest.length_rate, 'fastest l at rest [m/s]', 1.0),
+            ),
+            novelty=Novelty(
+                positive('new_joint_distance', novelty.joint, 'to stored samples [rad]', 3.0),
+                positive('new_tension_distance', novelty.tension, 'to stored ones [N]', 500.0),
+            ),
+            training=TrainingProcess,
+            directory=self._declare_directory(),
+        )
+
+    def _declare_directory(self) -> Path | None:
+        meaning = "for samples and network; 'auto': below XDG_STATE_HOME; '': nothing kept"
+        value = self.declare_parameter('state_directory', AUTO, text(meaning, True)).value
+        if value != AUTO:
+            return Path(value) if value else None
+        home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
+        place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
+        return place.joinpath(*self.get_namespace().strip('/').split('/'))
+
     def _start_fresh(self, value: bool) -> None:
         if not value:
             return
         if not self.running:
-            self.session.set_aside()
+            self.core.replace(None)
             return
         path = self.get_parameter('checkpoint').value
         if not path:
@@ -84,13 +125,12 @@ class Learner(Shell):
 
     def _take_checkpoint(self, path: str) -> None:
         if path and self.running:
-            self.session.replace(path)
-        elif path and self.session.data is None:
-            self.session.begin(path)
+            self.core.replace(checkpoint.load(path, self.robot))
+        elif path and self.core.checkpoint is None:
+            self.core.begin(checkpoint.load(path, self.robot))
 
     def _relearn(self, names: Sequence[str]) -> None:
-        for muscle in self.robot.muscle_indices(name for name in names if name):
-            self.session.relearn(muscle)
+        self.core.relearn(self.robot.muscle_indices(name for name in names if name))
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -98,70 +138,56 @@ class Learner(Shell):
         return self.get_clock().now().nanoseconds * 1e-9
 
     def _joints(self, message: JointState) -> None:
-        self.pairing.joints(self._now(), read_posture(message, self.robot.joints))
+        self.core.joints(self._now(), read_posture(message, self.robot.joints))
 
     def _muscles(self, message: Float64MultiArray) -> None:
         length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
-        paired = self.pairing.muscles(self._now(), tension, length)
-        if paired is None or not self.enabled:
-            return
-        sample = self.collector.step(paired.tension, paired.length, paired.dt, paired.theta)
-        if sample is not None:
-            self.session.accept(sample)
+        self.core.muscles(self._now(), tension, length)
 
     def _anomaly(self, message: Bool) -> None:
-        self.anomaly = message.data
-        self.collector.set_anomaly(message.data)
+        self.core.anomaly(message.data)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if request.data and not self.enabled:
-            self._forget_the_moment()
-        self.enabled = request.data
+        self.core.enable(request.data)
         response.success = True
         response.message = 'learning' if request.data else 'stopped; samples and network stay'
         return response
 
     def _save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            response.message = f'saved in {self.session.save()}'
-            response.success = True
-        except (MusculoskeletalError, OSError) as error:
+            response.success, response.message = True, f'saved in {self.core.save()}'
+        except MusculoskeletalError as error:
             response.success, response.message = False, str(error)
         return response
 
     def _poll(self) -> None:
-        self.session.poll(self.enabled and not self.anomaly)
-
-    def _forget_the_moment(self) -> None:
-        self.collector.reset()
-        self.pairing.reset()
+        data = self.core.poll(self._now())
+        if data is not None:
+            self.publisher.publish(bytes_message(data))
 
     def clock_jumped_back(self) -> None:
         """Forget what is not a sample yet."""
-        self._forget_the_moment()
+        self.core.reset()
 
     # -- diagnostics ----------------------------------------------------------------------------
 
     def state(self) -> tuple[bytes, str, dict[str, str]]:
         """Return what /diagnostics shows."""
-        values = self.session.values()
-        values |= {f'not learned: {why}': str(n) for why, n in self.collector.rejected.items()}
         level, message = OK, 'learning'
-        if self.session.trouble:
-            level, message = ERROR, self.session.trouble
-        elif self.session.data is None:
+        if self.core.trouble:
+            level, message = ERROR, self.core.trouble
+        elif self.core.checkpoint is None:
             level, message = WARN, 'waiting for a checkpoint: set the parameter `checkpoint`'
-        elif not self.enabled:
+        elif not self.core.enabled:
             level, message = WARN, 'stopped by learner/enable'
-        elif self.anomaly:
+        elif self.core.stopped_by_anomaly:
             level, message = WARN, 'stopped by an anomaly until estimator/reset'
-        values['state'] = message
-        return level, message, values
+        return level, message, {**self.core.values(), 'state': message}
 
     def destroy_node(self) -> None:
         """End the training process with the node."""
-        if hasattr(self, 'session'):
-            self.session.close()
+        if hasattr(self, 'core'):
+            self.core.close()
         super().destroy_node()
 
 

@@ -76,7 +76,7 @@ def _streams(study: Study, robot: Robot, mae: Mae, seed: int) -> protocol.Stream
 
 
 def _keep_samples(study: Study, seed: int, curve: protocol.Curve) -> None:
-    store = curve.learner.collector.store
+    store = curve.learner.samples
     if len(store):
         seen = store.observations()
         samples = {'theta': seen.theta, 'tension': seen.tension, 'length': seen.length}

@@ -19,8 +19,7 @@ from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import LeastSquares, mean_error, oracle
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.robot.robot import Robot
 
 STRIDE = 10  # of messages; least squares is slow
@@ -72,12 +71,12 @@ def oracle_errors(robot: Robot, seed: int, recording: Recording) -> dict[str, fl
     }
 
 
-def body_error(robot: Robot, learner: OnlineLearner, recording: Recording) -> float:
+def body_error(robot: Robot, learner: Learner, recording: Recording) -> float:
     """Return the error of least squares on the body that a learner of preset default fitted."""
-    if not isinstance(learner.updater, BodyUpdater):
+    if learner.training.body is None:
         raise TypeError('only preset default fits a body')
     theta, tension = recording.theta[::STRIDE], recording.tension[::STRIDE]
-    estimate = LearntLeastSquares(robot, learner.updater.body).estimate(
+    estimate = LearntLeastSquares(robot, learner.training.body).estimate(
         tension, recording.length[::STRIDE]
     )
     return mean_error(estimate, theta)

@@ -63,7 +63,7 @@ class Study:
     @property
     def update_steps(self) -> int:
         """Training steps of one online update."""
-        from musculoskeletal_ae.learning.online import STEPS
+        from musculoskeletal_ae.learning.learner import STEPS
 
         return STEPS // 5 if self.quick else STEPS
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A budgeted store of samples that keeps coverage.
+"""Samples: what the sensors said while the arm was at rest, and which of them are kept.
 
 A sample is new when θ or T differs from every stored one by more than a threshold (paper, section
 "Online Learning"). When the store is full, one of the two samples nearest to each other goes, the
@@ -10,15 +10,52 @@ always stays.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body_fit import Observations
-from musculoskeletal_ae.learning.sample import Sample
+from musculoskeletal_ae.arrays import Array, Bools
 
 CAPACITY = 400
+
+
+class Sample(NamedTuple):
+    """Means over a rest.
+
+    Attributes:
+        theta: θ [rad], shape (D,).
+        tension: T [N], shape (M,).
+        length: l [m], shape (M,).
+        direction: s of every wire's friction, +1 wound in last, −1 paid out last, shape (M,).
+    """
+
+    theta: Array
+    tension: Array
+    length: Array
+    direction: Array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N samples as arrays.
+
+    Attributes:
+        theta: θ [rad], shape (N, D).
+        tension: T at the motors [N], shape (N, M).
+        length: l [m], shape (N, M).
+        direction: s in [−1, 1], shape (N, M).
+        known: Which of them say something about which muscle, shape (N, M).
+    """
+
+    theta: Array
+    tension: Array
+    length: Array
+    direction: Array
+    known: Bools
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.theta)
 
 
 @dataclass(frozen=True)
@@ -40,6 +77,7 @@ class SampleStore:
     Attributes:
         samples: The oldest first.
         known: For each sample the muscles that it says something about, shape (M,).
+        numbers: Each sample's place among all that were ever accepted, from 1.
         accepted: How many were ever accepted.
     """
 
@@ -47,9 +85,8 @@ class SampleStore:
         """Start empty."""
         self.novelty = novelty or Novelty()
         self.capacity = capacity
-        self.samples: list[Sample] = []
-        self.known: list[NDArray[np.bool_]] = []
         self.accepted = 0
+        self.clear()
 
     def __len__(self) -> int:
         """Samples stored."""
@@ -59,14 +96,15 @@ class SampleStore:
         """Whether a sample differs enough from every stored one."""
         return not self.samples or bool(self._distances(sample).min() > 1.0)
 
-    def add(self, sample: Sample, known: NDArray[np.bool_] | None = None) -> None:
-        """Store a sample, as the newest."""
+    def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
+        """Store a sample, as the newest; `known` and `number` are given to one stored before."""
+        self.accepted = number or self.accepted + 1
         self.samples.append(sample)
         self.known.append(np.ones(len(sample.tension), dtype=bool) if known is None else known)
-        self.accepted += 1
+        self.numbers.append(self.accepted)
         if len(self.samples) > self.capacity:
             worst = self._dispensable()
-            del self.samples[worst], self.known[worst]
+            del self.samples[worst], self.known[worst], self.numbers[worst]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
         """Let all samples but the newest ones say nothing about a muscle any more."""
@@ -75,14 +113,15 @@ class SampleStore:
 
     def clear(self) -> None:
         """Forget all samples."""
-        self.samples.clear()
-        self.known.clear()
+        self.samples: list[Sample] = []
+        self.known: list[Bools] = []
+        self.numbers: list[int] = []
         self.accepted = 0
 
     def observations(self) -> Observations:
         """Return all samples as arrays."""
-        theta, tension, length, sliding = map(np.array, zip(*self.samples, strict=True))
-        return Observations(theta, tension, length, sliding, np.array(self.known))
+        theta, tension, length, direction = map(np.array, zip(*self.samples, strict=True))
+        return Observations(theta, tension, length, direction, np.array(self.known))
 
     def _scaled(self, sample: Sample) -> Array:
         return np.concatenate(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preset `paper`: the procedure as printed (section "Online Learning").
+"""An update of preset `paper`: the procedure as printed (section "Online Learning").
 
     batch = {newest, (0, 0, 0), C_data random stored ones} × {①, ②, ③},   3 (C_data + 2) entries
 
@@ -16,13 +16,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from musculoskeletal_ae.learning.update import (
-    Job,
-    Update,
-    history,
-    newest_error,
-    with_statistics,
-)
+from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
+from musculoskeletal_ae.learning.training import Job, Update, history, newest_error
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae, to_mae
 from musculoskeletal_ae.mae.optimisers import Adam
@@ -33,21 +28,19 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BATCHES = 10  # C_batch
 EPOCHS = 10  # C_epoch
-THRESHOLD = 20  # C_thre
 DATA = 10  # C_data
 
 
 class PaperUpdater:
     """Learns as printed, on samples in their own units, by Adam of the initial training."""
 
-    least_samples = THRESHOLD + 1
+    body = None
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network."""
         self._robot, self._origin, self._mae = robot, mae, mae
         self._network = from_mae(mae)
-        self._settings = PAPER.training
-        self._optimiser = Adam(self._network, self._settings.step_size)
+        self._optimiser = Adam(self._network, PAPER.training.step_size)
         self._rng = np.random.default_rng([seed, 0x9A])
         self._steps = 0
 
@@ -59,17 +52,16 @@ class PaperUpdater:
         values = values * scale_vector(robot.joint_count, robot.muscle_count)
         # The print knows no changed muscle: a sample that says nothing about one is none.
         values = values[seen.known.all(axis=1)]
-        enough = len(values) >= self.least_samples
-        mask = torch.arange(3).repeat_interleave(DATA + 2)
         batches = []
-        for _ in range(BATCHES if enough else 0):
+        for _ in range(BATCHES if len(values) >= PAPER.least_samples else 0):
             stored = self._rng.choice(len(values) - 1, DATA, replace=False)
             rows = np.vstack([values[-1], np.zeros(values.shape[1]), values[stored]])
             batches.append(torch.as_tensor(np.tile(rows, (3, 1)), dtype=torch.float32))
+        mask = torch.arange(3).repeat_interleave(DATA + 2)
         losses = []
         with one_thread():
             for batch in EPOCHS * batches:
-                value = loss(self._network, batch, mask, self._settings)
+                value = loss(self._network, batch, mask, PAPER.training)
                 value.backward()
                 self._optimiser.step(1.0)
                 losses.append(value.item())
@@ -80,9 +72,8 @@ class PaperUpdater:
             robot.muscles,
             self._origin.preset,
             history(self._origin, len(seen), 'paper', self._steps),
-            job.version,
         )
-        self._mae = with_statistics(mae, self._mae, job)
-        return Update(
-            self._mae, float(np.mean(losses[-BATCHES:])) if enough else np.nan, error, np.empty(0)
-        )
+        before = self._mae if job.statistics_hold else uncalibrated(self._mae)
+        self._mae = recalibrated(mae, before.anomaly, job.healthy, len(seen))
+        last = float(np.mean(losses[-BATCHES:])) if losses else np.nan
+        return Update(self._mae, last, error, np.empty(0))

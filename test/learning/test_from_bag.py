@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from musculoskeletal_ae.bags.streams import Pairs
-from musculoskeletal_ae.learning.offline import error, learn
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train import main
-from musculoskeletal_ae.tools.train_from_bag import read
+from musculoskeletal_ae.tools.train_from_bag import error, learn, read
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 
@@ -32,9 +31,9 @@ def test_what_is_learned_from_one_recording_improves_another(robot):
     exploration = part(read(BAGS / 'exploration', robot), 0.0, 40.0)
     other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the muscle is cut later
     mae = initial_mae(robot, steps=600).mae
-    learner = OnlineLearner(robot, mae)
+    learner = Learner(robot, mae)
     told = []
-    learn(robot, learner, exploration, told.append)
+    learn(learner, exploration, told.append)
     assert sum(told) == pytest.approx(exploration.time[-1] - exploration.time[0])
     assert learner.updates > 0
     assert error(learner.mae, other) < 0.6 * error(mae, other)

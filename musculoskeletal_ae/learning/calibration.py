@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the detector has to know of a healthy arm: residuals of ② over messages that were fine.
+"""Calibrating the anomaly detector: residuals of ② over messages of the healthy arm.
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d
 
@@ -11,13 +11,15 @@ a sensor are no part of that: a few messages at most, far beyond all the rest, a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
 from musculoskeletal_ae.mae.anomaly_statistics import FLOOR, AnomalyStatistics
 from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae
@@ -54,22 +56,27 @@ class Healthy(NamedTuple):
 
 
 class Reservoir:
-    """A uniform draw of bounded size from all healthy messages.
+    """A uniform draw of bounded size from all messages of the healthy arm.
 
     Attributes:
         time: Healthy time seen [s].
     """
 
-    def __init__(self, muscles: int, seed: int = 0, capacity: int = CAPACITY) -> None:
-        """Start empty."""
+    def __init__(
+        self,
+        muscles: int,
+        seed: int = 0,
+        novelty: Novelty | None = None,
+        capacity: int = CAPACITY,
+    ) -> None:
+        """Start empty; rests differ by `novelty`."""
         self._rng = np.random.default_rng([seed, 0x4E])
         self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
-        self._seen = 0
-        self._since = 0.0
-        self.time = 0.0
+        self._rests = SampleStore(novelty)
+        self._seen, self._since, self.time = 0, 0.0, 0.0
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Take a healthy message."""
+        """Take a message."""
         self._since += dt
         if self._since < SPACING - 1e-9:
             return
@@ -81,69 +88,93 @@ class Reservoir:
             self._kept[place] = np.concatenate([tension, length])
         self._seen += 1
 
+    def rest(self, rest: Sample) -> None:
+        """Count a rest if it differs from those before."""
+        if self._rests.is_new(rest):
+            self._rests.add(rest)
+
     def clear(self) -> None:
         """Forget all, as when the body has changed."""
         self._seen, self._since, self.time = 0, 0.0, 0.0
+        self._rests.clear()
 
-    def messages(self) -> NDArray[np.float32]:
-        """Return (T, l) of the messages kept, shape (N, 2M)."""
-        return self._kept[: min(self._seen, len(self._kept))].copy()
+    def healthy(self) -> Healthy:
+        """Return what was seen."""
+        messages = self._kept[: min(self._seen, len(self._kept))].copy()
+        return Healthy(messages, self.time, len(self._rests))
+
+
+def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
+    """Return a network with statistics of its residuals, at least as trusted as those before.
+
+    After a restart the messages are few, and the calibrated statistics of the network that was
+    saved serve its successors until there are enough.
+
+    Args:
+        mae: The network.
+        before: Statistics of its predecessor.
+        healthy: What the healthy arm showed.
+        samples: How many samples the network has learned.
+    """
+    statistics = calibrate(mae, healthy, samples)
+    keep = before is not None and before.calibrated
+    if statistics is None or (keep and not statistics.calibrated):
+        statistics = before
+    return replace(mae, anomaly=statistics)
+
+
+def uncalibrated(mae: Mae) -> Mae:
+    """Return a network that says that its statistics are not of the arm as it is now."""
+    if mae.anomaly is None:
+        return mae
+    return replace(mae, anomaly=replace(mae.anomaly, calibrated=False))
+
+
+def is_calibrated(mae: Mae) -> bool:
+    """Whether a network's statistics come from the real arm."""
+    return mae.anomaly is not None and mae.anomaly.calibrated
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
     """Return statistics of a network's residuals, or None where there is too little.
 
-    Args:
-        mae: The network.
-        healthy: What the healthy arm showed.
-        samples: How many samples the network has learned.
+    Arguments as `recalibrated`.
     """
     if len(healthy.messages) < 2:
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
-    error = _without_glitches(residuals(mae, tension, length))
+    error = residuals(mae, tension, length)
+    sound = ~_glitches(error)
     known = min(samples, healthy.rests)
-    calibrated = healthy.time >= LEAST_TIME and known >= LEAST_SAMPLES
-    part = AnomalyStatistics.of(error[::2], calibrated)
-    held_out = distances(_regularised(part), error[1::2])
-    statistics = _regularised(AnomalyStatistics.of(error, calibrated))
-    largest = max(float(held_out.max()), float(distances(statistics, error).max()))
-    norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error, 2, axis=1))
+    calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
+    # Each message has its part whatever is left out, so that a glitch moves no other one.
+    first = np.arange(len(error)) % 2 == 0
+    part = _regularised(AnomalyStatistics.of(error[sound & first], calibrated))
+    statistics = _regularised(AnomalyStatistics.of(error[sound], calibrated))
+    largest = max(
+        distances(part, error[sound & ~first]).max(initial=0.0),
+        distances(statistics, error[sound]).max(),
+    )
+    norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error[sound], 2, axis=1))
     thresholds = {
-        DISTANCE: MARGIN * (1.0 + YOUNG / max(known, 1)) * largest,
+        DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
         'norm': float(np.max(norm)),
     }
-    return AnomalyStatistics(
-        statistics.mean, statistics.covariance, calibrated, len(error), thresholds
-    )
+    return replace(statistics, thresholds=thresholds)
 
 
-def _without_glitches(error: Array) -> Array:
+def _glitches(error: Array) -> Bools:
     few = int(GLITCHES * len(error))
     if few == 0:
-        return error
+        return np.zeros(len(error), dtype=bool)
     # Statistics that glitches cannot spoil: of the others, first by each residual's own spread.
     middle = np.median(error, axis=0)
     spread = np.median(np.abs(error - middle), axis=0) + FLOOR
     order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
     distance = distances(_regularised(AnomalyStatistics.of(error[order[:-few]], False)), error)
     rest = np.sort(distance)[-few - 1]
-    return error[distance <= GLITCH * rest]
-
-
-def recalibrate(
-    mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int
-) -> AnomalyStatistics | None:
-    """Return statistics of a network's residuals that are at least as trusted as those before.
-
-    After a restart the messages are few, and the calibrated statistics of the network that was
-    saved serve its successors until there are enough. Arguments as `calibrate`.
-    """
-    found = calibrate(mae, healthy, samples)
-    keep = before is not None and before.calibrated
-    if found is None or (keep and not found.calibrated):
-        return before
-    return found
+    glitches: Bools = distance > GLITCH * rest
+    return glitches
 
 
 def distances(statistics: AnomalyStatistics, error: Array) -> Array:
@@ -156,4 +187,4 @@ def distances(statistics: AnomalyStatistics, error: Array) -> Array:
 def _regularised(statistics: AnomalyStatistics) -> AnomalyStatistics:
     covariance = statistics.covariance
     mixed = (1.0 - DIAGONAL_SHARE) * covariance + DIAGONAL_SHARE * np.diag(np.diag(covariance))
-    return AnomalyStatistics(statistics.mean, mixed, statistics.calibrated, statistics.samples)
+    return replace(statistics, covariance=mixed)
