@@ -125,7 +125,8 @@ class Learner:
         paired = self._pairing.muscles(time, tension, length)
         if paired is None or not self.enabled:
             return
-        for rest in self._rests.step(*paired):
+        _, tension, length, dt, theta = paired
+        for rest in self._rests.step(tension, length, dt, theta):
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
                 self.accept(rest)

@@ -16,11 +16,11 @@ from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
-from musculoskeletal_ae.messages import read_posture
 from musculoskeletal_ae.nodes.parameters import text
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.validity import read_posture
 
 
 class BringupStatus(Shell):

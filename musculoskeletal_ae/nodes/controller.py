@@ -23,17 +23,12 @@ from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings, read_stiffness
 from musculoskeletal_ae.control.stiffness import StiffnessSolution
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.messages import (
-    QUANTITIES,
-    array_message,
-    read_array,
-    read_joints,
-    read_posture,
-)
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
 
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
 LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}

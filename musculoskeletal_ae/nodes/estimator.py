@@ -18,12 +18,13 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.messages import QUANTITIES, array_message, read_array, read_pose
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.parameters import declare_preset, number
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, WARN, Shell
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_pose
 
 # Commands older than this no longer say what the modules do.
 COMMAND_AGE = 0.5  # [s]

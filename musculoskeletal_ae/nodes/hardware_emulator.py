@@ -20,13 +20,14 @@ from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.messages import array_message, read_array, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
+from musculoskeletal_ae.validity import read_array, read_wrench
 
 MARKER_RATE = 10.0  # [Hz] of the markers for RViz
 # After a pause (a debugger, a suspended machine) the arm goes on instead of catching up.

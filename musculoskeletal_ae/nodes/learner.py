@@ -20,11 +20,12 @@ from musculoskeletal_ae.learning.rest import RestSettings
 from musculoskeletal_ae.learning.samples import Novelty
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.parameters import declare_preset, number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 POLL = 0.05  # [s] between looks at the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}

@@ -16,14 +16,15 @@ from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.messages import array_message, read_array, read_joints, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.parameters import declare_preset, text
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.validity import read_array, read_joints, read_wrench
 
 MARKER_RATE = 10.0  # [Hz] of the markers for RViz
 TEMPERATURE = 25.0  # [°C]

@@ -17,8 +17,9 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.robot import kinematics, series_elastic
-from musculoskeletal_ae.robot.entries import EntryReader, listed, read_text
+from musculoskeletal_ae.robot.entries import EntryReader, listed, refusal
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_urdf
 
@@ -89,7 +90,7 @@ def load_description(robot: str | Path) -> RobotDescription:
     """
     directory = find_robot(robot)
     urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
-    urdf = read_text(urdf_file)
+    urdf = read_text(urdf_file, refusal)
     model = read_urdf(urdf_file, urdf)
     reader = EntryReader(muscle_file)
     top = reader.mapping(reader.document(), 'top level', TOP_KEYS)

@@ -4,29 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-
-MAX_FILE_BYTES = 5_000_000
-
-
-class UniqueKeyLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key written twice, which YAML would silently override."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
-        """Refuse a repeated key, then build the mapping."""
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f'key {key!r} is written twice', node.start_mark
-                )
-        return super().construct_mapping(node, deep)
+from musculoskeletal_ae.files import read_yaml
 
 
 class EntryReader:
@@ -38,11 +21,7 @@ class EntryReader:
 
     def document(self) -> object:
         """Return the parsed file."""
-        try:
-            return yaml.load(read_text(self.file), Loader=UniqueKeyLoader)  # noqa: S506 (is safe)
-        # A ValueError is what PyYAML lets pass for a date that is none, or an endless integer.
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            raise RobotDescriptionError(f'{self.file}: not valid YAML: {error}') from error
+        return read_yaml(self.file, refusal)
 
     def fail(self, entry: str, problem: str) -> RobotDescriptionError:
         """Return the error that says what is wrong with an entry."""
@@ -91,8 +70,8 @@ class EntryReader:
 
     def unique(self, names: list[str], entry: str) -> tuple[str, ...]:
         """Return names of which none is written twice."""
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise self.fail(entry, f'{name!r} is listed twice; names must be unique')
         return tuple(names)
 
@@ -102,13 +81,7 @@ def listed(names: tuple[str, ...] | list[str]) -> str:
     return ', '.join(names)
 
 
-def read_text(file: Path) -> str:
-    """Return the text of one file of a robot directory."""
-    try:
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise RobotDescriptionError(f'{file}: larger than {MAX_FILE_BYTES} bytes')
-        return file.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise RobotDescriptionError(
-            f'{file}: cannot be read ({error}); a robot directory holds robot.urdf and muscles.yaml'
-        ) from error
+def refusal(file: Path, problem: str) -> RobotDescriptionError:
+    """Return the error that says what is wrong with a file of a robot directory."""
+    remedy = 'a robot directory holds robot.urdf and muscles.yaml'
+    return RobotDescriptionError(f'{file}: {problem}; {remedy}')

@@ -11,7 +11,7 @@ even where the arm could still hold itself.
 
 from __future__ import annotations
 
-import csv
+import os
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +19,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription
+from musculoskeletal_ae.robot.entries import refusal
 
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
@@ -58,18 +60,12 @@ def read_declared_actions(description: RobotDescription) -> tuple[Action, ...]:
         RobotDescriptionError: Naming the file, the line and the legal values.
     """
     file = description.directory / DECLARATION_FILE
-    if not file.is_file():
+    if not os.path.lexists(file):
         return ()
-    with file.open(encoding='utf-8', newline='') as stream:
-        kept = [(i, s) for i, s in enumerate(stream, 1) if s.strip() and not s.startswith('#')]
-    rows = list(csv.reader(text for _, text in kept))
-    if not rows or [cell.strip() for cell in rows[0]] != COLUMNS:
-        raise RobotDescriptionError(f'{file}: expected the columns {",".join(COLUMNS)}')
     legal = (description.muscles, description.joints, tuple(SIGNS)[:2])
     actions: list[Action] = []
-    for (line, text), row in zip(kept[1:], rows[1:], strict=True):
+    for line, text, cells in read_csv(file, COLUMNS, refusal):
         where = f'{file}: line {line}'
-        cells = [cell.strip() for cell in row]
         if len(cells) != len(COLUMNS):
             raise RobotDescriptionError(f'{where}: expected 3 values, got {text.strip()!r}')
         cells[2] = '-' if cells[2] == '−' else cells[2]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from musculoskeletal_ae import options
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.series_elastic import (
     DEFAULT_FORCE,
     DEFAULT_RATE,
@@ -82,33 +82,23 @@ def read_table(file: Path) -> Array:
     Raises:
         RobotDescriptionError: Naming the file and the row.
     """
-    try:
-        lines = file.read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RobotDescriptionError(f'{file}: cannot be read: {error}') from error
-    kept = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and line[0] != '#']
-    cells = list(csv.reader(line for _, line in kept))
-    if not cells or [cell.strip() for cell in cells[0]] != COLUMNS:
-        found = kept[0][1] if kept else 'nothing'
-        raise RobotDescriptionError(
-            f'{file}: expected the columns {",".join(COLUMNS)}, got {found}'
-        )
     rows = []
-    for (number, line), row in zip(kept[1:], cells[1:], strict=True):
+    for number, line, cells in read_csv(file, COLUMNS, _refusal):
         try:
-            values = [float(cell) for cell in row]
+            values = [float(cell) for cell in cells]
         except ValueError:
             values = []
         if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
-            raise RobotDescriptionError(
-                f'{file}: row {number}: expected 3 finite numbers, got {line!r}'
-            )
+            raise _refusal(file, f'row {number}: expected 3 finite numbers, got {line[:80]!r}')
         if values[0] < 0.0 or values[1] <= 0.0:
-            raise RobotDescriptionError(
-                f'{file}: row {number}: expected tension >= 0 and absolute_length > 0, got {line!r}'
-            )
+            problem = f'row {number}: expected tension >= 0 and absolute_length > 0, got {line!r}'
+            raise _refusal(file, problem)
         rows.append(values)
     return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))
+
+
+def _refusal(file: Path, problem: str) -> RobotDescriptionError:
+    return RobotDescriptionError(f'{file}: {problem}')
 
 
 def yaml_line(constants: SeriesElastic) -> str:

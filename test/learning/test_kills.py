@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from musculoskeletal_ae.learning.samples import SampleStore
-
 from bench.kills import digest, grown, run, samples
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 
 

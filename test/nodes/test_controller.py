@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.control.stiffness_model import push_deflection
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
