@@ -15,7 +15,7 @@ import rclpy
 from rclpy.utilities import remove_ros_args
 from visualization_msgs.msg import Marker, MarkerArray
 
-from musculoskeletal_ae.experiments.picture import Line, save_picture
+from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.nodes.qos import SENSOR
 
 

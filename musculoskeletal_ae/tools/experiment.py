@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments.report.publish import publish
-from musculoskeletal_ae.experiments.report.readme import update_readme
-from musculoskeletal_ae.experiments.suite.registry import NAMES
-from musculoskeletal_ae.experiments.suite.run import run, total_weight
-from musculoskeletal_ae.experiments.suite.study import Study
+from musculoskeletal_ae.experiments import results
+from musculoskeletal_ae.experiments.report import write_report
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run, total_weight
+from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.experiments.table import update_readme
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
@@ -27,12 +27,13 @@ from musculoskeletal_ae.robot.robot import Robot
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
 MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
+BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 
 
 def main(argv: list[str] | None = None) -> int:
     """Measure; exit status 1 if a robot or folder is not usable, 2 for bad options."""
     args = _parse(argv)
-    names = NAMES if args.name == 'all' else (args.name,)
+    names = tuple(EXPERIMENTS) if args.name == 'all' else (args.name,)
     start = time.perf_counter()
     # Ended by whoever started it, it clears up as on Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -43,18 +44,15 @@ def main(argv: list[str] | None = None) -> int:
             study = Study(
                 args.robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder)
             )
-            with tqdm(
-                total=round(total_weight(study, names), 1), disable=None, bar_format=_BAR
-            ) as bar:
+            total = round(total_weight(study, names), 1)
+            with tqdm(total=total, disable=None, bar_format=BAR) as bar:
 
                 def report(done: float, running: str) -> None:
                     bar.n = round(min(done, bar.total), 1)
                     bar.set_description_str(running)
 
-                found = run(study, names, args.jobs, report)
-            if 'online_learning' not in names:
-                del found['online_learning']
-            files = publish(study, found, args.out)
+                measured = run(study, names, args.jobs, report)
+            files = [*results.write(study, measured, args.out), write_report(args.out)]
         if args.readme:
             files += update_readme(args.out, args.readme)
     except (MusculoskeletalError, OSError) as error:
@@ -68,9 +66,6 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-_BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
-
-
 def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='experiment',
@@ -79,7 +74,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         "paper's numbers beside. Exit status 1: the robot or a file is not usable, "
         '2: bad options.',
     )
-    names = (*NAMES, 'all')
+    names = (*EXPERIMENTS, 'all')
     robots = ', '.join(sorted(shipped_robots()))
     parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))
     parser.add_argument(
