@@ -1,5 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types of command-line options; argparse puts the option before what they say."""
+"""Command lines of all tools: one parser, the arguments they share, and how they end.
+
+A tool writes only what is its own:
+
+    def main(argv: list[str] | None = None) -> int:
+        parser = Parser('train', 'Trains the autoencoder and writes a checkpoint.')
+        parser.add_robot()
+        parser.add_out('FILE.safetensors', required=True)
+        parser.add_seed('of the training data and the weights')
+        parser.add_argument('--jobs', type=whole(1, 256), help='processes')
+        args = parser.parse_args(argv)
+        return exit_status(lambda: train(args))
+
+A wrong option is one line that names the option, the value and what is legal, and status 2; so is
+`parser.error('--hold-out goes with --from-bag')`. What the package refuses (a robot, a file) is one
+line and status 1. Help shows defaults by itself. Types raise `ArgumentTypeError`, before which
+argparse puts the option.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +24,13 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.presets import PRESETS
+
+DEFAULT_ROBOT = 'musashi_left_arm'
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
@@ -24,6 +48,32 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return convert
 
 
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return a type for numbers within [low, high]."""
+    return lambda text: _number(text, low, high, f'{text!r}: expected {low:g} to {high:g}')
+
+
+def not_negative(text: str) -> float:
+    """Return a finite number that is not negative."""
+    return _number(text, 0.0, sys.float_info.max, f'{text!r} is not a number of at least 0')
+
+
+def positive(text: str) -> float:
+    """Return a positive, finite number."""
+    return _number(text, math.ulp(0.0), sys.float_info.max, f'{text!r} is not a number above 0')
+
+
+def _number(text: str, low: float, high: float, problem: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(problem)
+    return value
+
+
+minutes = number(0.2, 600.0)  # of robot time
 seed = whole(0, 2**63 - 1)
 
 
@@ -38,29 +88,122 @@ def seeds(text: str) -> tuple[int, ...]:
     return values
 
 
-def positive(text: str) -> float:
-    """Return a positive, finite number."""
-    value = not_negative(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a number above 0')
-    return value
+def names(text: str) -> list[str]:
+    """Return the different names in a list separated by commas."""
+    listed = [name.strip() for name in text.split(',') if name.strip()]
+    if not listed:
+        raise argparse.ArgumentTypeError('no name is given')
+    return list(dict.fromkeys(listed))
 
 
-def not_negative(text: str) -> float:
-    """Return a finite number that is not negative."""
-    return _number(text, f'{text!r} is not a number of at least 0', 0.0, sys.float_info.max)
+class _Formatter(argparse.HelpFormatter):
+    """Puts the default behind the help of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, default = action.help or '', action.default
+        if default is None or default is False or default == [] or default == argparse.SUPPRESS:
+            return text
+        shown = ','.join(map(str, default)) if isinstance(default, list | tuple) else str(default)
+        return f'{text} (default: {shown.replace("%", "%%")})'.strip()
 
 
-def minutes(text: str) -> float:
-    """Return minutes of robot time."""
-    return _number(text, f'{text!r}: expected 0.2 to 600', 0.2, 600.0)
+class Parser(argparse.ArgumentParser):
+    """A parser whose mistakes are one line and exit status 2."""
+
+    def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
+        """Parse the options of the tool `prog`."""
+        super().__init__(prog, description=description, epilog=epilog, formatter_class=_Formatter)
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong and end with status 2."""
+        print(f'{self.prog}: error: {message} (see {self.prog} --help)', file=sys.stderr)
+        sys.exit(2)
+
+    def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
+        """Add the robot, by name or directory; `flag` 'robot' makes it positional.
+
+        Args:
+            flag: Name of the argument.
+            default: None: it must be given.
+        """
+        # Pinocchio, which loads behind this, takes a second that tools without a robot save.
+        from musculoskeletal_ae.robot.description import shipped_robots
+
+        text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
+        if flag.startswith('-'):
+            required = default is None
+            self.add_argument(
+                flag, metavar='NAME|DIR', default=default, required=required, help=text
+            )
+        else:
+            self.add_argument(flag, help=text)
+
+    def add_checkpoint(
+        self, text: str = 'trained network', flag: str = '--checkpoint', required: bool = False
+    ) -> None:
+        """Add a checkpoint file, None where it is not given."""
+        self.add_argument(flag, type=Path, metavar='FILE', required=required, help=text)
+
+    def add_preset(self, text: str = 'network, learning and solver') -> None:
+        """Add `--preset`."""
+        self.add_argument('--preset', choices=tuple(PRESETS), default='default', help=text)
+
+    def add_seed(self, text: str) -> None:
+        """Add `--seed`; the text says what it is the random seed of."""
+        self.add_argument('--seed', type=seed, default=0, help=f'random seed {text}')
+
+    def add_seeds(self, default: tuple[int, ...] | None = (0,)) -> None:
+        """Add `--seeds`, the individual arms."""
+        self.add_argument(
+            '--seeds', type=seeds, default=default, metavar='N,…', help='individual arms'
+        )
+
+    def add_minutes(self, text: str, default: float | None) -> None:
+        """Add `--minutes` of robot time; the text says what happens in them."""
+        self.add_argument('--minutes', type=minutes, default=default, help=text)
+
+    def add_quick(self, text: str) -> None:
+        """Add `--quick`; the text says what is left out."""
+        self.add_argument('--quick', action='store_true', help=text)
+
+    def add_out(
+        self,
+        metavar: str,
+        text: str = 'where to write',
+        default: Path | None = None,
+        required: bool = False,
+    ) -> None:
+        """Add `--out`, a file or directory."""
+        self.add_argument(
+            '--out', type=Path, metavar=metavar, default=default, required=required, help=text
+        )
+
+    def add_plot(self, text: str, default: str | None = None) -> None:
+        """Add `--plot`, a picture; where `default` names one, also `--no-plot`."""
+        shown = text if default is None else f'{text} (default: {default})'
+        self.add_argument('--plot', type=Path, metavar='FILE.png', help=shown)
+        if default is not None:
+            self.add_argument('--no-plot', action='store_true', help='write no plot')
 
 
-def _number(text: str, problem: str, low: float, high: float) -> float:
+def exit_status(
+    work: Callable[[], int | None], *also: type[Exception], interrupted: int = 130
+) -> int:
+    """Do a tool's work and return its exit status, without a traceback.
+
+    Args:
+        work: Returns a status, or None for 0.
+        also: Kinds of errors that are said in one line, beside what this package and files raise.
+        interrupted: Status after Ctrl-C.
+
+    Returns:
+        What `work` returns, or 1 after an error that was printed.
+    """
+    refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(problem)
-    return value
+        return work() or 0
+    except refused as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return interrupted

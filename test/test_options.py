@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every command line has in common."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from musculoskeletal_ae import options
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.options import Parser, exit_status
+
+
+def parser():
+    made = Parser('tool', 'Does something.')
+    made.add_robot()
+    made.add_preset()
+    made.add_seed('of the noise')
+    made.add_seeds((0, 1, 2))
+    made.add_minutes('of exploration', None)
+    made.add_out('DIR')
+    made.add_plot('the result', 'check_<robot>.png')
+    made.add_argument('--jobs', type=options.whole(1, 8), default=2, help='processes')
+    made.add_argument('--quick', action='store_true', help='less')
+    return made
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'problem'),
+    [
+        (['--preset', 'best'], "--preset: invalid choice: 'best'"),
+        (['--seed', '-1'], "--seed: '-1': expected 0 to"),
+        (['--seed', 'x'], "--seed: 'x': expected 0 to"),
+        (['--seeds', '1,1'], 'expected different whole numbers, as in 0,1,2'),
+        (['--seeds', '1,'], 'expected different whole numbers'),
+        (['--minutes', 'nan'], "--minutes: 'nan': expected 0.2 to 600"),
+        (['--jobs', '9'], "--jobs: '9': expected 1 to 8"),
+        (['--nonsense'], 'unrecognized arguments: --nonsense'),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_option_and_status_2(arguments, problem, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parser().parse_args(arguments)
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert problem in message
+    assert message.startswith('tool: error: ')
+    assert message.count('\n') == 1
+
+
+def test_help_shows_every_default_once():
+    text = ' '.join(parser().format_help().split())
+    for shown in ('musashi_left_arm', 'default', '0', '0,1,2', 'check_<robot>.png', '2'):
+        assert f'(default: {shown})' in text
+    assert text.count('(default:') == 6
+
+
+def test_a_robot_may_be_required_or_come_by_position(capsys):
+    required = Parser('tool', '')
+    required.add_robot(default=None)
+    with pytest.raises(SystemExit):
+        required.parse_args([])
+    assert '--robot' in capsys.readouterr().err
+    positional = Parser('tool', '')
+    positional.add_robot('robot')
+    assert positional.parse_args(['arm26']).robot == 'arm26'
+
+
+@pytest.mark.parametrize(
+    ('kind', 'good', 'bad'),
+    [
+        (options.positive, ['0.1', '1e300'], ['0', '-1', 'nan', 'inf', 'x', '']),
+        (options.not_negative, ['0', '3'], ['-1e-9', 'nan', 'inf', 'x']),
+        (options.number(1.0, 2.0), ['1', '2.0'], ['0.9', '2.1', 'nan', 'x']),
+        (options.whole(1, 3), ['1', '3'], ['0', '4', '1.5', 'x']),
+        (options.names, ['a', 'a, b'], ['', ',', ' ,']),
+    ],
+)
+def test_types_take_what_is_legal_and_nothing_else(kind, good, bad):
+    for text in good:
+        kind(text)
+    for text in bad:
+        with pytest.raises(argparse.ArgumentTypeError):
+            kind(text)
+
+
+def test_names_are_listed_once_and_in_order():
+    assert options.names('b,a, b') == ['b', 'a']
+
+
+def test_what_the_package_refuses_is_one_line_and_status_1(capsys):
+    def refuse():
+        raise RobotDescriptionError('robot.urdf: is no robot')
+
+    assert exit_status(refuse) == 1
+    assert capsys.readouterr().err == 'error: robot.urdf: is no robot\n'
+    assert exit_status(lambda: None) == 0
+    assert exit_status(lambda: 3) == 3
+
+
+def test_ctrl_c_ends_without_a_traceback(capsys):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    assert exit_status(interrupt) == 130
+    assert exit_status(interrupt, interrupted=0) == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_what_nobody_foresaw_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        exit_status(lambda: 1 // 0)
