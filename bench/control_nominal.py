@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What control does on the nominal body: no mismatch, no friction, what is left is the network's.
+"""What control does on the nominal body: no mismatch, no friction; what is left is the network's.
+
+    python -m bench control_nominal --checkpoint FILE --paper-checkpoint FILE [--quick]
 
 1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
    QP on the true G, lengths by the true body.
@@ -9,6 +11,8 @@
 """
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 
@@ -25,8 +29,10 @@ from musculoskeletal_ae.control.stiffness_model import push_deflection
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.holdable import holdable_postures
+from musculoskeletal_ae.experiments.control import holdable_postures
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES, QUICK = 50, 3
@@ -168,3 +174,26 @@ def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> s
         f'within 10 %: {100.0 * (errors < 0.1).mean():.0f} %'
     )
     return '\n'.join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the tables of two networks."""
+    parser = Parser('control_nominal', 'Control on the nominal body, without mismatch or friction.')
+    parser.add_robot()
+    parser.add_checkpoint('network of preset default', required=True)
+    parser.add_checkpoint('network of preset paper', '--paper-checkpoint', required=True)
+    parser.add_quick(f'{QUICK} postures instead of {POSTURES}')
+    args = parser.parse_args(argv)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        default, paper = (
+            checkpoint.load(file, robot) for file in (args.checkpoint, args.paper_checkpoint)
+        )
+        print(nominal_tables(robot, default, paper, args.quick))
+
+    return exit_status(work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -165,12 +165,12 @@ def fuzz(count: int, seed: int) -> tuple[Counter[str], list[str], float]:
     return outcomes, failures, slowest
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Print a summary; exit status 1 if there was a failure."""
     parser = argparse.ArgumentParser(description='Damages bags at random and reads them.')
     parser.add_argument('--count', type=int, default=10_000, help='bags (10000)')
     parser.add_argument('--seed', type=int, default=0, help='(0)')
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     # A reader that asks for what a damaged length claims then fails instead of taking the machine.
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     begin = time.monotonic()

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from musculoskeletal_ae.control.length import first_command
-from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
+from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import nearest_tension
 from musculoskeletal_ae.simulation.simulation import Simulation

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near the simulated arm is to the real one (paper, section "Simulation", and its experiment).
+"""Does the simulator rest where the nominal body rests, and give way to pushes as it does?
 
-    python -m musculoskeletal_ae.experiments.simulation --checkpoint FILE [--quick]
-        [--robot NAME|DIR] [--preset default|paper]
+    python -m bench simulation_nominal --checkpoint FILE [--robot NAME|DIR] [--preset …] [--quick]
 
-On a network trained on the geometric model, against that model as a body (the emulated arm without
-individual differences and friction): does it hold still, does it rest where the body rests, does it
-give way to pushes as the body does. `compare` puts simulator and any emulated arm under the same
-commands.
+(Paper, section "Simulation".) On a network trained on the geometric model, against that model as a
+body: the emulated arm without individual differences and friction. `compare` puts simulator and any
+emulated arm under the same commands.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,6 +24,7 @@ from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -137,17 +136,21 @@ def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:
         print_responses(robot, mae, preset)
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> int:
     """Print the measurements for a checkpoint."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='simulation')
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--checkpoint', required=True)
-    parser.add_argument('--preset', default='default', choices=('default', 'paper'))
-    parser.add_argument('--quick', action='store_true', help='fewer commands')
+    parser = Parser('simulation_nominal', 'The simulator beside the nominal body.')
+    parser.add_robot()
+    parser.add_checkpoint(required=True)
+    parser.add_preset('of the simulator')
+    parser.add_quick('fewer commands')
     args = parser.parse_args(argv)
-    robot = Robot.load(args.robot)
-    report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)
+
+    return exit_status(work)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -25,8 +25,12 @@ import torch
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.experiments.online_learning import HELD_OUT_STREAM, held_out_error
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
+from musculoskeletal_ae.experiments.recording import (
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    estimation_error,
+    record,
+)
 from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial import initial_mae
@@ -84,7 +88,7 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
     mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
-    held_out = record(EmulatedArm(robot, args.seed), motion(robot, mae, HELD_OUT_STREAM, PART))
+    held_out = record(EmulatedArm(robot, args.seed), mae, HELD_OUT_STREAM, PART)
     learner = OnlineLearner(robot, mae, seed=args.seed, steps=args.steps)
     arm = EmulatedArm(robot, args.seed)
     least, worst, waiting, changed = np.inf, 0.0, 0, 0
@@ -92,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
     reported: list[float] = []
     filled = most = 0.0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        stream = record(arm, motion(robot, mae, part, PART))
+        stream = record(arm, mae, part, PART)
         for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
             sample = learner.collector.step(tension, length, SAMPLE_TIME, theta)
             waiting += sample is not None
@@ -103,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
                 times.append(time.process_time() - begun)
                 changed += bool(update and update.changed)
         now = PART * (part + 1)
-        error = held_out_error(learner.mae, held_out, 10)
+        error = estimation_error(learner.mae, held_out, 10)
         if now >= SETTLED:
             least, worst = min(least, error), max(worst, error / least)
         if now == FILLED:

@@ -8,13 +8,12 @@ table cannot be filled from so few postures, is also given the whole stream at 1
 from __future__ import annotations
 
 from itertools import product
-from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.experiments.least_squares import nominal
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, mean_error
 from musculoskeletal_ae.experiments.study import Rests
 from musculoskeletal_ae.robot.robot import Robot
@@ -22,25 +21,12 @@ from musculoskeletal_ae.robot.robot import Robot
 STREAM_STRIDE = 10
 
 
-class Baseline(Protocol):
-    """An estimator of θ from (T, l).
-
-    Attributes:
-        name: For tables.
-        stride: It is given every so many messages, where all of them would take too long.
-    """
-
-    name: str
-    stride: int
-
-    def estimate(self, tension: Array, length: Array, dt: float) -> Array:
-        """Return θ [rad] (N, D) for successive messages (N, M) that are `dt` [s] apart."""
-
-
 def baseline_errors(
     robot: Robot, samples: Rests, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error on the held-out motion before and after learning [rad].
+
+    Least squares on the geometric model, without weights, has nothing to learn.
 
     Args:
         robot: The geometric model, from which all of them start.
@@ -50,27 +36,23 @@ def baseline_errors(
     """
     part = slice(None, None, STREAM_STRIDE)
     moving = Rests(stream.theta_sensor[part], stream.tension[part], stream.length[part])
-    error = baseline_error(GeometricLeastSquares(robot), held_out)
-    table = {GeometricLeastSquares.name: {'before_rad': error, 'after_rad': error}}
+    error = nominal(robot, tension_noise=0.0).error(held_out)
+    table = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
     for kind in (PolynomialFilter, TableSearch):
-        before = baseline_error(kind(robot), held_out)
+        before = _error(kind(robot), held_out)
         for data, name in ((samples, kind.name), (moving, f'{kind.name}, whole stream')):
             taught = kind(robot)
             if len(data.theta):
                 taught.learn(*data)
-            table[name] = {'before_rad': before, 'after_rad': baseline_error(taught, held_out)}
+            table[name] = {'before_rad': before, 'after_rad': _error(taught, held_out)}
     return table
 
 
-def baseline_error(baseline: Baseline, recording: Recording) -> float:
-    """Return the mean of ‖θ_est − θ_true‖₂ [rad] over the messages a baseline is given."""
-    part = slice(None, None, baseline.stride)
-    estimate = baseline.estimate(
-        recording.tension[part], recording.length[part], baseline.stride * SAMPLE_TIME
-    )
+def _error(baseline: PolynomialFilter | TableSearch, recording: Recording) -> float:
+    estimate = baseline.estimate(recording.tension, recording.length)
     if not np.isfinite(estimate).all():
         raise FloatingPointError(f'{baseline.name} diverged')
-    return mean_error(estimate, recording.theta[part])
+    return mean_error(estimate, recording.theta)
 
 
 def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
@@ -84,53 +66,6 @@ def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
     return compensated
 
 
-class GeometricLeastSquares:
-    """Geometric model, nonlinear least squares: the estimator without any learning.
-
-        min_θ Σ_m (l_m − f_geo,m(θ) + L_e,m(f_geo,abs(θ), T_m))²,   within the joint limits
-
-    started at the estimate before, as a robot would that runs it message by message.
-    """
-
-    name = 'geometric model, least squares'
-    stride = 10
-    # In the paper's scaled units (mm/100) lengths and their tolerances are of the size of one.
-    SCALE = 10.0
-    EVALUATIONS = 30
-    STARTS = 20  # for the first message, whose estimate before is not known
-
-    def __init__(self, robot: Robot) -> None:
-        """Use the model of `robot`."""
-        self._robot = robot
-
-    def estimate(self, tension: Array, length: Array, dt: float) -> Array:  # noqa: ARG002 (no rates)
-        """Return θ [rad] (N, D); see `Baseline`."""
-        starts = self._robot.random_postures(self.STARTS, np.random.default_rng(0))
-        solved = [self._solve(start, tension[0], length[0]) for start in starts]
-        theta = min(solved, key=lambda pair: pair[1])[0]
-        estimates = []
-        for pull, measured in zip(tension, length, strict=True):
-            theta, _ = self._solve(theta, pull, measured)
-            estimates.append(theta)
-        return np.array(estimates)
-
-    def _solve(self, start: Array, tension: Array, length: Array) -> tuple[Array, float]:
-        robot = self._robot
-
-        def residual(theta: Array) -> Array:
-            off: Array = robot.muscle_lengths(theta[None], tension[None])[0] - length
-            return self.SCALE * off
-
-        def jacobian(theta: Array) -> Array:
-            slope = 1.0 - robot.series_elastic.length_slope(tension)
-            change: Array = slope[:, None] * robot.routes.muscle_jacobian(theta[None])[0]
-            return self.SCALE * change
-
-        bounds = robot.lower, robot.upper
-        solved = least_squares(residual, start, jacobian, bounds, max_nfev=self.EVALUATIONS)
-        return solved.x, float(solved.cost)
-
-
 class PolynomialFilter:
     """Joint-muscle mapping by polynomials, and an extended Kalman filter on it (Ookubo 2015).
 
@@ -142,7 +77,6 @@ class PolynomialFilter:
     """
 
     name = 'polynomial mapping, EKF'
-    stride = 1
     DEGREE = 3
     MODEL_SAMPLES = 20_000
     PRIOR_ROWS = 20.0  # samples that the coefficients before are worth
@@ -200,14 +134,14 @@ class PolynomialFilter:
         turn = 2.0 / (self._robot.upper - self._robot.lower)
         return predicted, (coefficients.T @ slope) * turn
 
-    def estimate(self, tension: Array, length: Array, dt: float) -> Array:
-        """Return θ [rad] (N, D); see `Baseline`."""
+    def estimate(self, tension: Array, length: Array) -> Array:
+        """Return θ [rad] (N, D) for successive messages T [N] (N, M), l [m] (N, M)."""
         robot = self._robot
         measured = unstretched(robot, tension, length)
         noise = np.diag(np.maximum(self._noise, self.LEAST_NOISE) ** 2)
         theta = 0.5 * (robot.lower + robot.upper)
         spread = np.diag(((robot.upper - robot.lower) / np.sqrt(12.0)) ** 2)
-        walk = self.WALK**2 * dt * np.eye(robot.joint_count)
+        walk = self.WALK**2 * SAMPLE_TIME * np.eye(robot.joint_count)
         estimates = np.empty((len(length), robot.joint_count))
         for n in range(len(length)):
             spread = spread + walk
@@ -233,7 +167,6 @@ class TableSearch:
     """
 
     name = 'table search'
-    stride = 1
     ROWS = 100_000
 
     def __init__(self, robot: Robot) -> None:
@@ -247,9 +180,8 @@ class TableSearch:
         self._theta = theta
         self._lengths = cKDTree(unstretched(self._robot, tension, length))
 
-    def estimate(self, tension: Array, length: Array, dt: float) -> Array:  # noqa: ARG002 (no rates)
-        """Return θ [rad] (N, D); see `Baseline`."""
-        nearest: Array = self._theta[
-            self._lengths.query(unstretched(self._robot, tension, length))[1]
-        ]
+    def estimate(self, tension: Array, length: Array) -> Array:
+        """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M)."""
+        row = self._lengths.query(unstretched(self._robot, tension, length))[1]
+        nearest: Array = self._theta[row]
         return nearest

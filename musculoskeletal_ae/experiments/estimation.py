@@ -122,7 +122,8 @@ def _course(found: Individuals) -> plots.Plot:
     for panel in axes[:, 0]:
         panel.set_yscale('log')
     for when, colour in plots.WHEN.items():
-        seen, style = trace[when], {'color': colour, 'lw': 1}
+        seen = trace[when]
+        style: dict[str, Any] = {'color': colour, 'lw': 1}
         error = np.linalg.norm(seen['theta'] - trace['theta'], axis=1)[rows]
         free, loaded = row.numbers[f'{when}_rad'], row.numbers[f'{when}_payload_rad']
         label = f'{when} learning ({free:.3f} rad, with weight {loaded:.3f} rad)'

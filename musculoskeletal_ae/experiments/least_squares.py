@@ -43,18 +43,22 @@ class LeastSquares:
         muscle_jacobian: Callable[[Array], Array],
         length_at_zero: Array,
         elastic: SeriesElastic,
+        tension_noise: float = TENSION_NOISE,
     ) -> None:
-        """Take the body model: l [m] (N, M) of θ (N, D) and T [N] (N, M), G, l_abs(0) and L_e."""
+        """Take the body model: l [m] (N, M) of θ (N, D) and T [N] (N, M), G, l_abs(0) and L_e.
+
+        Without noise of the tension sensors [N] all muscles have one weight.
+        """
         self._lower, self._upper, self._lengths = robot.lower, robot.upper, lengths
         self.muscle_jacobian = muscle_jacobian
-        self._at_zero, self._elastic = length_at_zero, elastic
+        self._at_zero, self._elastic, self._noise = length_at_zero, elastic, tension_noise
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M), started at mid-range."""
         theta = np.tile(0.5 * (self._lower + self._upper), (len(tension), 1))
         absolute = self._at_zero + self._lengths(theta, np.zeros_like(tension))
         compliance = self._elastic.compliance(absolute, tension)
-        weight = 1.0 / (LENGTH_NOISE**2 + (compliance * TENSION_NOISE) ** 2)
+        weight = 1.0 / (LENGTH_NOISE**2 + (compliance * self._noise) ** 2)
         damping = np.full(len(tension), DAMPING)
         residual = length - self._lengths(theta, tension)
         cost = np.sum(weight * residual**2, axis=1)
@@ -93,11 +97,11 @@ def oracle(robot: Robot, true: Individual) -> LeastSquares:
     return LeastSquares(robot, *model)
 
 
-def nominal(robot: Robot) -> LeastSquares:
+def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
     """Return least squares on the geometric model."""
     routes = robot.routes
     model = robot.muscle_lengths, routes.muscle_jacobian, routes.length_at_zero
-    return LeastSquares(robot, *model, robot.series_elastic)
+    return LeastSquares(robot, *model, robot.series_elastic, tension_noise)
 
 
 def learned(robot: Robot, body: CorrectedBody) -> LeastSquares:

@@ -200,16 +200,16 @@ def plot(found: Individuals) -> list[plots.Plot]:
     for preset, colour in COLOURS.items():
         traces = [row.traces[preset] for row in rows]
         running = np.array([trace['running'] for trace in traces])
-        minutes = (np.arange(running.shape[1]) + 0.5) / 60.0
+        seconds = np.linspace(0.5, running.shape[1] - 0.5, running.shape[1])
         mean: Array = running.mean(axis=0)
         for each in running if len(running) > 1 else ():
-            plots.line(time_axes, minutes, each, 10, color=colour, lw=0.5, alpha=0.25)
+            plots.line(time_axes, seconds / 60, each, 10, color=colour, lw=0.5, alpha=0.25)
         label = f'preset {preset}'
-        plots.line(time_axes, minutes, mean, 10, color=colour, lw=1.2, label=label)
+        plots.line(time_axes, seconds / 60, mean, 10, color=colour, lw=1.2, label=label)
         start, end = (np.mean([t[f'fit_{at}_rad'] for t in traces]) for at in ('start', 'end'))
         fit = f'exponential fit: {start:.3f} → {end:.3f} rad'
-        fitted = exponential_fit(60.0 * minutes, mean)
-        time_axes.plot(minutes, fitted, color=colour, lw=2.5, ls='--', label=fit)
+        fitted = exponential_fit(seconds, mean)
+        time_axes.plot(seconds / 60, fitted, color=colour, lw=2.5, ls='--', label=fit)
         for trace in traces:
             points = trace['curve_samples'], trace['curve_errors']
             sample_axes.plot(*points, color=colour, lw=1.2, alpha=0.7, label=label)

@@ -63,7 +63,7 @@ def smooth(values: Array, window: int) -> Array:
     return mean
 
 
-def line(axes: Any, x: Array, y: Array, window: int = 1, **style: Any) -> None:
+def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
     """Draw a line of at most `POINTS` points through y, or its running mean over a window."""
     step = max(1, len(x) // POINTS)
     axes.plot(x[::step], smooth(y, window)[::step], **style)

@@ -15,8 +15,8 @@ import rclpy
 from rclpy.utilities import remove_ros_args
 from visualization_msgs.msg import Marker, MarkerArray
 
-from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.nodes.qos import SENSOR
+from musculoskeletal_ae.robot.picture import Line, save_picture
 
 
 def _lines(message: MarkerArray) -> list[Line]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from musculoskeletal_ae.experiments.baselines.estimator import unstretched
 from musculoskeletal_ae.experiments.baselines.geometric import GeometricLeastSquares
 from musculoskeletal_ae.experiments.baselines.mapping import PolynomialFilter
 from musculoskeletal_ae.experiments.baselines.table import TableSearch
+
 from musculoskeletal_ae.robot.robot import Robot
 
 DT = 0.02

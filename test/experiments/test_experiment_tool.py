@@ -8,8 +8,8 @@ import math
 from html.parser import HTMLParser
 
 import pytest
-
 from musculoskeletal_ae.experiments.suite.registry import NAMES
+
 from musculoskeletal_ae.tools import experiment
 
 # As INTERFACE.md lists them.

@@ -8,7 +8,6 @@ import shutil
 import numpy as np
 import pytest
 import torch
-
 from musculoskeletal_ae.experiments.suite.detection import alarms_begun, auroc
 from musculoskeletal_ae.experiments.suite.learning import (
     EXPLORING,
@@ -26,6 +25,7 @@ from musculoskeletal_ae.experiments.suite.scenario import (
     ScriptedArm,
 )
 from musculoskeletal_ae.experiments.suite.study import Study
+
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 

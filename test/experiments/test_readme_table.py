@@ -6,8 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.report.readme import (
     BEGIN,
     END,
@@ -19,6 +17,8 @@ from musculoskeletal_ae.experiments.report.readme import (
     write_table,
 )
 from musculoskeletal_ae.experiments.report.rows import ROWS, missed_by, verdict
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 REPOSITORY = Path(__file__).parents[2]
 

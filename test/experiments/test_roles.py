@@ -6,8 +6,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from robots import write_robot
-
 from musculoskeletal_ae.experiments.suite.roles import (
     elbow,
     flexed,
@@ -16,6 +14,8 @@ from musculoskeletal_ae.experiments.suite.roles import (
     slides,
     within,
 )
+from robots import write_robot
+
 from musculoskeletal_ae.robot.robot import Robot
 
 
