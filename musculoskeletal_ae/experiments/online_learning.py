@@ -196,35 +196,35 @@ def plot(found: Individuals) -> list[plots.Plot]:
     """Draw the running error with its exponential fit, and the held-out error over samples."""
     rows = list(found.rows.values())
     figure, axes = plots.new_figure(12.0, 4.6, 1, 2, width_ratios=(3, 2))
-    time_axes, sample_axes = axes[0]
+    left, right = axes[0]
     for preset, colour in COLOURS.items():
         traces = [row.traces[preset] for row in rows]
         running = np.array([trace['running'] for trace in traces])
         seconds = np.linspace(0.5, running.shape[1] - 0.5, running.shape[1])
         mean: Array = running.mean(axis=0)
         for each in running if len(running) > 1 else ():
-            plots.line(time_axes, seconds / 60, each, 10, color=colour, lw=0.5, alpha=0.25)
+            plots.line(left, seconds / 60, each, 10, color=colour, lw=0.5, alpha=0.25)
         label = f'preset {preset}'
-        plots.line(time_axes, seconds / 60, mean, 10, color=colour, lw=1.2, label=label)
+        plots.line(left, seconds / 60, mean, 10, color=colour, lw=1.2, label=label)
         start, end = (np.mean([t[f'fit_{at}_rad'] for t in traces]) for at in ('start', 'end'))
         fit = f'exponential fit: {start:.3f} → {end:.3f} rad'
         fitted = exponential_fit(seconds, mean)
-        time_axes.plot(seconds / 60, fitted, color=colour, lw=2.5, ls='--', label=fit)
+        left.plot(seconds / 60, fitted, color=colour, lw=2.5, ls='--', label=fit)
         for trace in traces:
             points = trace['curve_samples'], trace['curve_errors']
-            sample_axes.plot(*points, color=colour, lw=1.2, alpha=0.7, label=label)
+            right.plot(*points, color=colour, lw=1.2, alpha=0.7, label=label)
             label = ''
     ends = f'paper, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
     long_enough = found.study.minutes >= PRINTED_MINUTES
     at = [0.0, PRINTED_MINUTES] if long_enough else [np.nan, np.nan]
-    time_axes.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=ends)
+    left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=ends)
     oracle = float(np.mean([numbers['oracle_rad'] for numbers in found.numbers]))
-    sample_axes.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
-    plots.tidy(time_axes, 'exploration [min]', '‖θ_est − θ_sensor‖ [rad]', 'while exploring')
-    plots.tidy(sample_axes, 'samples at rest', 'mean error [rad]', 'held-out motion, individuals')
-    for each_axes in axes[0]:
-        each_axes.set_ylim(bottom=0.0)
-        each_axes.legend(fontsize=9)
+    right.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
+    plots.tidy(left, 'time of exploration [min]', '‖θ_est − θ_sensor‖ [rad]', 'while exploring')
+    plots.tidy(right, 'samples at rest', 'mean error [rad]', 'held-out motion, each individual')
+    for panel in (left, right):
+        panel.set_ylim(bottom=0.0)
+        panel.legend(fontsize=9)
     caption = (
         'Left: error of the estimate during online learning (10 s running means; bold: mean over '
         f'individuals {", ".join(map(str, found.rows))}, pale: each), with the exponential fit of '

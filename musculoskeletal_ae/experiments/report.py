@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from musculoskeletal_ae.experiments.results import read
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
@@ -28,15 +27,17 @@ def write_report(folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(code=_code, command=_command, flat=_flat, cell=_cell)
+    environment.filters.update(command=_command, flat=_flat, cell=_cell)
     about = next(iter(results.values()))['about']
+    table = [row for row in ROWS if row.number(results, row.default) is not None]
     page = environment.get_template(TEMPLATE).render(
         results=results,
         experiments=EXPERIMENTS,
         about=about,
         mixed=any(result['about'] != about for result in results.values()),
         quick=any(result['about']['quick'] for result in results.values()),
-        table=[row for row in ROWS if row.number(results, row.default) is not None],
+        table=table,
+        missed=[row.quantity for row in table if (row.missed(results) or 0.0) > 0.0],
         images={
             (name, plot['file']): base64.b64encode(file.read_bytes()).decode('ascii')
             for name, result in results.items()
@@ -57,13 +58,6 @@ def _command(name: str, about: Mapping[str, Any]) -> str:
         f'ros2 run musculoskeletal_ae experiment {name} --robot {about["robot"]} '
         f'--preset {about["preset"]} --seeds {seeds} --minutes {about["minutes"]:g}{quick}'
     )
-
-
-def _code(text: str) -> Markup:
-    """Return text as HTML, with what stands between backquotes as code."""
-    parts = [escape(part) for part in text.split('`')]
-    marked = [Markup('<code>{}</code>').format(p) if i % 2 else p for i, p in enumerate(parts)]
-    return Markup('').join(marked)
 
 
 def _flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:

@@ -6,7 +6,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from musculoskeletal_ae.experiments.suite.roles import (
+from robots import write_robot
+
+from musculoskeletal_ae.experiments.roles import (
     elbow,
     flexed,
     plotted,
@@ -14,8 +16,6 @@ from musculoskeletal_ae.experiments.suite.roles import (
     slides,
     within,
 )
-from robots import write_robot
-
 from musculoskeletal_ae.robot.robot import Robot
 
 

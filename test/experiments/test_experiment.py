@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from html.parser import HTMLParser
 
 import pytest
-from musculoskeletal_ae.experiments.suite.registry import NAMES
 
+from musculoskeletal_ae.experiments.report import write_report
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.tools import experiment
 
 # As INTERFACE.md lists them.
@@ -20,7 +22,7 @@ KEYS = {
     'a_before_healthy_max a_before_ruptured_min a_healthy_max a_ruptured_min threshold '
     'detection_s false_alarms auroc named_share',
     'control': 'qp_bound_n',
-    'simulation': 'before_rad after_rad before_n after_n',
+    'simulation': 'before_rad after_rad before_n after_n frictionless_rad',
     'loss_change': '',
     'body_change': '',
 }
@@ -55,7 +57,7 @@ class Links(HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.parametrize('name', NAMES)
+@pytest.mark.parametrize('name', EXPERIMENTS)
 def test_every_experiment_writes_its_keys_with_finite_numbers(quick, name):
     found = result(quick, name)
     assert set(KEYS[name].split()) <= set(found)
@@ -69,9 +71,11 @@ def test_control_has_every_method_of_the_paper(quick):
         assert {'error_rad', 'error_var', 'tension_n'} <= set(found[method])
 
 
-@pytest.mark.parametrize('name', NAMES)
+@pytest.mark.parametrize('name', EXPERIMENTS)
 def test_every_experiment_draws_the_plots_it_lists(quick, name):
-    for plot in result(quick, name)['plots']:
+    plots = result(quick, name)['plots']
+    assert plots
+    for plot in plots:
         assert (quick / name / plot['file']).read_bytes().startswith(b'\x89PNG')
         assert plot['caption']
 
@@ -81,7 +85,7 @@ def test_the_report_is_one_well_formed_page_that_needs_nothing_else(quick):
     links = Links()
     links.feed(page)
     assert not links.open
-    plots = sum(len(result(quick, name)['plots']) for name in NAMES)
+    plots = sum(len(result(quick, name)['plots']) for name in EXPERIMENTS)
     assert sum(link.startswith('data:image/png;base64,') for link in links.found) == plots
     assert all(link.startswith(('data:', '#')) for link in links.found)
     assert 'url(' not in page
@@ -91,7 +95,32 @@ def test_the_report_has_the_papers_numbers_and_the_command_to_repeat_it(quick):
     page = (quick / 'report.html').read_text(encoding='utf-8')
     for printed in ('0.414', '0.186', '0.324', '0.154', '0.335', '0.162', '105', '92.2'):
         assert f'<td>{printed}</td>' in page
-    assert 'experiment all --robot arm26 --preset default --seeds 0 --minutes 2 --quick' in page
+    assert 'experiment all --robot arm26 --preset default --seeds 0 --minutes 0.5 --quick' in page
+
+
+@pytest.mark.parametrize('name', EXPERIMENTS)
+def test_the_report_explains_every_experiment(quick, name):
+    page = (quick / 'report.html').read_text(encoding='utf-8')
+    assert f'<h2 id="{name}">{EXPERIMENTS[name].title}</h2>' in page
+    assert EXPERIMENTS[name].here.split('. ')[0].splitlines()[0].split(' `')[0] in page
+
+
+def test_the_report_says_by_how_much_an_aim_is_missed(quick, tmp_path):
+    folder = tmp_path / 'bad'
+    shutil.copytree(quick, folder)
+    found = result(folder, 'control')
+    found['proposed']['error_rad'] = 0.5
+    (folder / 'control' / 'result.json').write_text(json.dumps(found), encoding='utf-8')
+    page = write_report(folder).read_text(encoding='utf-8')
+    assert '<span class="missed">missed by 0.440</span>' in page
+    assert 'proposed, distance from θ_eval [rad]' in page.split('Aims missed:')[1].split('</p>')[0]
+
+
+def test_the_report_of_one_experiment_has_that_one_only(quick, tmp_path):
+    shutil.copytree(quick / 'body_change', tmp_path / 'body_change')
+    page = write_report(tmp_path).read_text(encoding='utf-8')
+    assert page.count('<h2 id=') == 1
+    assert 'experiment body_change --robot arm26' in page and 'Beside the paper' not in page
 
 
 @pytest.mark.parametrize(
