@@ -89,8 +89,7 @@ def follow(
         update = learner.step(stream.tension[n], stream.length[n], SAMPLE_TIME, theta)
         if update is not None or n == len(running) - 1:
             part = slice(start, n + 1)
-            before = learner.mae if update is None else mae
-            estimate = before.estimate(stream.tension[part], stream.length[part]).theta
+            estimate = mae.estimate(stream.tension[part], stream.length[part]).theta
             running[part] = np.linalg.norm(estimate - stream.theta_sensor[part], axis=1)
             start, mae = n + 1, learner.mae
             samples.append(len(learner.collector.store))
@@ -114,7 +113,7 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
     study.keep_stream(seed, 'exploring', exploring)
     study.keep_stream(seed, 'held_out', held_out)
     progress(0.2)
-    numbers: dict[str, Any] = {}
+    limits, numbers = oracle_errors(robot, seed, held_out), {}
     traces: dict[str, Any] = {}
     for preset, share in (('default', 0.5), ('paper', 0.2)):
         learner = OnlineLearner(robot, initial[preset], preset, seed, study.update_steps)
@@ -122,7 +121,8 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         if isinstance(learner.updater, BodyUpdater):
             study.keep_rests(seed, _rests(learner))
-            numbers['body_rad'] = learned(robot, learner.updater.body).error(held_out)
+            body = learned(robot, learner.updater.body)
+            limits = {'body_rad': body.error(held_out), **limits}
         found = _numbers(curve, learner, initial[preset], held_out)
         for prefix, named in (('', study.preset), ('paper_', 'paper')):
             if preset == named:
@@ -135,8 +135,7 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
             'fit_end_rad': found['fit_end_rad'],
         }
         progress(share)
-    numbers.update(oracle_errors(robot, seed, held_out))
-    return Measured(numbers, traces)
+    return Measured({**limits, **numbers}, traces)
 
 
 def _rests(learner: OnlineLearner) -> Rests:

@@ -157,39 +157,29 @@ def markdown(results: Results) -> str:
     return '\n'.join(['', text, '', *lines, ''])
 
 
-def update_readme(measured: Path, readme: Path) -> list[Path]:
-    """Keep the result.json files of a folder beside a README and write its table anew.
+def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
+    """Write the table of a README from the results kept beside it; return the files written.
+
+    Args:
+        readme: Has a place between markers.
+        measured: A folder whose result.json files are kept first.
 
     Raises:
-        MusculoskeletalError: If the README has no place for it.
+        MusculoskeletalError: If the README has no place for the table.
     """
-    kept = []
-    for name in read(measured):
-        source, goal = (
-            folder / name / 'result.json' for folder in (measured, readme.parent / KEPT)
-        )
-        goal.parent.mkdir(parents=True, exist_ok=True)
-        if source.resolve() != goal.resolve():
-            shutil.copyfile(source, goal)
-        kept.append(goal)
-    write_table(readme)
-    return [*kept, readme]
-
-
-def write_table(readme: Path) -> None:
-    """Write the table between the markers of a README.
-
-    Raises:
-        MusculoskeletalError: If it has none.
-    """
-    text = readme.read_text(encoding='utf-8')
+    text, kept, files = readme.read_text(encoding='utf-8'), readme.parent / KEPT, []
     if text.count(BEGIN) != 1 or text.count(END) != 1:
         raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and one {END}')
+    if measured is not None and measured.resolve() != kept.resolve():
+        for name in read(measured):
+            files.append(kept / name / 'result.json')
+            files[-1].parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(measured / name / 'result.json', files[-1])
     head, rest = text.split(BEGIN)
     tail = rest.split(END)[1]
-    new = f'{head}{BEGIN}\n{markdown(read(readme.parent / KEPT))}\n{END}{tail}'
-    readme.write_text(new, encoding='utf-8')
+    readme.write_text(f'{head}{BEGIN}\n{markdown(read(kept))}\n{END}{tail}', encoding='utf-8')
+    return [*files, readme]
 
 
 if __name__ == '__main__':
-    write_table(Path(sys.argv[1]))
+    update_readme(Path(sys.argv[1]))

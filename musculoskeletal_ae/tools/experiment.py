@@ -73,7 +73,7 @@ def _measure(args: argparse.Namespace) -> None:
             measured = run(study, names, args.jobs, report)
         files = [*results.write(study, measured, args.out), write_report(args.out)]
     if args.readme:
-        files += update_readme(args.out, args.readme)
+        files += update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
 
 

@@ -17,7 +17,6 @@ from musculoskeletal_ae.experiments.table import (
     ROWS,
     markdown,
     update_readme,
-    write_table,
 )
 
 REPOSITORY = Path(__file__).parents[2]
@@ -56,13 +55,13 @@ def test_a_row_of_the_worst_individual_shows_the_largest_of_them():
 def test_a_run_is_kept_and_its_table_written(quick, tmp_path):
     readme = tmp_path / 'README.md'
     readme.write_text(f'before\n{BEGIN}\nlast year\n{END}\nafter\n', encoding='utf-8')
-    files = update_readme(quick, readme)
+    files = update_readme(readme, quick)
     assert (tmp_path / KEPT / 'control' / 'result.json') in files
     text = readme.read_text(encoding='utf-8')
     assert text.startswith('before\n') and text.endswith('\nafter\n')
     assert 'last year' not in text
     assert text.count('\n| ') == 1 + len(ROWS)
-    write_table(readme)
+    assert update_readme(readme) == [readme]
     assert readme.read_text(encoding='utf-8') == text
 
 
@@ -70,7 +69,7 @@ def test_a_readme_without_markers_is_left_alone(tmp_path):
     readme = tmp_path / 'README.md'
     readme.write_text('no place', encoding='utf-8')
     with pytest.raises(MusculoskeletalError, match='results'):
-        write_table(readme)
+        assert update_readme(readme) == [readme]
     assert readme.read_text(encoding='utf-8') == 'no place'
 
 
