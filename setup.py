@@ -9,17 +9,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
-NODES = [
-    'bringup_status',
-    'controller',
-    'estimator',
-    'hardware_emulator',
-    'learner',
-    'record',
-    'render',
-    'replay',
-    'sim',
-]
+NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
+ROS_TOOLS = ['record', 'render', 'replay']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 
@@ -55,7 +46,8 @@ setup(
     python_requires='>=3.10',
     entry_points={
         'console_scripts': [
-            *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
+            *(f'{name} = {NAME}.nodes.running:{name}' for name in NODES),
+            *(f'{name} = {NAME}.nodes.{name}:main' for name in ROS_TOOLS),
             *(f'{name} = {NAME}.tools.{name}:main' for name in TOOLS),
         ],
     },

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.control.length import first_command
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
 from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import nearest_tension
+from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
@@ -40,7 +40,7 @@ def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
     """Hold the middle of the joint range, then load the hand; return the files written."""
     simulated = Simulation(robot, mae)
     theta = 0.5 * (robot.lower + robot.upper)
-    tension = nearest_tension(
+    tension, _ = least_tension(
         mae.muscle_jacobian(theta, np.full(robot.muscle_count, robot.tension.bias)),
         robot.kinematics.holding_torque(theta),
         robot.tension.bias,

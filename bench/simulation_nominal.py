@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.sim_responses import FLEXED, FORCED, print_responses
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import msc_compensation
+from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError

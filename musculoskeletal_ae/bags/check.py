@@ -14,7 +14,7 @@ from musculoskeletal_ae.bags.selection import interface_topics
 from musculoskeletal_ae.bags.streams import Streams, read_streams
 from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
 

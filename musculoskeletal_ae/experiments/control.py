@@ -19,7 +19,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.proposed import proposed
+from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm

@@ -12,8 +12,9 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, AnomalyDetector
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, rows_between
-from musculoskeletal_ae.mae.evaluation import residuals
-from musculoskeletal_ae.mae.mae import Mae, State
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import residuals
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
 PAYLOAD = 3.6  # [kg], the paper's dumbbell
@@ -234,7 +235,7 @@ def slack_auroc(robot: Robot, mae: Mae, taken: Recording, plan: GraspAndCut) -> 
 
 def _anomaly(mae: Mae, tension: Array, length: Array) -> Array:
     """Return A of messages (N, M), scaled units, shape (N,)."""
-    halves = np.split(residuals(mae, tension, length), 2, axis=1)
+    halves = np.split(residuals(mae.estimate(tension, length), tension, length), 2, axis=1)
     total: Array = sum((np.linalg.norm(half, axis=1) for half in halves), np.zeros(len(tension)))
     return total
 

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import geometric_command
-from musculoskeletal_ae.control.proposed import proposed
+from musculoskeletal_ae.control.methods import geometric_command, proposed
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.roles import elbow, flexed, plotted, shoulder, within

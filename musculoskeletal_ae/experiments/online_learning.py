@@ -41,8 +41,8 @@ from musculoskeletal_ae.experiments.study import (
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.presets import PRESETS
 
 CURVE_STRIDE = 10  # of held-out messages, after every update

@@ -10,7 +10,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
-from musculoskeletal_ae.control.length import first_command, ramp
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.mae.mae import Mae
@@ -76,7 +76,8 @@ def record(
         for tick in range(round(step_time / SAMPLE_TIME)):
             if script:
                 script(arm, SAMPLE_TIME * len(rows))
-            command = ramp(start, goal, (tick + 1) * SAMPLE_TIME, RAMP_SHARE * step_time)
+            share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step_time))
+            command = start + share * (goal - start)
             arm.command_length(command)
             arm.step(SAMPLE_TIME)
             read = arm.sense()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -17,22 +18,17 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
 from musculoskeletal_ae.messages import read_posture
-from musculoskeletal_ae.nodes.parameters import text
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
-from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 
 
 class BringupStatus(Shell):
     """Prints estimation error, A, samples learned and number of checkpoints."""
 
-    def __init__(self) -> None:
-        """Declare parameters and listen."""
-        super().__init__('bringup_status')
-        self.declare_parameter(
-            'duration', 0.0, text('end so many seconds after the arm is up [s]; 0: never', True)
-        )
-        self.duration = self.get_parameter('duration').value
+    def __init__(self, **options: Any) -> None:
+        """Listen; options are those of Node."""
+        super().__init__('bringup_status', **options)
+        self.duration: float = self.parameter('duration')
         self.theta: np.ndarray | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
@@ -93,8 +89,3 @@ class BringupStatus(Shell):
         print(line, flush=True)
         if 0.0 < self.duration <= elapsed:
             raise ExternalShutdownException
-
-
-def main() -> None:
-    """Run the node."""
-    run(BringupStatus)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -19,9 +20,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages import QUANTITIES, array_message, read_array, read_pose
-from musculoskeletal_ae.nodes.parameters import declare_preset, number
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
-from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, WARN, Shell
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
@@ -36,25 +35,16 @@ MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 class Estimator(Shell):
     """Node shell of the MAE's estimate ② and the anomaly detector."""
 
-    def __init__(self) -> None:
-        """Declare parameters and topics."""
-        super().__init__('estimator')
-        # Shared by all nodes; what network it is, the checkpoint says.
-        declare_preset(self, 'of the checkpoint')
+    def __init__(self, **options: Any) -> None:
+        """Declare topics; options are those of Node."""
+        super().__init__('estimator', **options)
         self.detector = AnomalyDetector(self.robot)
         self.verdict: Verdict | None = None
         self.cause = self.suspect = ''
         self.taken = self.get_clock().now()
         self.arrival = -math.inf
         self.command_arrival = -math.inf
-        self.settable(
-            'anomaly_threshold',
-            0.0,
-            number(
-                'A above it in 5 messages running is an anomaly; 0: calibrated detector', 0, 1e6
-            ),
-            self._set_threshold,
-        )
+        self.follow_parameter('anomaly_threshold', self._set_threshold)
         self.joint_publisher = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscle_publisher = self.create_publisher(
             Float64MultiArray, 'estimated_muscle_states', RELIABLE
@@ -150,8 +140,3 @@ class Estimator(Shell):
         if time.monotonic() - self.arrival > 1.0:
             return WARN, 'no muscle_states', values
         return OK, 'estimating' if self.detector.calibrated else 'estimating, uncalibrated', values
-
-
-def main() -> None:
-    """Run the node."""
-    run(Estimator)

@@ -7,7 +7,7 @@ muscle_length_command, muscle_tension_command → joint_states, muscle_states, m
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -22,9 +22,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import array_message, read_array, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
-from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 
@@ -36,38 +34,20 @@ LONGEST_STEP = 0.1  # [s]
 class HardwareEmulator(Shell):
     """Node shell of the emulated arm."""
 
-    def __init__(self) -> None:
-        """Declare parameters and topics, and start the arm."""
-        super().__init__('hardware_emulator')
-        self.declare_parameter('seed', 0, whole('which individual arm'))
-        self.declare_parameter(
-            'joint_sensors', True, text('false: no joint_states', read_only=True)
-        )
-        self.arm = EmulatedArm(self.robot, self.get_parameter('seed').value)
+    def __init__(self, **options: Any) -> None:
+        """Declare topics and start the arm; options are those of Node."""
+        super().__init__('hardware_emulator', **options)
+        self.arm = EmulatedArm(self.robot, self.parameter('seed'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
         self.read = self.arm.sense()
-        self.settable(
-            'command_timeout',
-            0.5,
-            number('without a command for this long the modules go safe [s]', 0.01, 60.0),
-            self._set_timeout,
-        )
-        self.settable(
-            'ruptured_muscles', [''], text('names of cut muscles; "[\'\']" heals'), self._rupture
-        )
-        self.settable('payload', 0.0, number('in the hand [kg]', 0.0, 20.0), self._set_payload)
-        self.settable(
-            'length_offset',
-            [0.0],
-            text('added to the length sensors [m]: one value for all muscles, or one each'),
-            self._set_offset,
-        )
-        self.settable(
-            'marker_rate', 0.0, number('of marker_pose [Hz], 0: none', 0.0, 100.0), self._see_marker
-        )
+        self.follow_parameter('command_timeout', self._set_timeout)
+        self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
+        self.follow_parameter('payload', self.arm.set_payload)
+        self.follow_parameter('length_offset', self._set_offset)
+        self.follow_parameter('marker_rate', self._see_marker)
         self.joint_publisher = None
-        if self.get_parameter('joint_sensors').value:
+        if self.parameter('joint_sensors'):
             self.joint_publisher = self.create_publisher(JointState, 'joint_states', RELIABLE)
         self.muscle_publisher = self.create_publisher(Float64MultiArray, 'muscle_states', RELIABLE)
         self.pose_publisher = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
@@ -91,20 +71,14 @@ class HardwareEmulator(Shell):
     def _set_timeout(self, value: float) -> None:
         self.arm.command_timeout = value
 
-    def _set_payload(self, value: float) -> None:
-        self.arm.set_payload(value)
-
     def _see_marker(self, value: float) -> None:
         self.marker_rate = value
 
-    def _rupture(self, names: Sequence[str]) -> None:
-        self.arm.set_ruptured(name for name in names if name)
-
-    def _set_offset(self, values: Sequence[float]) -> None:
-        offset, count = np.asarray(values, dtype=float), self.robot.muscle_count
-        if len(offset) not in (1, count) or not np.isfinite(offset).all():
-            raise MusculoskeletalError(f'{list(values)}: expected 1 or {count} finite numbers [m]')
-        self.arm.set_length_offset(np.broadcast_to(offset, count))
+    def _set_offset(self, values: tuple[float, ...]) -> None:
+        count = self.robot.muscle_count
+        if len(values) not in (1, count):
+            raise MusculoskeletalError(f'{list(values)}; legal: 1 or {count} numbers [m]')
+        self.arm.set_length_offset(np.broadcast_to(values, count))
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -119,7 +93,7 @@ class HardwareEmulator(Shell):
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.arm.reset()
-        self._rupture(self.get_parameter('ruptured_muscles').value)
+        self.arm.set_ruptured(self.parameter('ruptured_muscles'))
         response.success = True
         response.message = 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
         return response
@@ -169,8 +143,3 @@ class HardwareEmulator(Shell):
         if self.arm.safe:
             return WARN, 'modules safe: no commands', values
         return OK, 'following commands', values
-
-
-def main() -> None:
-    """Run the node."""
-    run(HardwareEmulator)

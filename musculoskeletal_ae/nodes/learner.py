@@ -7,6 +7,7 @@ joint_states or vision_joint_states, muscle_states, anomaly_detected → mae_che
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -17,10 +18,8 @@ from musculoskeletal_ae.learning.collector import Collector
 from musculoskeletal_ae.learning.pairing import Pairing
 from musculoskeletal_ae.learning.session import Session
 from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
-from musculoskeletal_ae.nodes.learner_settings import declare_settings
-from musculoskeletal_ae.nodes.parameters import text
+from musculoskeletal_ae.nodes.learner_settings import read_settings
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
-from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
 
 POLL = 0.05  # [s] between looks at the training process
@@ -29,10 +28,10 @@ POLL = 0.05  # [s] between looks at the training process
 class Learner(Shell):
     """Node shell of online learning."""
 
-    def __init__(self) -> None:
-        """Declare parameters and topics, and start the training process."""
-        super().__init__('learner')
-        settings = declare_settings(self)
+    def __init__(self, **options: Any) -> None:
+        """Declare topics and start the training process; options are those of Node."""
+        super().__init__('learner', **options)
+        settings = read_settings(self)
         self.collector = Collector(self.robot, settings.rest, settings.novelty, settings.seed)
         self.pairing = Pairing(1.0 / self.rate)
         self.enabled, self.anomaly, self.running = True, False, False
@@ -46,21 +45,9 @@ class Learner(Shell):
             settings.directory,
             lambda data: self.publisher.publish(bytes_message(data)),
         )
-        self.settable(
-            'fresh', False, text('true: drop the saved state for `checkpoint`'), self._start_fresh
-        )
-        self.settable(
-            'checkpoint',
-            '',
-            text('MAE checkpoint to start from where no state is saved; set later: replaces it'),
-            self._take_checkpoint,
-        )
-        self.settable(
-            'relearn_muscles',
-            [''],
-            text('names of replaced or re-wired muscles, learned anew from now on'),
-            self._relearn,
-        )
+        self.follow_parameter('fresh', self._start_fresh)
+        self.follow_parameter('checkpoint', self._take_checkpoint)
+        self.follow_parameter('relearn_muscles', self._relearn)
         self.running = True
         self.listen(JointState, settings.joint_topic, self._joints, SENSOR)
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
@@ -77,7 +64,7 @@ class Learner(Shell):
         if not self.running:
             self.session.set_aside()
             return
-        path = self.get_parameter('checkpoint').value
+        path = self.parameter('checkpoint')
         if not path:
             raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
         self._take_checkpoint(path)
@@ -89,7 +76,7 @@ class Learner(Shell):
             self.session.begin(path)
 
     def _relearn(self, names: Sequence[str]) -> None:
-        for muscle in self.robot.muscle_indices(name for name in names if name):
+        for muscle in self.robot.muscle_indices(names):
             self.session.relearn(muscle)
 
     # -- messages -------------------------------------------------------------------------------
@@ -163,8 +150,3 @@ class Learner(Shell):
         if hasattr(self, 'session'):
             self.session.close()
         super().destroy_node()
-
-
-def main() -> None:
-    """Run the node."""
-    run(Learner)

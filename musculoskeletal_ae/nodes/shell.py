@@ -9,20 +9,26 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as SetParameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
 
 from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.nodes.reception import Reception
+from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.robot.robot import Robot
 
 #: for ages and watchdogs; never stands still, whatever /clock does
@@ -39,18 +45,17 @@ class Shell(Node):
         rejected: How many messages were rejected, by topic and reason.
     """
 
-    def __init__(self, name: str) -> None:
-        """Start the node and load its robot."""
-        super().__init__(name)
-        self.declare_parameter('robot', 'musashi_left_arm', text('shipped name or directory', True))
-        self.declare_parameter(
-            'rate', 100.0, number('rate of the muscle modules [Hz]', 1.0, 1000.0, True)
-        )
-        self.robot = Robot.load(self.get_parameter('robot').value)
-        self.rate = float(self.get_parameter('rate').value)
+    def __init__(self, name: str, **options: Any) -> None:
+        """Start the node, declare its parameters and load its robot; options are those of Node."""
+        super().__init__(name, **options)
+        self._parameters_of_node = PARAMETERS[name]
+        for key, parameter in PARAMETERS[name].items():
+            self.declare_parameter(key, _ros_value(parameter), _descriptor(parameter))
+        self.robot = Robot.load(self.parameter('robot'))
+        self.rate: float = self.parameter('rate')
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected
-        self._setters: dict[str, Callable[[Any], None]] = {}
+        self._setters: dict[str, Callable[[Any], object]] = {}
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._report_timer = self.create_timer(1.0, self._report, clock=STEADY)
@@ -73,37 +78,38 @@ class Shell(Node):
 
     # -- parameters -----------------------------------------------------------------------------
 
-    def settable(
-        self,
-        name: str,
-        default: Any,
-        descriptor: ParameterDescriptor,
-        setter: Callable[[Any], None],
-    ) -> None:
-        """Declare a parameter that may be set at run time.
+    def parameter(self, name: str) -> Any:
+        """Return a parameter's value; lists as tuples, without empty names.
 
-        Args:
-            name: Its name.
-            default: Its default.
-            descriptor: What it means, unit and range.
-            setter: Takes a new value and uses it, or raises a `MusculoskeletalError` or `OSError`.
+        Raises:
+            MusculoskeletalError: If the value is not legal.
         """
-        self.declare_parameter(name, default, descriptor)
+        return self._apply(name, self.get_parameter(name).value, lambda value: value)
+
+    def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
+        """Call `setter` with a parameter's value, now and whenever it is set.
+
+        The setter raises a `MusculoskeletalError` or `OSError` to refuse a value.
+        """
+        self._apply(name, self.get_parameter(name).value, setter)
         self._setters[name] = setter
+
+    def _apply(self, name: str, value: Any, setter: Callable[[Any], Any]) -> Any:
         try:
-            setter(self.get_parameter(name).value)
+            return setter(self._parameters_of_node[name].checked(value))
         except (MusculoskeletalError, OSError) as error:
             raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
-    def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _set_parameters(self, parameters: list[SetParameter]) -> SetParametersResult:
         taken: list[str] = []
         for parameter in parameters:
             if parameter.name in self._setters:
+                setter = self._setters[parameter.name]
                 try:
-                    self._setters[parameter.name](parameter.value)
-                except (MusculoskeletalError, OSError) as error:
+                    self._apply(parameter.name, parameter.value, setter)
+                except MusculoskeletalError as error:
                     for name in reversed(taken):  # all or nothing
-                        self._setters[name](self.get_parameter(name).value)
+                        self._apply(name, self.get_parameter(name).value, self._setters[name])
                     return SetParametersResult(successful=False, reason=str(error))
                 taken.append(parameter.name)
         return SetParametersResult(successful=True)
@@ -139,7 +145,7 @@ class Shell(Node):
                 unfit(str(error))
                 raise
 
-        self.settable('checkpoint', '', text('MAE checkpoint file; empty: wait for one'), from_file)
+        self.follow_parameter('checkpoint', from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 
     # -- messages -------------------------------------------------------------------------------
@@ -178,3 +184,23 @@ class Shell(Node):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _ros_value(parameter: Parameter) -> Any:
+    default = parameter.default
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=parameter.description,
+        read_only=not parameter.settable,
+        dynamic_typing=parameter.is_number_list,  # `[]` is an array of bytes to rclpy
+    )
+    if parameter.within is not None:
+        low, high = parameter.within
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    return descriptor

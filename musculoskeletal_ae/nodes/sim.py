@@ -9,6 +9,8 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
@@ -18,9 +20,7 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages import array_message, read_array, read_joints, read_wrench
 from musculoskeletal_ae.nodes.markers import arm_markers
-from musculoskeletal_ae.nodes.parameters import declare_preset, text
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
-from musculoskeletal_ae.nodes.running import run
 from musculoskeletal_ae.nodes.shell import OK, WARN, Shell
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -34,14 +34,11 @@ LONGEST_STEP = 0.1  # [s]
 class Sim(Shell):
     """Node shell of the simulation."""
 
-    def __init__(self) -> None:
-        """Declare parameters and topics."""
-        super().__init__('sim')
-        self.preset = declare_preset(self, 'descent and weights')
-        self.declare_parameter(
-            'as_robot', False, text('take the place of the robot on its topics', read_only=True)
-        )
-        as_robot = self.get_parameter('as_robot').value
+    def __init__(self, **options: Any) -> None:
+        """Declare topics; options are those of Node."""
+        super().__init__('sim', **options)
+        self.preset: str = self.parameter('preset')
+        as_robot = self.parameter('as_robot')
         prefix = '' if as_robot else 'sim/'
         self.arm: Simulation | None = None
         self.command: np.ndarray | None = None
@@ -131,8 +128,3 @@ class Sim(Shell):
         if limits:
             return WARN, f'at the limit: {", ".join(limits)}', values
         return OK, 'resting at T_bias' if self.command is None else 'following commands', values
-
-
-def main() -> None:
-    """Run the node."""
-    run(Sim)

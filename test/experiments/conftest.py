@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph per test, and one quickly trained network for all of them."""
+"""A graph per test."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ import os
 import pytest
 from graph import Graph
 
-from musculoskeletal_ae.mae import checkpoint, evaluation
-from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import initial_training
 from musculoskeletal_ae.robot.robot import Robot
 
 _counter = itertools.count(1)
@@ -23,16 +20,8 @@ def arm26() -> Robot:
 
 
 @pytest.fixture(scope='session')
-def trained(arm26, tmp_path_factory) -> str:
-    """Return a checkpoint file of arm26, trained for a few seconds."""
-    from dataclasses import replace
-
-    network, _ = initial_training(arm26, 'default', steps=600)
-    mae = to_mae(network, arm26.joints, arm26.muscles, 'default', 'briefly, for a test')
-    mae = replace(mae, anomaly=evaluation.geometric_anomaly(mae, arm26, seed=0))
-    path = tmp_path_factory.mktemp('checkpoint') / 'arm26.safetensors'
-    checkpoint.save(mae, path)
-    return str(path)
+def trained(trained_file) -> str:
+    return trained_file
 
 
 @pytest.fixture

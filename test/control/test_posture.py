@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The ramp to a goal; goals themselves are tested with the controller."""
+
 from __future__ import annotations
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.ramp import Ramp
+from musculoskeletal_ae.control.posture import Ramp
 
 values = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
 

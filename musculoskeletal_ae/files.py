@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading files that a user names, whatever they turn out to be.
+
+Only regular files are opened (a FIFO would block, a device may never end), no more than a limit is
+read, and what a few bytes of YAML can ask for is bounded before anything is built from it. All
+functions take `refuse`, which makes the caller's error of a file and what is wrong with it.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import stat
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import yaml
+
+Refuse = Callable[[Path, str], Exception]
+
+LARGEST = 5_000_000  # [bytes] of a text
+LARGEST_YAML = 1 << 20  # [bytes]; it is slow to read
+MOST_ENTRIES = 100_000  # in a YAML file, what aliases stand for included
+DEEPEST = 50  # levels of a YAML file
+LONGEST = 1000  # characters of a number in YAML: those to base 60 take the square of it
+
+_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_TAGS = (None, '!', 'tag:yaml.org,2002:str')
+_NUMERIC = tuple('+-.0123456789')
+
+
+def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
+    """Open a regular file for reading.
+
+    Raises:
+        Exception: What `refuse` makes, if there is none or it cannot be opened.
+    """
+    try:
+        # Not blocking, because opening a FIFO waits for its writer.
+        descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:  # a ValueError is a NUL in the path
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise refuse(file, f'cannot be read: {reason}') from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise refuse(file, 'cannot be read: it is no regular file')
+    return os.fdopen(descriptor, 'rb')
+
+
+def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
+    """Return the content of a regular file of at most `largest` bytes.
+
+    Raises:
+        Exception: What `refuse` makes, if it cannot be read or is larger.
+    """
+    with open_regular(file, refuse) as stream:
+        try:
+            if os.fstat(stream.fileno()).st_size <= largest:
+                data = stream.read(largest + 1)  # it may grow meanwhile
+                if len(data) <= largest:
+                    return data
+        except OSError as error:
+            raise refuse(file, f'cannot be read: {error.strerror}') from error
+    raise refuse(file, f'is larger than {largest} bytes')
+
+
+def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
+    """Return the text of a UTF-8 file.
+
+    Raises:
+        Exception: What `refuse` makes, if it cannot be read, is larger or is no such text.
+    """
+    try:
+        return read_bytes(file, refuse, largest).decode('utf-8')
+    except UnicodeDecodeError as error:
+        raise refuse(file, f'is not text in UTF-8 (byte {error.start})') from error
+
+
+def read_yaml(file: Path, refuse: Refuse) -> Any:
+    """Return what a YAML file holds.
+
+    Raises:
+        Exception: What `refuse` makes, if it cannot be read or `parse_yaml` refuses it.
+    """
+    text = read_text(file, refuse, LARGEST_YAML)
+    try:
+        return parse_yaml(text)
+    except ValueError as error:
+        raise refuse(file, f'not valid YAML: {error}') from error
+
+
+def read_csv(
+    file: Path, columns: Sequence[str], refuse: Refuse
+) -> list[tuple[int, str, list[str]]]:
+    """Return (line number, line, cells) below the head of a table; # begins a comment line.
+
+    Args:
+        file: The table.
+        columns: What its head must say.
+        refuse: Makes the error.
+
+    Raises:
+        Exception: What `refuse` makes, if it cannot be read or has another head.
+    """
+    rows = []
+    for number, line in enumerate(read_text(file, refuse).splitlines(), 1):
+        if line.strip() and not line.startswith('#'):
+            try:
+                cells = next(csv.reader([line]))
+            except csv.Error as error:
+                raise refuse(file, f'line {number}: no line of a table: {error}') from error
+            rows.append((number, line, [cell.strip() for cell in cells]))
+    if not rows or rows[0][2] != list(columns):
+        head = repr(rows[0][1][:80]) if rows else 'nothing'
+        raise refuse(file, f'expected the columns {",".join(columns)}, got {head}')
+    return rows[1:]
+
+
+def parse_yaml(text: str) -> Any:
+    """Return what one YAML document holds: strings, numbers, lists, mappings, dates.
+
+    Raises:
+        ValueError: If it is not YAML, writes a key twice, has explicit types, or is larger or
+            deeper than the limits above once its aliases are replaced by what they stand for.
+    """
+    try:
+        _check(text)
+        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
+    # PyYAML lets TypeError, OverflowError and others out of dates and numbers that are none.
+    except Exception as error:
+        raise ValueError(' '.join(str(error).split())[:300] or type(error).__name__) from error
+
+
+@dataclass
+class _Collection:
+    """A list or mapping that is being read: its keys, and whether one comes next."""
+
+    anchor: str
+    before: int  # entries of the text before it
+    mapping: bool
+    keys: set[str] = field(default_factory=set)
+    at_key: bool = True
+
+
+def _check(text: str) -> None:
+    """Read the events of a YAML text, which builds nothing."""
+    count = 0
+    sizes: dict[str, int] = {}  # entries that an alias stands for
+    within: list[_Collection] = []
+    for event in yaml.parse(text, Loader=_Loader):
+        where = f'line {event.start_mark.line + 1 if event.start_mark else 0}'
+        if isinstance(event, yaml.CollectionEndEvent):
+            done = within.pop()
+            sizes[done.anchor] = count - done.before
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        anchor = event.anchor or ''
+        if within and within[-1].mapping:
+            mapping = within[-1]
+            if mapping.at_key and isinstance(event, yaml.ScalarEvent):
+                if event.value in mapping.keys:
+                    raise ValueError(f'{where}: key {event.value[:60]!r} is written twice')
+                mapping.keys.add(event.value)
+            mapping.at_key = not mapping.at_key
+        if isinstance(event, yaml.AliasEvent):
+            if anchor not in sizes:
+                raise ValueError(f'{where}: *{anchor[:60]} stands for nothing before it')
+            count += sizes[anchor]
+        else:
+            count += 1
+            sizes[anchor] = 1
+        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
+            if event.tag not in _TAGS:
+                raise ValueError(f'{where}: explicit type {str(event.tag)[:60]}')
+            if isinstance(event, yaml.CollectionStartEvent):
+                del sizes[anchor]  # it cannot stand for itself
+                kind = isinstance(event, yaml.MappingStartEvent)
+                within.append(_Collection(anchor, count - 1, kind))
+            elif not event.style and event.value[:1] in _NUMERIC and len(event.value) > LONGEST:
+                raise ValueError(f'{where}: an unquoted number of over {LONGEST} characters')
+        if count > MOST_ENTRIES:
+            raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases included')
+        if len(within) > DEEPEST:
+            raise ValueError(f'{where}: more than {DEEPEST} levels')
