@@ -50,9 +50,9 @@ def random_commands(robot: Robot, count: int, seed: int) -> Array:
         theta = robot.random_postures(1, rng)[0]
         jacobian = robot.routes.muscle_jacobian(theta)
         torque = robot.kinematics.holding_torque(theta)
-        wish = rng.uniform(low, 0.6 * high)
+        desired = rng.uniform(low, 0.6 * high)
         try:
-            tension = holding_tension(jacobian, torque, low, high, wish)
+            tension = holding_tension(jacobian, torque, low, high, desired)
         except InfeasibleError:
             continue
         commands.append(robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension))

@@ -69,9 +69,9 @@ def _explored(seen: Array, robot: Robot, tension: Array) -> Bools:
     return explored
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw l over the shoulder's angle and over tension, one panel for each muscle."""
-    (seed, first), robot = found.first, found.robot
+    (seed, first), robot = individuals.first, individuals.robot
     trace, joint = first.traces, first.numbers['joint']
     degrees, label = np.degrees(trace['angle']), f'θ of {joint} [deg]'
     angle = _grid(robot, degrees, trace['by_angle'], trace['angle_trained'], label)

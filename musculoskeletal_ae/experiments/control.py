@@ -218,10 +218,10 @@ def _causes(robot: Robot, mae: Mae, seed: int, ended: Approaches) -> dict[str, f
     }
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw the bars of the first individual, and those of all together."""
-    seed, first = found.first
-    traces = [row.traces for row in found.rows.values()]
+    seed, first = individuals.first
+    traces = [row.traces for row in individuals.rows.values()]
     targets = [f'θ_eval {p + 1}' for p in range(len(first.traces['bound']))]
     one = _bars(first.traces, targets, f'individual {seed}')
     # Each individual has its own θ_eval: in the second plot a group of bars is an individual.
@@ -230,7 +230,7 @@ def plot(found: Individuals) -> list[plots.Plot]:
         for key in ('errors', 'tensions')
     }
     together['bound'] = np.array([trace['bound'].mean() for trace in traces])
-    every = _bars(together, [f'individual {seed}' for seed in found.rows], 'all individuals')
+    every = _bars(together, [f'individual {seed}' for seed in individuals.rows], 'all individuals')
     caption = (
         'Distance from the target and muscle tension at rest for {}; whiskers: standard deviation '
         'over {}. Dashed: the least ‖T‖ with which the true body can hold the target. `first` and '

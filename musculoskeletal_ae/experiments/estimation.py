@@ -97,9 +97,9 @@ def _errors(when: str, plan: GraspAndCut, taken: Recording, seen: Watched) -> di
     }
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw estimate and anomaly through grasp and cut, every muscle's cut, older estimators."""
-    return [_course(found), _tracking(found), _cuts(found), _baselines(found)]
+    return [draw(individuals) for draw in (_course, _tracking, _cuts, _baselines)]
 
 
 def _span(trace: Mapping[str, Any]) -> tuple[slice, Any]:
@@ -113,8 +113,8 @@ def _events(axes: Any, trace: Mapping[str, Any]) -> None:
     axes.axvspan(trace['cut'], trace['cut'] + CUT_TIME, color='#F0E442', alpha=0.5, lw=0)
 
 
-def _course(found: Individuals) -> plots.Plot:
-    (seed, row), robot = found.first, found.robot
+def _course(individuals: Individuals) -> plots.Plot:
+    (seed, row), robot = individuals.first, individuals.robot
     trace = row.traces
     rows, time = _span(trace)
     figure, axes = plots.new_figure(12.0, 8.0, 3, 1, sharex=True)
@@ -150,8 +150,8 @@ def _course(found: Individuals) -> plots.Plot:
     return plots.Plot('grasp_and_cut', figure, caption)
 
 
-def _tracking(found: Individuals) -> plots.Plot:
-    (seed, row), robot = found.first, found.robot
+def _tracking(individuals: Individuals) -> plots.Plot:
+    (seed, row), robot = individuals.first, individuals.robot
     trace = row.traces
     rows, time = _span(trace)
     count = robot.joint_count
@@ -177,8 +177,8 @@ def _tracking(found: Individuals) -> plots.Plot:
     return plots.Plot('tracking', figure, caption)
 
 
-def _cuts(found: Individuals) -> plots.Plot:
-    robot, numbers = found.robot, found.numbers
+def _cuts(individuals: Individuals) -> plots.Plot:
+    robot, numbers = individuals.robot, individuals.numbers
     figure, axes = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
     place = np.arange(robot.muscle_count)
     for letter, panel, label in (
@@ -229,9 +229,9 @@ def _cuts(found: Individuals) -> plots.Plot:
     return plots.Plot('cuts', figure, caption)
 
 
-def _baselines(found: Individuals) -> plots.Plot:
-    numbers = found.numbers
-    names = [f'autoencoder, preset {found.study.preset}', *numbers[0]['baselines']]
+def _baselines(individuals: Individuals) -> plots.Plot:
+    numbers = individuals.numbers
+    names = [f'autoencoder, preset {individuals.study.preset}', *numbers[0]['baselines']]
     figure, axes = plots.new_figure(9.0, 0.62 * len(names) + 1.3)
     panel = axes[0, 0]
     place = np.arange(len(names))

@@ -131,18 +131,18 @@ def _stacked(rows: list[tuple[Array, Array]]) -> dict[str, Array]:
     return {'theta': theta, 'tension': tension}
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw angles and tensions over time, and pictures at the end of each phase."""
-    _, first = found.first
+    _, first = individuals.first
     numbers = first.numbers
     names = [phase.name for phase in PHASES]
     names[0] = f'{numbers["flexed_joint"]}\n{np.degrees(numbers["flexed_rad"]):.0f}°'
     names[3] = f'{numbers["forced_joint"]}\nforced to {np.degrees(numbers["forced_rad"]):.0f}°'
-    return [_traces(found, names), _pictures(found, names)]
+    return [_traces(individuals, names), _pictures(individuals, names)]
 
 
-def _traces(found: Individuals, names: list[str]) -> plots.Plot:
-    (seed, row), robot = found.first, found.robot
+def _traces(individuals: Individuals, names: list[str]) -> plots.Plot:
+    (seed, row), robot = individuals.first, individuals.robot
     figure, axes = plots.new_figure(12.0, 7.4, 2, 1, sharex=True)
     time = STEP * np.arange(len(row.traces['after']['theta']))
     edges = np.cumsum([0.0, *(phase.duration for phase in PHASES)])
@@ -178,8 +178,8 @@ def _traces(found: Individuals, names: list[str]) -> plots.Plot:
     return plots.Plot('loss_change', figure, caption)
 
 
-def _pictures(found: Individuals, names: list[str]) -> plots.Plot:
-    seed, row = found.first
+def _pictures(individuals: Individuals, names: list[str]) -> plots.Plot:
+    seed, row = individuals.first
     moments = ENDS[:4]
     rows = [
         (f'{when} learning', trace['theta'][moments], trace['tension'][moments])
@@ -187,7 +187,7 @@ def _pictures(found: Individuals, names: list[str]) -> plots.Plot:
         if when != 'arm'
     ]
     columns = [name.replace('\n', ' ') for name in names[: len(moments)]]
-    figure = plots.picture_rows(found.robot, rows, columns, f'simulator of individual {seed}')
+    figure = plots.picture_rows(individuals.robot, rows, columns, f'simulator of individual {seed}')
     caption = 'The simulator at the end of each phase, before and after learning.'
     return plots.Plot('loss_change_pictures', figure, caption)
 

@@ -123,16 +123,16 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
             study.keep_rests(seed, _rests(learner))
             body = learned(robot, learner.updater.body)
             limits = {'body_rad': body.error(held_out), **limits}
-        found = _numbers(curve, learner, initial[preset], held_out)
+        values = _numbers(curve, learner, initial[preset], held_out)
         for prefix, named in (('', study.preset), ('paper_', 'paper')):
             if preset == named:
-                numbers.update({prefix + key: value for key, value in found.items()})
+                numbers.update({prefix + key: value for key, value in values.items()})
         traces[preset] = {
             'running': _by_second(curve.running),
             'curve_samples': np.array(curve.samples),
             'curve_errors': np.array(curve.errors),
-            'fit_start_rad': found['fit_start_rad'],
-            'fit_end_rad': found['fit_end_rad'],
+            'fit_start_rad': values['fit_start_rad'],
+            'fit_end_rad': values['fit_end_rad'],
         }
         progress(share)
     return Measured({**limits, **numbers}, traces)
@@ -191,9 +191,9 @@ def _by_second(values: Array) -> Array:
     return means
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw the running error with its exponential fit, and the held-out error over samples."""
-    rows = list(found.rows.values())
+    rows = list(individuals.rows.values())
     figure, axes = plots.new_figure(12.0, 4.6, 1, 2, width_ratios=(3, 2))
     left, right = axes[0]
     for preset, colour in COLOURS.items():
@@ -214,20 +214,21 @@ def plot(found: Individuals) -> list[plots.Plot]:
             right.plot(*points, color=colour, lw=1.2, alpha=0.7, label=label)
             label = ''
     ends = f'paper, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
-    long_enough = found.study.minutes >= PRINTED_MINUTES
+    long_enough = individuals.study.minutes >= PRINTED_MINUTES
     at = [0.0, PRINTED_MINUTES] if long_enough else [np.nan, np.nan]
     left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=ends)
-    oracle = float(np.mean([numbers['oracle_rad'] for numbers in found.numbers]))
+    oracle = float(np.mean([numbers['oracle_rad'] for numbers in individuals.numbers]))
     right.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
     plots.tidy(left, 'time of exploration [min]', '‖θ_est − θ_sensor‖ [rad]', 'while exploring')
     plots.tidy(right, 'samples at rest', 'mean error [rad]', 'held-out motion, each individual')
     for panel in (left, right):
         panel.set_ylim(bottom=0.0)
         panel.legend(fontsize=9)
+    seeds = ', '.join(map(str, individuals.rows))
     caption = (
         'Left: error of the estimate during online learning (10 s running means; bold: mean over '
-        f'individuals {", ".join(map(str, found.rows))}, pale: each), with the exponential fit of '
-        'the paper. Right: error on the motion never used for learning, after every update.'
+        f'individuals {seeds}, pale: each), with the exponential fit of the paper. Right: error on '
+        'the motion never used for learning, after every update.'
     )
     return [plots.Plot('online_learning', figure, caption)]
 

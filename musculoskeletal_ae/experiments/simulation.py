@@ -90,13 +90,13 @@ def _beside(arm: Recording, theta: Array, tension: Array) -> dict[str, Array]:
     }
 
 
-def plot(found: Individuals) -> list[plots.Plot]:
+def plot(individuals: Individuals) -> list[plots.Plot]:
     """Draw pictures of arm and simulator, and the errors over time."""
-    return [_pictures(found), _errors(found)]
+    return [_pictures(individuals), _errors(individuals)]
 
 
-def _pictures(found: Individuals) -> plots.Plot:
-    seed, row = found.first
+def _pictures(individuals: Individuals) -> plots.Plot:
+    seed, row = individuals.first
     count = len(row.traces['arm']['theta'])
     # The ends of as many cycles: at rest, with the random tensions of the third step.
     ends = (np.arange(count * SAMPLE_TIME // CYCLE) * CYCLE + 9.9) / SAMPLE_TIME
@@ -117,12 +117,12 @@ def _pictures(found: Individuals) -> plots.Plot:
     )
     title = f'individual {seed}, the same commands'
     return plots.Plot(
-        'simulation_pictures', plots.picture_rows(found.robot, rows, columns, title), caption
+        'simulation_pictures', plots.picture_rows(individuals.robot, rows, columns, title), caption
     )
 
 
-def _errors(found: Individuals) -> plots.Plot:
-    seed, row = found.first
+def _errors(individuals: Individuals) -> plots.Plot:
+    seed, row = individuals.first
     figure, axes = plots.new_figure(12.0, 5.6, 2, 1, sharex=True)
     for panel, key, unit in ((axes[0, 0], 'rad', 'rad'), (axes[1, 0], 'n', 'N')):
         for when, colour in plots.WHEN.items():

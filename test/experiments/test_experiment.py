@@ -44,12 +44,12 @@ def numbers(value):
 class Links(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.found = []
+        self.targets = []
         self.open = []
 
     def handle_starttag(self, tag, attrs):
         assert tag not in ('script', 'iframe', 'object')
-        self.found += [value for key, value in attrs if key in ('src', 'href', 'srcset')]
+        self.targets += [value for key, value in attrs if key in ('src', 'href', 'srcset')]
         if tag not in ('meta', 'link', 'img', 'br'):
             self.open.append(tag)
 
@@ -59,16 +59,16 @@ class Links(HTMLParser):
 
 @pytest.mark.parametrize('name', EXPERIMENTS)
 def test_every_experiment_writes_its_keys_with_finite_numbers(quick, name):
-    found = result(quick, name)
-    assert set(KEYS[name].split()) <= set(found)
-    assert set(KEYS[name].split()) <= set(found['seeds']['0'])
-    assert all(math.isfinite(number) for number in numbers(found))
+    content = result(quick, name)
+    assert set(KEYS[name].split()) <= set(content)
+    assert set(KEYS[name].split()) <= set(content['seeds']['0'])
+    assert all(math.isfinite(number) for number in numbers(content))
 
 
 def test_control_has_every_method_of_the_paper(quick):
-    found = result(quick, 'control')
+    content = result(quick, 'control')
     for method in METHODS:
-        assert {'error_rad', 'error_var', 'tension_n'} <= set(found[method])
+        assert {'error_rad', 'error_var', 'tension_n'} <= set(content[method])
 
 
 @pytest.mark.parametrize('name', EXPERIMENTS)
@@ -86,8 +86,8 @@ def test_the_report_is_one_well_formed_page_that_needs_nothing_else(quick):
     links.feed(page)
     assert not links.open
     plots = sum(len(result(quick, name)['plots']) for name in EXPERIMENTS)
-    assert sum(link.startswith('data:image/png;base64,') for link in links.found) == plots
-    assert all(link.startswith(('data:', '#')) for link in links.found)
+    assert sum(link.startswith('data:image/png;base64,') for link in links.targets) == plots
+    assert all(link.startswith(('data:', '#')) for link in links.targets)
     assert 'url(' not in page
 
 
@@ -108,9 +108,9 @@ def test_the_report_explains_every_experiment(quick, name):
 def test_the_report_says_by_how_much_an_aim_is_missed(quick, tmp_path):
     folder = tmp_path / 'bad'
     shutil.copytree(quick, folder)
-    found = result(folder, 'control')
-    found['proposed']['error_rad'] = 0.5
-    (folder / 'control' / 'result.json').write_text(json.dumps(found), encoding='utf-8')
+    content = result(folder, 'control')
+    content['proposed']['error_rad'] = 0.5
+    (folder / 'control' / 'result.json').write_text(json.dumps(content), encoding='utf-8')
     page = write_report(folder).read_text(encoding='utf-8')
     assert '<span class="missed">missed by 0.440</span>' in page
     assert 'proposed, distance from θ_eval [rad]' in page.split('Aims missed:')[1].split('</p>')[0]

@@ -16,12 +16,12 @@ def test_result_json_has_means_over_seeds_but_counts_alarms_in_all(tmp_path):
         0: {'after_rad': 0.1, 'false_alarms': 1, 'first': {'error_rad': 0.2}, 'joint': 'elbow'},
         1: {'after_rad': 0.3, 'false_alarms': 2, 'first': {'error_rad': 0.4}, 'joint': 'elbow'},
     }
-    found = combined(study, rows)
-    assert found['after_rad'] == 0.2
-    assert found['false_alarms'] == 3
-    assert found['first']['error_rad'] == pytest.approx(0.3)
-    assert found['joint'] == 'elbow'
-    assert found['seeds']['1']['after_rad'] == 0.3
+    content = combined(study, rows)
+    assert content['after_rad'] == 0.2
+    assert content['false_alarms'] == 3
+    assert content['first']['error_rad'] == pytest.approx(0.3)
+    assert content['joint'] == 'elbow'
+    assert content['seeds']['1']['after_rad'] == 0.3
 
 
 def test_a_number_that_json_cannot_say_is_refused(tmp_path):
