@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,11 @@ def test_every_bench_is_listed_with_what_it_measures(capsys):
     assert set(benches()) >= NAMED
     for name, text in benches().items():
         assert any(line.startswith(name) and line.endswith(text) for line in lines) and text
+
+
+def test_every_bench_is_explained():
+    text = (Path(__file__).parents[1] / 'bench' / 'README.md').read_text(encoding='utf-8')
+    assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
 
 
 @pytest.mark.parametrize('name', benches())
