@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import pkgutil
 import shutil
 from html.parser import HTMLParser
 
 import pytest
 
+from musculoskeletal_ae import experiments
 from musculoskeletal_ae.experiments.report import write_report
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.tools import experiment
@@ -55,6 +58,14 @@ class Links(HTMLParser):
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
+
+
+def test_every_module_that_is_an_experiment_can_be_named():
+    modules = pkgutil.iter_modules(experiments.__path__, f'{experiments.__name__}.')
+    loaded = [importlib.import_module(module.name) for module in modules]
+    defined = [module.EXPERIMENT for module in loaded if hasattr(module, 'EXPERIMENT')]
+    assert len(defined) == len(EXPERIMENTS)
+    assert all(experiment in defined for experiment in EXPERIMENTS.values())
 
 
 @pytest.mark.parametrize('name', EXPERIMENTS)
