@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.messages import read_array
+from musculoskeletal_ae.validity import read_array
 
 RATE_LIMIT = 0.2  # [m/s]
 

@@ -24,6 +24,7 @@ from safetensors.numpy import save as save_tensors
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
+from musculoskeletal_ae.files import read_bytes
 from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.mae.units import UNITS
@@ -329,9 +330,9 @@ def load(path: str | Path, robot: Robot | None = None) -> Mae:
     Raises:
         CheckpointError: If it cannot be read, is damaged or does not fit the robot.
     """
-    try:
-        with Path(path).open('rb') as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f'{path}: cannot be read ({error}); {REMEDY}') from error
+
+    def refuse(file: Path, problem: str) -> CheckpointError:
+        return CheckpointError(f'{file}: {problem}; {REMEDY}')
+
+    data = read_bytes(Path(path), refuse, MAX_BYTES)
     return from_bytes(data, robot, str(path))

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool
 
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.robot.stiffness import push_deflection
 

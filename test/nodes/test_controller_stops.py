@@ -13,7 +13,7 @@ from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.control.controller import LONGEST_STEP
-from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])

@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
-from musculoskeletal_ae.messages import array_message, bytes_message
+from musculoskeletal_ae.nodes.messages import array_message, bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 

@@ -12,8 +12,9 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from musculoskeletal_ae.messages import array_message, read_array
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.validity import read_array
 
 
 @pytest.fixture

@@ -15,9 +15,10 @@ from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import array_message, bytes_message, read_array
+from musculoskeletal_ae.nodes.messages import array_message, bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.validity import read_array
 
 
 @pytest.fixture
