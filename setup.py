@@ -9,17 +9,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
-NODES = [
-    'bringup_status',
-    'controller',
-    'estimator',
-    'hardware_emulator',
-    'learner',
-    'record',
-    'render',
-    'replay',
-    'sim',
-]
+NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
+ROS_TOOLS = ['record', 'render', 'replay']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 
@@ -36,6 +27,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['bench', 'bench.*', 'test', 'test.*']),
+    package_data={f'{NAME}.experiments': ['report.html.jinja']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -54,7 +46,8 @@ setup(
     python_requires='>=3.10',
     entry_points={
         'console_scripts': [
-            *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
+            *(f'{name} = {NAME}.nodes.running:{name}' for name in NODES),
+            *(f'{name} = {NAME}.nodes.{name}:main' for name in ROS_TOOLS),
             *(f'{name} = {NAME}.tools.{name}:main' for name in TOOLS),
         ],
     },

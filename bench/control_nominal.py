@@ -3,31 +3,30 @@
 
 1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
    QP on the true G, lengths by the true body.
-2. stiffness: the deflection of a push at the wished stiffness in the lower and the upper quarter of
-   the reported reachable range, and the ratio of both beside the predicted one.
+2. stiffness: the deflection of a push at a stiffness in the lower and the upper quarter of the
+   reported reachable range, and the ratio of both beside the predicted one.
 3. torque: joint torque that the commanded tensions make, beside the commanded torque.
+
+    python -m bench control_nominal --checkpoint FILE --paper-checkpoint FILE [--robot …] [--quick]
 """
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import proposed as control
-from musculoskeletal_ae.control.length import (
-    first_command,
-    geometric_command,
-    msc_compensation,
-)
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.stiffness import stiffness_command
-from musculoskeletal_ae.control.stiffness_model import push_deflection
-from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.holdable import holdable_postures
+from musculoskeletal_ae.experiments.control import holdable_postures
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
 
 POSTURES, QUICK = 50, 3
 SETTLING, PERIOD = 3.0, 0.02  # [s]
@@ -56,30 +55,43 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
     rng = np.random.default_rng(5)
     for theta, least in holdable_postures(robot, arm.individual, count, rng):
         torque = robot.kinematics.holding_torque(theta)
-        bound = robot.muscle_lengths(theta, least) + msc_compensation(robot, least)
-        commands = {
-            'bound: QP on the true body': bound,
-            'QP on the true G, l from ①': first_command(robot, mae, theta, least),
-            'proposed': control.proposed(robot, mae, theta, torque, bias, limit).length,
-            'proposed, paper': control.proposed_paper(robot, paper, theta, torque, bias).length,
-            'first': first_command(robot, mae, theta, bias),
-            'first, paper': first_command(robot, paper, theta, bias),
-            'geometric': geometric_command(robot, theta),
-        }
-        seconds = {'first': ('second', mae), 'first, paper': ('second, paper', paper)}
-        for name, command in commands.items():
-            arm.reset(theta)
+        bound = robot.muscle_lengths(theta, least) + methods.msc_compensation(robot, least)
+
+        def measure(name: str, command: Array, theta: Array = theta, least: Array = least) -> None:
             settle(arm, command)
-            after = [name]
-            if name in seconds:
-                after.append(seconds[name][0])
-            for which in after:
-                if which != name:
-                    settle(arm, first_command(robot, seconds[name][1], theta, arm.tension))
-                error = float(np.linalg.norm(arm.theta - theta))
-                tension = float(np.linalg.norm(arm.tension))
-                rows.setdefault(which, []).append((error, tension, float(np.linalg.norm(least))))
+            error, tension = np.linalg.norm(arm.theta - theta), np.linalg.norm(arm.tension)
+            row = float(error), float(tension), float(np.linalg.norm(least))
+            rows.setdefault(name, []).append(row)
+
+        for name, command in {
+            'bound: QP on the true body': bound,
+            'QP on the true G, l from ①': methods.first_command(robot, mae, theta, least),
+            'proposed': methods.proposed(robot, mae, theta, torque, bias, limit).length,
+            'proposed, paper': methods.proposed_paper(robot, paper, theta, torque, bias).length,
+            'geometric': methods.geometric_command(robot, theta),
+        }.items():
+            arm.reset(theta)
+            measure(name, command)
+        for network, suffix in ((mae, ''), (paper, ', paper')):
+            arm.reset(theta)
+            measure(f'first{suffix}', methods.first_command(robot, network, theta, bias))
+            current = methods.first_command(robot, network, theta, arm.tension)
+            measure(f'second{suffix}', current)
     return {name: np.array(values) for name, values in rows.items()}
+
+
+def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array) -> Array:
+    """Return by how much a small push turns the joints, (K_θ + ∂g/∂θ)⁻¹ Jᵀ F [rad], shape (D,).
+
+    Args:
+        robot: For its weight and hand.
+        theta: Where it rests [rad], shape (D,).
+        stiffness: K_θ [N·m/rad], shape (D, D).
+        wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
+    """
+    torque = robot.kinematics.end_effector_jacobian(theta).T @ wrench
+    turn: Array = np.linalg.inv(stiffness + robot.kinematics.gravity_gradient(theta)) @ torque
+    return turn
 
 
 def stiffness_ratios(
@@ -87,8 +99,8 @@ def stiffness_ratios(
 ) -> Array:
     """Return (measured, predicted) ratio of deflection, lower over upper quarter, (N, 2).
 
-    Each posture wishes for one joint, in turn; the push is the wrench that comes nearest to a
-    torque [N·m] on that joint alone.
+    Each posture stiffens one joint, in turn; the push is the wrench that comes nearest to a torque
+    [N·m] on that joint alone.
     """
     arm = arm or nominal_arm(robot)
     ratios = []
@@ -97,17 +109,17 @@ def stiffness_ratios(
     for n, (theta, _) in enumerate(postures):
         joint = n % robot.joint_count
         torque = robot.kinematics.holding_torque(theta)
-        wish = np.zeros(robot.joint_count)
-        free = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
+        desired = np.zeros(robot.joint_count)
+        free = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit)
         low, high = free.lowest[joint], free.highest[joint]
         jacobian = robot.kinematics.end_effector_jacobian(theta)
         wrench = np.asarray(push * np.linalg.pinv(jacobian.T)[:, joint], dtype=np.float64)
         deflections = []
         for quarter in QUARTERS:
-            wish[joint] = low + quarter * (high - low)
-            found = stiffness_command(robot, mae, theta, torque, wish, robot.tension.limit)
-            expected = push_deflection(robot, theta, found.stiffness, wrench)[joint]
-            moved = _pushed(arm, theta, found.command.length, wrench)[joint]
+            desired[joint] = low + quarter * (high - low)
+            solution = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit)
+            expected = push_deflection(robot, theta, solution.stiffness, wrench)[joint]
+            moved = _pushed(arm, theta, solution.command.length, wrench)[joint]
             deflections.append((moved, expected))
         (soft, soft_expected), (stiff, stiff_expected) = deflections
         ratios.append((soft / stiff, soft_expected / stiff_expected))
@@ -132,16 +144,14 @@ def torque_errors(robot: Robot, mae: Mae, count: int) -> Array:
     """Return ‖−Gᵀ T − τ‖ / ‖τ‖ with the true G, for random postures and efforts, (N,)."""
     errors = []
     rng = np.random.default_rng(9)
-    torque_control = TorqueControl(robot, Settings())
-    individual = Individual(robot, 0, NOMINAL)
-    limit = np.full(robot.muscle_count, robot.tension.limit)
+    individual, limits = Individual(robot, 0, NOMINAL), robot.tension
     for theta, least in holdable_postures(robot, individual, count, rng):
         effort = rng.normal(0.0, TORQUE_SPREAD, robot.joint_count)
         torque = robot.kinematics.holding_torque(theta) + effort
-        found = torque_control.exertion(mae, theta, torque, least, limit)
-        # Torque beyond the muscles is reported as missing and not promised.
-        promised = torque - found.missing_torque
-        exerted = -robot.routes.muscle_jacobian(theta).T @ found.tension
+        jacobian = mae.muscle_jacobian(theta, least)
+        tension, missing = least_tension(jacobian, torque, limits.bias, limits.limit)
+        promised = torque - missing  # torque beyond the muscles is reported and not promised
+        exerted = -robot.routes.muscle_jacobian(theta).T @ tension
         errors.append(np.linalg.norm(exerted - promised) / np.linalg.norm(promised))
     return np.array(errors)
 
@@ -168,3 +178,24 @@ def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> s
         f'within 10 %: {100.0 * (errors < 0.1).mean():.0f} %'
     )
     return '\n'.join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the tables."""
+    parser = Parser('control_nominal', 'What control does on the nominal body.')
+    parser.add_robot()
+    parser.add_checkpoint('network of preset default', required=True)
+    parser.add_checkpoint('network of preset paper', '--paper-checkpoint', required=True)
+    parser.add_quick('few postures')
+    args = parser.parse_args(argv)
+
+    def tables() -> None:
+        robot = Robot.load(args.robot)
+        mae, paper = (checkpoint.load(f, robot) for f in (args.checkpoint, args.paper_checkpoint))
+        print(nominal_tables(robot, mae, paper, args.quick))
+
+    return exit_status(tables)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

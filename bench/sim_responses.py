@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.nominal_rest import nominal_rest
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import msc_compensation
+from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension

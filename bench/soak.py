@@ -25,13 +25,17 @@ import torch
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.experiments.online_learning import HELD_OUT_STREAM, held_out_error
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
+from musculoskeletal_ae.experiments.recording import (
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    estimation_error,
+    record,
+)
 from musculoskeletal_ae.learning.learner import STEPS, Learner
 from musculoskeletal_ae.learning.training import Job, Training
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PART = 300.0  # [s] of robot time that is recorded and learned at once
@@ -49,6 +53,7 @@ class RareTraining(Training):
 
     Attributes:
         every: So many.
+        samples: That have come since the last job.
         seconds: CPU time of every update [s].
     """
 
@@ -113,26 +118,26 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
     mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
-    held_out = record(EmulatedArm(robot, args.seed), motion(robot, mae, HELD_OUT_STREAM, PART))
+    held_out = record(EmulatedArm(robot, args.seed), mae, HELD_OUT_STREAM, PART)
     learner = Learner(robot, mae, seed=args.seed, steps=args.steps, training=RareTraining)
     training = learner.training
     assert isinstance(training, RareTraining)
     training.every = args.every
     arm = EmulatedArm(robot, args.seed)
     least, worst, reopened = np.inf, 0.0, 0
-    reported = 0
+    messages = reported = 0
     filled = most = 0.0
-    tick = 0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        stream = record(arm, motion(robot, mae, part, PART))
+        stream = record(arm, mae, part, PART)
         for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
-            before = learner.samples.accepted, learner.update
-            tick += 1
-            learner.step(tick * SAMPLE_TIME, theta, tension, length)
-            training.samples += learner.samples.accepted - before[0]
-            reopened += learner.update is not before[1] and bool(learner.update.changed)
+            accepted, update = learner.samples.accepted, learner.update
+            messages += 1
+            learner.step(messages * SAMPLE_TIME, theta, tension, length)
+            training.samples += learner.samples.accepted - accepted
+            if learner.update is not None and learner.update is not update:
+                reopened += bool(learner.update.changed)
         now = PART * (part + 1)
-        error = held_out_error(learner.mae, held_out, 10)
+        error = estimation_error(learner.mae, held_out, 10)
         if now >= SETTLED:
             least, worst = min(least, error), max(worst, error / least)
         if now == FILLED:

@@ -21,15 +21,14 @@ import torch
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.experiments.online_learning import EXPLORATION_STREAM
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
-from musculoskeletal_ae.experiments.suite.limits import LearntLeastSquares
+from musculoskeletal_ae.experiments.least_squares import learned
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import Prior, fit_body
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 FITS = 3  # each goes on fitting from where the last one ended
@@ -42,9 +41,7 @@ def rms(values: Array) -> float:
 
 def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
     """Return the lines of one individual."""
-    stream = record(
-        EmulatedArm(robot, seed), motion(robot, mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
-    )
+    stream = record(EmulatedArm(robot, seed), mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
     learner = Learner(robot, seed=seed)
     for n, values in enumerate(zip(stream.theta_sensor, stream.tension, stream.length)):
         learner.step(n * SAMPLE_TIME, *values)
@@ -53,10 +50,10 @@ def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
         fit_body(body, seen, Prior())
     holding = np.array([robot.kinematics.holding_torque(theta) for theta in seen.theta])
     true = Individual(robot, seed).muscle_jacobian(seen.theta)
-    learned = LearntLeastSquares(robot, body).muscle_jacobian(seen.theta)
+    fitted = learned(robot, body).muscle_jacobian(seen.theta)
     nominal = np.array([robot.routes.muscle_jacobian(theta) for theta in seen.theta])
     lines = [f'individual {seed}, {len(seen)} samples, holding torque {rms(holding):.2f} N·m']
-    for name, jacobian in (('true', true), ('learned', learned), ('geometric', nominal)):
+    for name, jacobian in (('true', true), ('learned', fitted), ('geometric', nominal)):
         residual = holding + np.einsum('nmd,nm->nd', jacobian, seen.tension)
         lines.append(
             f'  {name:10s} residual {rms(residual):.3f} N·m, '

@@ -126,8 +126,7 @@ class Parser(argparse.ArgumentParser):
             flag: Name of the argument.
             default: None: it must be given.
         """
-        # Pinocchio, which loads behind this, takes a second that tools without a robot save.
-        from musculoskeletal_ae.robot.description import shipped_robots
+        from musculoskeletal_ae.robot.directories import shipped_robots
 
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
         if flag.startswith('-'):

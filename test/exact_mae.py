@@ -27,6 +27,6 @@ class ExactMae:
 
 
 def rest_readings(robot, theta, tension=None):
-    """Return noiseless (l, T, temperature) of the geometric model at rest."""
+    """Return noiseless (l, T) of the geometric model at rest."""
     tension = np.full(robot.muscle_count, robot.tension.bias) if tension is None else tension
-    return robot.muscle_lengths(theta, tension), tension, np.full(robot.muscle_count, 30.0)
+    return robot.muscle_lengths(theta, tension), tension

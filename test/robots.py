@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from musculoskeletal_ae.robot.description import find_robot
+from musculoskeletal_ae.robot.directories import find_robot
 
 # Written from the hand inwards, and with a fixed link and a turned frame on the way, so that
 # nothing works by the accident of order or of identity rotations.

@@ -46,13 +46,17 @@ def test_the_rule_would_see_an_import(tmp_path: Path) -> None:
 def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
         if file.parent.name not in ('nodes', 'tools'):
-            upward = [n for n in imported(file) if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)]
+            upward = [
+                n for n in imported(file) if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
+            ]
             assert not upward, file
 
 
 def test_every_source_file_names_its_licence() -> None:
     for file in sources(PACKAGE, ROOT / 'test', ROOT / 'bench', ROOT / 'bags'):
-        assert '# SPDX-License-Identifier: Apache-2.0' in file.read_text(encoding='utf-8')[:120], file
+        assert '# SPDX-License-Identifier: Apache-2.0' in file.read_text(encoding='utf-8')[:120], (
+            file
+        )
 
 
 def test_every_document_that_code_cites_is_in_the_repository() -> None:
@@ -91,7 +95,10 @@ def test_ament_copyright() -> None:
     # It knows long headers only; ours are the SPDX lines above. What it can judge is the licence
     # and the terms of contributions.
     parser = pytest.importorskip('ament_copyright.parser', reason='only a sourced Jazzy has it')
-    for kind, name in (('LicenseDescriptor', 'LICENSE'), ('ContributingDescriptor', 'CONTRIBUTING.md')):
+    for kind, name in (
+        ('LicenseDescriptor', 'LICENSE'),
+        ('ContributingDescriptor', 'CONTRIBUTING.md'),
+    ):
         file = getattr(parser, kind)(str(ROOT / name))
         file.parse()
         assert file.license_identifier == 'apache2', name

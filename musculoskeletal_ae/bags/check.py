@@ -15,7 +15,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.robot.description import shipped_robots
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
 # Another muscle must explain a column this much better before its place is doubted: bodies differ

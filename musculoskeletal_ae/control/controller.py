@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control as a whole: targets in, safe commands out, and why the arm must not move.
 
-    target ─→ posture_control (lengths) or torque_control (tensions) ─→ safety ─→ command
+    target ─→ posture (lengths) or torque (tensions) ─→ safety ─→ command
 
 A stop latches on missing or old sensor data, an anomaly, an unfit checkpoint, a fault of control's
-own, or on request (INTERFACE, Stop and resume). `reset` clears it once no cause is left; then the
-last target is resumed by a ramp from where the arm is. Exploration is not resumed.
+own, or on request (doc/interface.md, stop and resume). `reset` clears it once no cause is left;
+then the last target is resumed by a ramp from where the arm is. Exploration is not resumed.
 """
 
 from __future__ import annotations
@@ -49,24 +49,40 @@ class Controller:
         stepped_at: When it was stepped last [s].
     """
 
-    def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
-        """Control `robot`; `seed` is the exploration's."""
-        self._robot, self._seed = robot, seed
-        self.settings = settings
-        self.posture = PostureControl(robot, settings)
-        self.torque = TorqueControl(robot, settings)
-        self.safety = SafetyFilter(robot, settings)
+    def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
+        """Control `robot`; `seed` is the random seed of the exploration."""
+        self._robot, self.settings = robot, settings or Settings()
+        self.posture = PostureControl(robot, self.settings)
+        self.torque = TorqueControl(robot, self.settings)
+        self.safety = SafetyFilter(robot, self.settings)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
         self.clamped: tuple[str, ...] = ()
         self._mae: Mae | None = None
-        self._exploration: Exploration | None = None
+        # One stream for the life of the controller: after a pause it brings new postures.
+        self._exploration = Exploration(robot, seed)
         self._muscles: Muscles | None = None
         self._estimate: Array | None = None
         self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
         self._anomaly = False
-        self._method = ''
+        # Whether the next command starts a method anew, from how the muscles pull then.
+        self._starts = True
 
     # -- what comes in --------------------------------------------------------------------------
+
+    def configure(self, settings: Settings) -> None:
+        """Take new settings; another method starts from how the muscles pull at that moment.
+
+        Raises:
+            MusculoskeletalError: If the joint stiffness does not fit the robot.
+        """
+        before, joints = self.settings, self._robot.joint_count
+        stiffness = settings.desired_stiffness(joints)
+        self.settings = settings
+        self.posture.settings = self.torque.settings = self.safety.settings = settings
+        if settings.method != before.method and not self.posture.exploring:
+            self._starts = True
+        elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
+            self.posture.start()
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
@@ -76,6 +92,7 @@ class Controller:
     def muscles(self, muscles: Muscles, now: float) -> None:
         """Take muscle_states."""
         self._muscles, self._muscles_at = muscles, now
+        self.safety.muscles(muscles)
         highest = self.settings.temperature_limit
         self.limit = thermal_limit(self._robot, muscles.temperature, highest)
 
@@ -89,7 +106,7 @@ class Controller:
         if detected:
             self.stop('anomaly_detected')
 
-    def target(self, found: Mapping[str, tuple[float, float]]) -> None:
+    def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs.
 
         Raises:
@@ -97,15 +114,16 @@ class Controller:
         """
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
-        if kept is None and len(found) < robot.joint_count:
+        if kept is None and len(joints) < robot.joint_count:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
         theta = np.zeros(robot.joint_count) if kept is None else kept.copy()
         effort = self.posture.effort.copy()
         for i, name in enumerate(robot.joints):
-            if name in found:
-                theta[i], effort[i] = found[name]
+            if name in joints:
+                theta[i], effort[i] = joints[name]
         inside = np.clip(theta, robot.lower, robot.upper)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
+        self._starts |= self.posture.exploring
         self.posture.set_target(inside, effort)
 
     # -- what is asked --------------------------------------------------------------------------
@@ -114,12 +132,11 @@ class Controller:
         """Explore, or end it and hold; return why not, or ''."""
         if wanted and self.safety.cause:
             return f'stopped: {self.safety.cause}'
-        # One stream for the life of the controller: after a pause it brings new postures.
-        self._exploration = self._exploration or Exploration(self._robot, self._seed)
         if wanted != self.posture.exploring:
             self._exploration.begin_cycle()
             self.posture.explore(self._exploration if wanted else None)
             self.posture.theta = None
+            self._starts = True
         return ''
 
     def stop(self, cause: str) -> None:
@@ -132,7 +149,7 @@ class Controller:
         cause = self.present_cause(now)
         if not cause and self.safety.cause:
             self.safety.reset()
-            self._method = ''
+            self._starts = True
         return cause
 
     def present_cause(self, now: float) -> str:
@@ -156,41 +173,40 @@ class Controller:
         since = now - self.stepped_at if self.stepped_at > -math.inf else 0.0
         dt = min(max(since, 0.0), LONGEST_STEP)
         self.stepped_at = now
-        muscles, cause = self._muscles, self.present_cause(now)
-        if muscles is None:
-            return None
+        cause = self.present_cause(now)
         # Before the first command there is nothing to stop.
         if cause and self.safety.command is not None:
             self.stop(cause)
-        wished = None
+        desired = None
         if not cause and not self.safety.cause:
             try:
-                wished = self._wish(muscles, dt)
+                desired = self._command(dt)
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         fresh = now - self._muscles_at <= self.settings.max_age
-        return self.safety.step(wished, muscles, self.limit, dt, fresh)
+        return self.safety.step(desired, self.limit, dt, fresh)
 
-    def _wish(self, muscles: Muscles, dt: float) -> Command | None:
-        assert self._mae is not None and self._estimate is not None  # no present cause
-        posture, method = self.posture, self.settings.method
-        method = 'exploration' if posture.exploring else method
-        if method != self._method:
-            self._start(method, muscles)
+    def _command(self, dt: float) -> Command | None:
+        mae, muscles, estimate = self._mae, self._muscles, self._estimate
+        # No present cause: all are there.
+        assert mae is not None and muscles is not None and estimate is not None
+        posture = self.posture
+        in_tension = self.settings.method == 'tension' and not posture.exploring
+        if self._starts:
+            self._starts = False
+            self._start(TENSION if in_tension else LENGTH, muscles)
         planned = np.minimum(self.limit, self._robot.tension.limit)
-        if method != 'tension':
-            length = posture.step(muscles.tension, self._estimate, planned, dt)
+        if not in_tension:
+            length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
         if posture.theta is None:
             return None
         target, effort = posture.theta, posture.effort
-        tension = self.torque.step(self._mae, self._estimate, target, effort, planned, dt)
+        tension = self.torque.step(mae, estimate, target, effort, planned, dt)
         return Command(TENSION, tension)
 
-    def _start(self, method: str, muscles: Muscles) -> None:
-        """Go over to a method from how the muscles pull at this moment."""
-        self._method = method
-        kind = TENSION if method == 'tension' else LENGTH
+    def _start(self, kind: str, muscles: Muscles) -> None:
+        """Go on from the last command, or from how the muscles pull at this moment."""
         command = self.safety.command
         if command is None or command.kind != kind:
             command = unchanging(self._robot, kind, muscles)

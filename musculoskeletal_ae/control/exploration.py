@@ -6,7 +6,7 @@
 3. 3 s: `first` again with a random T_const in [T_bias, T_limit]
 
 (paper, section "Online Learning of Musculoskeletal AutoEncoder"). Each step ramps the command and
-then rests, since the body is learnt at rest. Targets are drawn among the postures that the arm can
+then rests, since the body is learned at rest. Targets are drawn among the postures that the arm can
 hold with tensions in [T_bias, T_limit].
 """
 
@@ -64,33 +64,28 @@ class Exploration:
         return self._pending.pop(0)
 
     def _cycle(self) -> list[Step]:
-        tension = self._robot.tension
+        robot, tension = self._robot, self._robot.tension
         theta, holding = self._holdable_posture()
-        bias = np.full(self._robot.muscle_count, tension.bias)
-        wished = self._rng.uniform(tension.bias, tension.limit, self._robot.muscle_count)
+        bias = np.full(robot.muscle_count, tension.bias)
+        constant = self._rng.uniform(tension.bias, tension.limit, robot.muscle_count)
         return [
             Step('first', theta, bias, DURATIONS[0]),
             Step('second', theta, holding, DURATIONS[1]),
-            Step('first', theta, wished, DURATIONS[2]),
+            Step('first', theta, constant, DURATIONS[2]),
         ]
 
     def _holdable_posture(self) -> tuple[Array, Array]:
         """Return a random posture and the least tension that holds it."""
-        robot = self._robot
+        robot, tension = self._robot, self._robot.tension
         for _ in range(TRIES):
             theta = robot.random_postures(1, self._rng)[0]
+            jacobian = robot.routes.muscle_jacobian(theta)
+            torque = robot.kinematics.holding_torque(theta)
             try:
-                holding = holding_tension(
-                    robot.routes.muscle_jacobian(theta),
-                    robot.kinematics.holding_torque(theta),
-                    robot.tension.bias,
-                    robot.tension.limit,
-                    wish=0.0,
-                )
+                return theta, holding_tension(jacobian, torque, tension.bias, tension.limit, 0.0)
             except InfeasibleError:
                 continue
-            return theta, holding
         raise RobotDescriptionError(
             f'{robot.description.directory}: none of {TRIES} random postures can be held with '
-            f'tensions in [{robot.tension.bias:g}, {robot.tension.limit:g}] N; run check_robot'
+            f'tensions in [{tension.bias:g}, {tension.limit:g}] N; run check_robot'
         )

@@ -3,11 +3,13 @@
 
 A target becomes one or two goals (`second` runs `first` before it, as in the paper); a goal is
 ramped to and then held. A new target, method or network starts a new ramp from the command of the
-moment, so that nothing jumps. T_current is read once, when a method starts: read again and again,
-`second` would raise the tension without end.
+moment, so that nothing jumps:
 
-While the arm rests under `proposed`, `feedback` corrects what friction leaves, and sheds tension
-that is not needed.
+    c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
+
+starts and ends at rest, and all muscles arrive together. T_current is read once, when a method
+starts: read again and again, `second` would raise the tension without end. While the arm rests
+under `proposed`, `feedback` corrects what friction leaves, and sheds tension that is not needed.
 """
 
 from __future__ import annotations
@@ -17,19 +19,52 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import proposed as control
+from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
 from musculoskeletal_ae.control.feedback import RestFeedback
-from musculoskeletal_ae.control.length import first_command, geometric_command
-from musculoskeletal_ae.control.proposed import Solution
-from musculoskeletal_ae.control.ramp import Ramp
+from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stiffness import StiffnessSolution, stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
+PEAK = 1.5  # fastest over mean speed of a ramp
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
+
+
+class Ramp:
+    """A smooth way from one command to another.
+
+    Attributes:
+        duration: Time it takes [s].
+        done: Whether it has ended.
+    """
+
+    def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
+        """Plan the way.
+
+        Args:
+            start: Command of the moment, shape (M,).
+            goal: Command to reach, shape (M,).
+            duration: Time it should take [s]; stretched until no entry is faster than the limit.
+            rate_limit: Fastest change of an entry [1/s].
+        """
+        self._start, self._goal = start.copy(), goal
+        farthest = float(np.abs(goal - start).max())
+        self.duration = max(duration, PEAK * farthest / rate_limit)
+        self._elapsed = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether the goal is reached."""
+        return self._elapsed >= self.duration
+
+    def step(self, dt: float) -> Array:
+        """Return the command dt seconds on."""
+        self._elapsed += dt
+        u = 1.0 if self.done else self._elapsed / self.duration
+        command: Array = self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
+        return command
 
 
 class Goal(NamedTuple):
@@ -44,22 +79,23 @@ class PostureControl:
     """Commands muscle lengths towards target postures.
 
     Attributes:
+        settings: What the user chose; used from the next goal on.
         theta: θ_target [rad], shape (D,), or None before the first target.
         effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
-        missing_torque: What the last goal cannot deliver [N·m], shape (D,).
-        solution: Lengths and tensions of the last goal of `proposed` or `stiffness`, or None.
+        solution: Command of the last goal and what it is expected to bring, or None.
         stiffness: What the last goal of `stiffness` expects, or None.
         feedback: Corrections at rest.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Control `robot`; the owner may change `settings` at any time."""
-        self._robot, self._settings = robot, settings
+        """Control `robot`."""
+        self._robot, self.settings = robot, settings
         self._mae: Mae | None = None
         self.theta: Array | None = None
         self.effort: Array = np.zeros(robot.joint_count)
-        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self.solution: Solution | None = None
         self.stiffness: StiffnessSolution | None = None
+        self.feedback = RestFeedback(robot)
         self._exploration: Exploration | None = None
         self._goals: list[Goal] = []
         self._method = ''
@@ -69,8 +105,6 @@ class PostureControl:
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
-        self.solution: Solution | None = None
-        self.feedback = RestFeedback(robot)
         self._jacobian: Array | None = None
 
     @property
@@ -96,10 +130,9 @@ class PostureControl:
 
     def start(self) -> None:
         """Go to the target by the method that is set now, from the command of the moment."""
-        if self.theta is None or self._exploration is not None:
+        if self.theta is None or self.exploring:
             return
-        chosen = self._settings
-        tension = self._robot.tension
+        chosen, tension = self.settings, self._robot.tension
         constant = np.clip(chosen.constant_tension, tension.bias, tension.limit)
         self._constant = np.full(self._robot.muscle_count, constant)
         self._remaining = 0.0
@@ -135,13 +168,18 @@ class PostureControl:
             return None
         if not self._ramp.done:
             self._command = self._ramp.step(dt)
-        else:
+        elif self._corrects:
             self._correct(tension, theta, dt)
         return self._command.copy()
 
+    @property
+    def _corrects(self) -> bool:
+        # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
+        return self._method == 'proposed' and self.settings.by_balance
+
     def _solve_again(self) -> None:
-        if self._ramp is not None and not self._goals and self._exploration is None:
-            self._goals = [Goal(self._method, self._settings.second_duration, reads=False)]
+        if self._ramp is not None and not self._goals and not self.exploring:
+            self._goals = [Goal(self._method, self.settings.second_duration, reads=False)]
             if self._ramp.done:
                 self._remaining = 0.0
 
@@ -156,47 +194,41 @@ class PostureControl:
         if reads:
             self._current = tension
         self._limit = limit
-        goal = self._solve(self._mae, self.theta, self._current, limit)
-        if self.solution is not None:
+        self.solution = self._solve(self._mae, self.theta, limit)
+        goal = self.solution.length
+        if self._corrects:
             goal = goal + self.feedback.shift(self._mae, self.theta, self.solution.tension)
-        self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self._settings.rate_limit)
+        self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self.settings.rate_limit)
         self._remaining = max(duration, self._ramp.duration)
         self.feedback.moving()
 
-    def _solve(self, mae: Mae, theta: Array, current: Array, limit: Array) -> Array:
-        robot, method = self._robot, self._method
-        self.missing_torque = np.zeros(robot.joint_count)
+    def _solve(self, mae: Mae, theta: Array, limit: Array) -> Solution:
+        robot, current = self._robot, self._current
         self.solution = self.stiffness = self._jacobian = None
-        if method == 'geometric':
-            return geometric_command(robot, theta)
-        if method in ('first', 'second'):
-            return first_command(
-                robot, mae, theta, self._constant if method == 'first' else current
-            )
+        nothing = np.zeros(robot.joint_count)
+        if self._method == 'geometric':
+            bias = np.full(robot.muscle_count, robot.tension.bias)
+            return Solution(methods.geometric_command(robot, theta), bias, nothing)
+        if self._method in ('first', 'second'):
+            tension = self._constant if self._method == 'first' else current
+            length = methods.first_command(robot, mae, theta, tension)
+            return Solution(length, tension, nothing)
         torque = robot.kinematics.holding_torque(theta) + self.effort
-        if method == 'stiffness':
-            wish = np.zeros(robot.joint_count)
-            wish[: len(self._settings.joint_stiffness)] = self._settings.joint_stiffness
-            self.stiffness = stiffness_command(robot, mae, theta, torque, wish, limit)
-            self.solution = self.stiffness.command
-        elif PRESETS[self._settings.preset].equilibrium:
-            self.solution = control.proposed(robot, mae, theta, torque, current, limit)
-        else:
-            self.solution = control.proposed_paper(robot, mae, theta, torque, current)
-        self.missing_torque = self.solution.missing_torque
-        return self.solution.length
+        if self._method == 'stiffness':
+            desired = np.array(self.settings.desired_stiffness(robot.joint_count))
+            self.stiffness = stiffness_command(robot, mae, theta, torque, desired, limit)
+            return self.stiffness.command
+        if self.settings.by_balance:
+            return methods.proposed(robot, mae, theta, torque, current, limit)
+        return methods.proposed_paper(robot, mae, theta, torque, current)
 
     def _correct(self, tension: Array, theta: Array, dt: float) -> None:
         """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""
-        chosen, solution = self._settings, self.solution
-        # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
-        by_balance = self._method == 'proposed' and PRESETS[chosen.preset].equilibrium
-        if not by_balance or solution is None:
-            return
-        assert self._mae is not None and self.theta is not None  # they gave the solution
+        mae, target, solution = self._mae, self.theta, self.solution
+        # They gave the goal that is held.
+        assert mae is not None and target is not None and solution is not None
         if self._jacobian is None:
-            self._jacobian = self._mae.muscle_jacobian(self.theta, solution.tension)
-        error, gain = self.theta - theta, chosen.feedback_gain
+            self._jacobian = mae.muscle_jacobian(target, solution.tension)
+        error, gain = target - theta, self.settings.feedback_gain
         if self.feedback.step(error, self._jacobian, tension, self._limit, gain, dt):
-            shift = self.feedback.shift(self._mae, self.theta, solution.tension)
-            self._command = solution.length + shift
+            self._command = solution.length + self.feedback.shift(mae, target, solution.tension)

@@ -3,24 +3,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stiffness import StiffnessSolution
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 NOTABLE = 0.05  # [N·m] of missing torque
-
-
-class Report(NamedTuple):
-    """Level ('ok', 'warn' or 'error'), one line, and named values."""
-
-    level: str
-    message: str
-    values: dict[str, str]
 
 
 def control_report(robot: Robot, control: Controller, now: float) -> Report:
@@ -31,24 +21,18 @@ def control_report(robot: Robot, control: Controller, now: float) -> Report:
     if control.clamped:
         values['target clamped at'] = ', '.join(control.clamped)
         warnings.append('target clamped to the joint limits')
-    if posture.stiffness is not None:
-        values |= stiffness_values(robot, chosen, posture.stiffness)
+    values |= _stiffness_values(robot, control)
     if posture.effort.any() and chosen.method in ('geometric', 'first', 'second'):
         warnings.append(f'method {chosen.method} exerts no effort')
-    in_tension = chosen.method == 'tension' and not posture.exploring
-    missing = control.torque.missing_torque if in_tension else posture.missing_torque
-    if np.abs(missing).max() > NOTABLE:
+    missing = _missing_torque(control)
+    if np.abs(missing).max(initial=0.0) > NOTABLE:
         values['missing torque'] = ', '.join(
             f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing)
         )
         warnings.append('the target needs more torque than the muscles have')
-    hot = [n for n, limit in zip(robot.muscles, control.limit) if limit < robot.tension.max]
+    hot = {n: t for n, t in zip(robot.muscles, control.limit) if t < robot.tension.max}
     if hot:
-        values['tension limited by heat'] = ', '.join(
-            f'{name} {limit:.0f} N'
-            for name, limit in zip(robot.muscles, control.limit)
-            if name in hot
-        )
+        values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
         warnings.append(f'hot: {", ".join(hot)}')
     if control.safety.cause:
         return Report('error', f'stopped: {control.safety.cause}', values)
@@ -57,26 +41,37 @@ def control_report(robot: Robot, control: Controller, now: float) -> Report:
         return Report('warn', f'waiting: {waiting}', values)
     if posture.exploring:
         doing = 'exploring'
-    elif posture.theta is not None:
-        doing = 'holding'
     else:
-        doing = 'no target'
+        doing = 'no target' if posture.theta is None else 'holding'
     if warnings:
         values['doing'] = doing
         return Report('warn', '; '.join(warnings), values)
     return Report('ok', doing, values)
 
 
-def stiffness_values(robot: Robot, chosen: Settings, found: StiffnessSolution) -> dict[str, str]:
-    """Return, for each joint, expected and reachable stiffness, and whether a wish was clamped."""
+def _missing_torque(control: Controller) -> Array:
+    posture = control.posture
+    if control.settings.method == 'tension' and not posture.exploring:
+        return control.torque.missing_torque
+    return np.zeros(0) if posture.solution is None else posture.solution.missing_torque
+
+
+def _stiffness_values(robot: Robot, control: Controller) -> dict[str, str]:
+    """Return each joint's expected and reachable stiffness, and whether the desired one is not."""
+    solution = control.posture.stiffness
+    if solution is None:
+        return {}
     values = {}
-    wishes = (*chosen.joint_stiffness, *[0.0] * robot.joint_count)
-    expected = found.stiffness.diagonal()
-    for name, wish, got, low, high in zip(
-        robot.joints, wishes, expected, found.lowest, found.highest
-    ):
-        said = f'{got:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'
-        if wish > 0.0 and not low <= wish <= high:
-            said += f', wish {wish:.2f} clamped'
-        values[f'joint stiffness {name}'] = said
+    rows = zip(
+        robot.joints,
+        control.settings.desired_stiffness(robot.joint_count),
+        solution.stiffness.diagonal(),
+        solution.lowest,
+        solution.highest,
+    )
+    for name, desired, expected, low, high in rows:
+        text = f'{expected:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'
+        if desired > 0.0 and not low <= desired <= high:
+            text += f', desired {desired:.2f} clamped'
+        values[f'joint stiffness {name}'] = text
     return values

@@ -71,20 +71,27 @@ class SafetyFilter:
     """Latched stop and limits of the commands.
 
     Attributes:
+        settings: What the user chose.
         cause: Why the arm was stopped, or ''.
         command: Last command that left, or None.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Guard `robot`; the owner may change `settings` at any time."""
-        self._robot, self._settings = robot, settings
+        """Guard `robot`."""
+        self._robot, self.settings = robot, settings
         self.cause = ''
         self.command: Command | None = None
         self._held = 0.0
-        self._readings: deque[Array] = deque(maxlen=3)
+        self._muscles: Muscles | None = None
+        self._lengths: deque[Array] = deque(maxlen=3)
         postures = robot.random_postures(200, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)
         self._longest: Array = longest + LENGTH_MARGIN
+
+    def muscles(self, muscles: Muscles) -> None:
+        """Take new muscle_states."""
+        self._muscles = muscles
+        self._lengths.append(muscles.length)
 
     def stop(self, cause: str) -> None:
         """Latch a stop; the first cause is kept."""
@@ -96,24 +103,21 @@ class SafetyFilter:
         self.cause = ''
 
     def step(
-        self, wished: Command | None, muscles: Muscles, limit: Array, dt: float, fresh: bool = True
+        self, desired: Command | None, limit: Array, dt: float, fresh: bool = True
     ) -> Command | None:
         """Return the command that may leave, or None if nothing was ever commanded.
 
         Args:
-            wished: What control wants; None to keep the last command.
-            muscles: The last muscle_states that came.
+            desired: What control wants; None to keep the last command.
             limit: Tension limit of each muscle [N], shape (M,).
             dt: Time since the step before [s].
-            fresh: Whether `muscles` still says where the muscles are.
+            fresh: Whether the last muscle_states still say where the muscles are.
         """
-        if not self._readings or muscles.length is not self._readings[-1]:
-            self._readings.append(muscles.length)
+        muscles, desired = self._muscles, desired or self.command
+        if muscles is None or desired is None:
+            return None
         if not self.cause:
-            wished = wished or self.command
-            if wished is None:
-                return None
-            limited = self._limited(wished, muscles, limit, dt)
+            limited = self._limited(desired, muscles, limit, dt)
             if np.isfinite(limited.value).all():
                 self.command = limited
                 return limited
@@ -123,27 +127,27 @@ class SafetyFilter:
         return self.command
 
     def _rate(self, kind: str) -> float:
-        rate = self._settings.rate_limit
+        rate = self.settings.rate_limit
         return rate if kind == LENGTH else rate * self._robot.stiffness
 
-    def _limited(self, wished: Command, muscles: Muscles, limit: Array, dt: float) -> Command:
-        kind, robot = wished.kind, self._robot
+    def _limited(self, desired: Command, muscles: Muscles, limit: Array, dt: float) -> Command:
+        kind, robot = desired.kind, self._robot
         before = self.command
         if before is None or before.kind != kind:
             before = unchanging(robot, kind, muscles)
             if kind == LENGTH:
                 before = Command(kind, np.minimum(before.value, self._longest))
         change = self._rate(kind) * dt
-        value = before.value + np.clip(wished.value - before.value, -change, change)
+        value = before.value + np.clip(desired.value - before.value, -change, change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
-        length = np.minimum(np.median(self._readings, axis=0), self._longest)
+        length = np.minimum(np.median(self._lengths, axis=0), self._longest)
         shortest = length - (limit - robot.tension.bias) / robot.stiffness
         return Command(kind, np.maximum(value, shortest))
 
     def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
         self._held += dt
-        if self._held <= self._settings.hold_time:
+        if self._held <= self.settings.hold_time:
             return command
         kind, value = command
         change = self._rate(kind) * dt

@@ -1,89 +1,80 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may choose about control: every setting with its meaning, unit and range.
-
-One table for the core and the node, which declares a parameter for each field here.
-"""
+"""What a user may choose about control: one table for the core and the node's parameters."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.parameters import PRESET, Parameter
 from musculoskeletal_ae.presets import PRESETS
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 
 
-def choice(default: str, legal: tuple[str, ...], meaning: str) -> Any:
-    """Return the field of a setting that is one of a few words."""
-    return field(default=default, metadata={'meaning': meaning, 'legal': legal})
+def _number(default: float, meaning: str, unit: str, low: float, high: float) -> Any:
+    return Parameter(default, meaning, unit, (low, high), settable=True).field()
 
 
-def quantity(default: float, low: float, high: float, meaning: str) -> Any:
-    """Return the field of a setting that is a number within [low, high]."""
-    return field(default=default, metadata={'meaning': meaning, 'range': (low, high)})
-
-
-@dataclass
+@dataclass(frozen=True)
 class Settings:
-    """Settings of control; the owner may change them at any time.
+    """Settings of control; `Controller.configure` takes changed ones."""
 
-    Attributes are described by their own `meaning`, except for
-    joint_stiffness: wished diagonal entries of the joint stiffness [N·m/rad], one for each joint,
-        0 as it comes; empty for all as they come.
-    """
+    method: str = Parameter(
+        'proposed', 'how a target posture becomes a command', legal=METHODS, settable=True
+    ).field()
+    preset: str = replace(PRESET, settable=True).field()
+    joint_stiffness: tuple[float, ...] = Parameter(
+        (0.0,),
+        'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
+        'N·m/rad',
+        settable=True,
+    ).field()
+    first_duration: float = _number(5.0, 'movement duration', 's', 0.1, 60.0)
+    second_duration: float = _number(
+        2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
+    )
+    constant_tension: float = _number(
+        0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
+    )
+    rate_limit: float = _number(
+        0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
+    )
+    position_gain: float = _number(
+        10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
+    )
+    velocity_gain: float = _number(
+        0.5, 'damping torque, method `tension` (0: none)', 'N·m·s/rad', 0.0, 20.0
+    )
+    feedback_gain: float = _number(
+        0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
+    )
+    max_age: float = _number(
+        0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
+    )
+    hold_time: float = _number(0.5, 'how long a stop holds the last command', 's', 0.0, 60.0)
+    temperature_limit: float = _number(
+        85.0, 'a module this hot pulls with T_bias only', '°C', 40.0, 200.0
+    )
 
-    method: str = choice('proposed', METHODS, 'how a target posture becomes a command')
-    preset: str = choice('default', tuple(PRESETS), 'of the method proposed')
-    first_duration: float = quantity(5.0, 0.1, 60.0, 'of a movement [s]')
-    second_duration: float = quantity(
-        2.0, 0.1, 60.0, 'of the second movement of second, and after a new checkpoint [s]'
-    )
-    constant_tension: float = quantity(
-        0.0, 0.0, 1000.0, 'T_const of first [N], within [T_bias, T_limit]'
-    )
-    rate_limit: float = quantity(
-        0.1, 0.001, 1.0, 'fastest change of a commanded length [m/s]; of a tension K_stiff times it'
-    )
-    position_gain: float = quantity(
-        10.0, 0.0, 200.0, 'method tension: torque towards the target [N·m/rad]; 0: torque only'
-    )
-    velocity_gain: float = quantity(
-        0.5, 0.0, 20.0, 'method tension: damping torque [N·m·s/rad]; 0: torque only'
-    )
-    feedback_gain: float = quantity(
-        0.5,
-        0.0,
-        2.0,
-        'proposed, default: correction of error and needless tension at rest [1/s]; 0: none',
-    )
-    max_age: float = quantity(
-        0.2, 0.01, 10.0, 'older muscle_states or estimated_joint_states stop the arm [s]'
-    )
-    hold_time: float = quantity(0.5, 0.0, 60.0, 'a stop holds the last command so long [s]')
-    temperature_limit: float = quantity(
-        85.0, 40.0, 200.0, 'a module this hot pulls with T_bias only [°C]'
-    )
-    joint_stiffness: tuple[float, ...] = ()
+    @property
+    def by_balance(self) -> bool:
+        """Whether `proposed` solves the balance of torques, instead of the printed descent."""
+        return PRESETS[self.preset].equilibrium
 
+    def desired_stiffness(self, joints: int) -> tuple[float, ...]:
+        """Return `joint_stiffness` for so many joints; nothing, or a single 0, is all as they come.
 
-def read_stiffness(wished: Iterable[Any], joints: int) -> tuple[float, ...]:
-    """Return the wish as `Settings` keeps it; nothing, or a single 0, is all as they come.
-
-    Raises:
-        MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
-    """
-    try:
-        values = tuple(float(value) for value in wished)
-    except (TypeError, ValueError):
-        values = (math.nan,)
-    if values == (0.0,):
-        return ()
-    if len(values) not in (0, joints) or not all(0.0 <= value < math.inf for value in values):
-        raise MusculoskeletalError(
-            f'joint stiffness {wished!r}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
-        )
-    return values
+        Raises:
+            MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
+        """
+        values = self.joint_stiffness
+        if values in ((), (0.0,)):
+            return (0.0,) * joints
+        if len(values) != joints or not all(0.0 <= value < math.inf for value in values):
+            raise MusculoskeletalError(
+                f'{list(values)}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
+            )
+        return values

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A posture with a chosen joint stiffness: the method `stiffness`.
 
-    min Σ_j (K_jj(T) − wish_j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
+    min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-Tensions in the null space of Gᵀ leave the posture as it is and stiffen the elastic units
-(`stiffness_model`). T_low lies above T_bias, because a muscle that MSC holds at T_bias is stiff in
-one direction only. K is nearly linear in T, so that a few quadratic programmes around the last
-solution find the optimum.
+with K_θ of `robot/stiffness.py`, whose G, ∂²l/∂θ² and L_e(T), which is −l(θ, T) up to a constant,
+are read by entering the MAE with ① (paper, section "Control", third: variable stiffness). Tensions
+in the null space of Gᵀ leave the posture as it is and stiffen the elastic units. T_low lies above
+T_bias, because a muscle that MSC holds at T_bias is stiff in one direction only. K is nearly linear
+in T, so that a few quadratic programmes around the last solution reach the optimum.
 """
 
 from __future__ import annotations
@@ -14,24 +15,25 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import quadprog
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import first_command
-from musculoskeletal_ae.control.proposed import SOLVES, Solution
-from musculoskeletal_ae.control.stiffness_model import StiffnessModel, stiffness_model
+from musculoskeletal_ae.control.methods import SOLVES, Solution, first_command
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension, least_tension
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 
 # [N] above T_bias that a push may take from a muscle before it gives way; the widest that is held.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6
-# Of the least tension against the wish; a reachable wish is missed by about this share.
+# Of the least tension against the stiffness; one within reach is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
 SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to a corner; K bends down in every tension
 FAR = 1e5  # [N²] turns a quadratic programme into a linear one: its gradient outweighs distance
+LEVELS = 8  # tensions between T_bias and limit at which the elongation is read
+# [rad] for the slope of G; small against the bends of a route, large against errors of the MAE.
+STEP = 0.05
 
 
 class StiffnessSolution(NamedTuple):
@@ -50,41 +52,71 @@ class StiffnessSolution(NamedTuple):
     highest: Array
 
 
-class _Polytope(NamedTuple):
-    """Tensions that produce the torque within their limits."""
+class StiffnessModel(NamedTuple):
+    """Joint stiffness around one posture, as the MAE sees it.
+
+    Attributes:
+        jacobian: G [m/rad], shape (M, D).
+        hessian: ∂²l/∂θ² [m/rad²], shape (M, D, D).
+        compliance: ∂L_e/∂T [m/N] as polynomials of T, highest power first, shape (3, M).
+        module: K_stiff [N/m].
+    """
 
     jacobian: Array
-    torque: Array
-    low: Array
-    high: Array
+    hessian: Array
+    compliance: Array
+    module: float
 
-    def nearest(self, tension: Array) -> Array:
-        return holding_tension(self.jacobian, self.torque, self.low, self.high, tension)
+    @classmethod
+    def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
+        """Read the model off the MAE at θ (D,) and T (M,)."""
 
-    def minimum(self, quadratic: Array, linear: Array) -> Array:
-        """Return argmin ½ Tᵀ Q T − aᵀ T."""
-        eye = np.eye(len(linear))
-        constraints = np.hstack([-self.jacobian, eye, -eye])
-        bounds = np.concatenate([self.torque, self.low, -self.high])
-        try:
-            solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, len(self.torque))
-        except ValueError as error:
-            raise InfeasibleError('no tension within its limits produces the torque') from error
-        tension: Array = solution[0]
-        return tension
+        def jacobian(postures: Array) -> Array:
+            return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
+
+        levels = np.linspace(robot.tension.bias, robot.tension.limit, LEVELS)
+        tensions = np.tile(levels[:, None], robot.muscle_count)
+        lengths = mae.lengths(np.tile(theta, (LEVELS, 1)), tensions)
+        cubic: Array = np.polyfit(levels, -lengths, 3)  # (4, M)
+        return cls(
+            jacobian=mae.muscle_jacobian(theta, tension),
+            hessian=robot_stiffness.muscle_hessian(jacobian, theta, STEP),
+            compliance=cubic[:3] * np.array([3.0, 2.0, 1.0])[:, None],
+            module=robot.stiffness,
+        )
+
+    def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:
+        """Return k [N/m] and dk/dT [1/m] of every muscle, each of shape (M,)."""
+        square, linear, constant = self.compliance
+        compliance = (square * tension + linear) * tension + constant
+        # A network may err so far that a wire seems to shorten under tension; call it rigid.
+        slope = np.where(compliance > 0.0, 2.0 * square * tension + linear, 0.0)
+        k = robot_stiffness.muscle_stiffness(self.module, np.maximum(compliance, 0.0))
+        return k, -k * k * slope
+
+    def joint_stiffness(self, tension: Array) -> Array:
+        """Return K_θ [N·m/rad] at T (M,), shape (D, D)."""
+        k, _ = self.muscle_stiffness(tension)
+        return robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
+
+    def slope(self, tension: Array) -> Array:
+        """Return ∂K_jj/∂T_i [N·m/rad/N] at T (M,), shape (D, M)."""
+        _, bend = self.muscle_stiffness(tension)
+        slope: Array = (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
+        return slope
 
 
 def stiffness_command(
-    robot: Robot, mae: Mae, theta: Array, torque: Array, wish: Array, limit: Array | float
+    robot: Robot, mae: Mae, theta: Array, torque: Array, desired: Array, limit: Array | float
 ) -> StiffnessSolution:
-    """Return the command whose joint stiffness is as near as possible to the wish.
+    """Return the command whose joint stiffness is as near as possible to the desired one.
 
     Args:
         robot: For limits and K_stiff.
         mae: The network.
         theta: θ_target [rad], shape (D,).
         torque: τ_target = g(θ_target) + effort [N·m], shape (D,).
-        wish: Diagonal entries [N·m/rad], shape (D,); 0 for as it comes. A wish beyond the
+        desired: Diagonal entries [N·m/rad], shape (D,); 0 for as it comes. What lies beyond the
             reachable range of its joint is taken as the end of that range.
         limit: Highest tension planned [N], scalar or shape (M,).
     """
@@ -95,59 +127,55 @@ def stiffness_command(
         tension, missing = least_tension(jacobian, torque, low, high)
         if not missing.any():
             break
-    model = stiffness_model(robot, mae, theta, tension)
+    model = StiffnessModel.read(robot, mae, theta, tension)
     # Where every muscle is needed for the torque nothing is left to choose.
     lowest = highest = np.diag(model.joint_stiffness(tension))
     for _ in range(SOLVES):
-        tensions = _Polytope(model.jacobian, torque, low, high)
+        programme = TensionProgramme(model.jacobian, torque, low, high)
         try:
-            start = tensions.nearest(tension)
+            start = programme.nearest(tension)
         except InfeasibleError:
             break
-        lowest, highest = _reachable(model, tensions, start)
-        wished = np.where(wish > 0.0, np.clip(wish, lowest, highest), 0.0)
-        tension = _approach(model, tensions, start, wished)
-        model = stiffness_model(robot, mae, theta, tension)
+        # Each joint alone.
+        lowest, highest = (
+            np.array([_extreme(model, programme, start, j, sign) for j in range(len(theta))])
+            for sign in (-1.0, 1.0)
+        )
+        within = np.where(desired > 0.0, np.clip(desired, lowest, highest), 0.0)
+        tension = _approach(model, programme, start, within)
+        model = StiffnessModel.read(robot, mae, theta, tension)
         missing = torque + model.jacobian.T @ tension if missing.any() else missing
     command = Solution(first_command(robot, mae, theta, tension), tension, missing)
     return StiffnessSolution(command, model.joint_stiffness(tension), lowest, highest)
 
 
-def _approach(model: StiffnessModel, tensions: _Polytope, start: Array, wish: Array) -> Array:
-    """Gauss–Newton on the wished entries; the others are as they come."""
-    chosen = wish > 0.0
+def _approach(
+    model: StiffnessModel, programme: TensionProgramme, start: Array, desired: Array
+) -> Array:
+    """Gauss–Newton on the desired entries; the others are as they come."""
+    chosen = desired > 0.0
     tension = start
     for _ in range(ITERATIONS if chosen.any() else 0):
         slope = model.slope(tension)[chosen]
-        short = (wish - np.diag(model.joint_stiffness(tension)))[chosen]
+        short = (desired - np.diag(model.joint_stiffness(tension)))[chosen]
         small = LEAST_TENSION_SHARE * np.square(slope).sum(axis=1).mean()
         quadratic = slope.T @ slope + small * np.eye(len(tension))
-        linear = slope.T @ (short + slope @ tension) + small * start
-        tension = tensions.minimum(quadratic, linear)
+        tension = programme.minimum(quadratic, slope.T @ (short + slope @ tension) + small * start)
     return tension
 
 
-def _reachable(model: StiffnessModel, tensions: _Polytope, start: Array) -> tuple[Array, Array]:
-    """Return the least and the greatest diagonal entries, each joint alone."""
-    joints = range(model.jacobian.shape[1])
-    lowest = [_extreme(model, tensions, start, joint, -1.0) for joint in joints]
-    highest = [_extreme(model, tensions, start, joint, 1.0) for joint in joints]
-    return np.array(lowest), np.array(highest)
-
-
 def _extreme(
-    model: StiffnessModel, tensions: _Polytope, start: Array, joint: int, sign: float
+    model: StiffnessModel, programme: TensionProgramme, start: Array, joint: int, sign: float
 ) -> float:
     """Climb to the corner that the slope points to, as far as it improves (Frank and Wolfe)."""
 
     def value(tension: Array) -> float:
         return sign * float(model.joint_stiffness(tension)[joint, joint])
 
-    best, tension, eye = value(start), start, np.eye(len(start))
+    best, tension = value(start), start
     for _ in range(ITERATIONS):
         slope = sign * model.slope(tension)[joint]
-        pull = FAR / max(float(np.abs(slope).max()), 1e-12) * slope
-        corner = tensions.minimum(eye, tension + pull)
+        corner = programme.nearest(tension + FAR / max(float(np.abs(slope).max()), 1e-12) * slope)
         steps = [tension + share * (corner - tension) for share in SHARES]
         values = [value(step) for step in steps]
         k = int(np.argmax(values))

@@ -17,7 +17,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import Exertion, least_tension
+from musculoskeletal_ae.robot.tension import least_tension
 
 SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
@@ -26,12 +26,13 @@ class TorqueControl:
     """Tensions for a torque, moment by moment.
 
     Attributes:
+        settings: What the user chose.
         missing_torque: What the tensions of the last step do not deliver [N·m], shape (D,).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Control `robot`; the owner may change `settings` at any time."""
-        self._robot, self._settings = robot, settings
+        """Control `robot`."""
+        self._robot, self.settings = robot, settings
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self.start_from(np.full(robot.muscle_count, robot.tension.bias))
 
@@ -57,23 +58,17 @@ class TorqueControl:
         smooth = before + dt / (dt + SMOOTHING) * (theta - before)
         self._smooth = smooth
         velocity = (theta - smooth) / SMOOTHING
-        chosen = self._settings
+        chosen = self.settings
         torque = self._robot.kinematics.holding_torque(smooth) + effort
         torque = torque + chosen.position_gain * (target - smooth)
         torque = torque - chosen.velocity_gain * velocity
-        found = self.exertion(mae, smooth, torque, self._command, limit)
-        self.missing_torque = found.missing_torque
+        jacobian = mae.muscle_jacobian(smooth, self._command)
+        bias = self._robot.tension.bias
+        tension, self.missing_torque = least_tension(jacobian, torque, bias, limit)
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
-        change = found.tension - self._command
+        change = tension - self._command
         fastest = self._robot.stiffness * chosen.rate_limit * dt
         self._command = self._command + change * min(
             1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9)
         )
         return self._command.copy()
-
-    def exertion(
-        self, mae: Mae, theta: Array, torque: Array, tension: Array, limit: Array
-    ) -> Exertion:
-        """Return the tensions for a torque τ [N·m] (D,) at (θ, T)."""
-        jacobian = mae.muscle_jacobian(theta, tension)
-        return least_tension(jacobian, torque, self._robot.tension.bias, limit)

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
-from musculoskeletal_ae.mae.anomaly_statistics import FLOOR, AnomalyStatistics
-from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, residuals
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept
@@ -143,7 +142,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     if len(healthy.messages) < 2:
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
-    error = residuals(mae, tension, length)
+    error = residuals(mae.estimate(tension, length), tension, length)
     sound = ~_glitches(error)
     known = min(samples, healthy.rests)
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES

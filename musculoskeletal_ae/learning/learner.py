@@ -29,6 +29,7 @@ from musculoskeletal_ae.learning.training import Job, Training, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.report import Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 
 STEPS = 100  # of training in one update of preset default
@@ -291,19 +292,23 @@ class Learner:
         """Messages and rests that were not learned from, by reason."""
         return self._rests.rejected
 
-    @property
-    def stopped_by_anomaly(self) -> bool:
-        """Whether an anomaly stops learning."""
-        return self._rests.anomaly
-
-    @property
-    def trouble(self) -> str:
-        """What is wrong, or ''."""
+    def report(self) -> Report:
+        """Return how it is, for /diagnostics."""
+        level: Level = 'warn'
         disk = '' if self._state is None else self._state.trouble
-        return '; '.join(filter(None, (self.training.trouble, disk)))
+        if trouble := '; '.join(filter(None, (self.training.trouble, disk))):
+            level, message = 'error', trouble
+        elif self.checkpoint is None:
+            message = 'waiting for a checkpoint: set the parameter `checkpoint`'
+        elif not self.enabled:
+            message = 'stopped by learner/enable'
+        elif self._rests.anomaly:
+            message = 'stopped by an anomaly until estimator/reset'
+        else:
+            level, message = 'ok', 'learning'
+        return Report(level, message, {**self._values(), 'state': message})
 
-    def values(self) -> dict[str, str]:
-        """Return what people want to know, for /diagnostics."""
+    def _values(self) -> dict[str, str]:
         values = {
             'samples': str(len(self.samples)),
             'accepted': str(self.samples.accepted),

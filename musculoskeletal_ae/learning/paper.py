@@ -20,7 +20,7 @@ from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.training import Job, Update, history, newest_error
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae, to_mae
-from musculoskeletal_ae.mae.optimisers import Adam
+from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import loss, one_thread
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.presets import PAPER
@@ -40,7 +40,7 @@ class PaperUpdater:
         """Go on from a network."""
         self._robot, self._origin, self._mae = robot, mae, mae
         self._network = from_mae(mae)
-        self._optimiser = Adam(self._network, PAPER.training.step_size)
+        self._optimiser = Optimiser(self._network, PAPER.training.step_size, muon=False)
         self._rng = np.random.default_rng([seed, 0x9A])
         self._steps = 0
 

@@ -27,9 +27,8 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.training import Job, Update, history, learned_steps, newest_error
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
-from musculoskeletal_ae.mae.optimisers import Muon
-from musculoskeletal_ae.mae.samples import OVERLOAD_SHARE
-from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY, one_thread
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.training import OVERLOAD_SHARE, TINY, one_thread
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -244,7 +243,7 @@ class Trainer:
         """Go on from a network's weights, as calmly as after so many `steps`."""
         self.network = network
         self._restless = copy.deepcopy(network)
-        self._optimiser = Muon(self._restless, MUON_MATRIX_RATIO * STEP_SIZE, STEP_SIZE)
+        self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
         self._rng = np.random.default_rng([seed, 0x7A])
         self.steps = steps
 

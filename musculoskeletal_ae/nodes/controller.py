@@ -8,45 +8,38 @@ muscle_length_command, or muscle_tension_command with method `tension`.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import Field, fields
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.report import control_report, stiffness_values
+from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
-from musculoskeletal_ae.control.settings import Settings, read_stiffness
-from musculoskeletal_ae.control.stiffness import StiffnessSolution
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.parameters import number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
-from musculoskeletal_ae.nodes.running import run
-from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
 
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
-LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}
 
 
 class Controller(Shell):
     """Node shell of control."""
 
-    def __init__(self) -> None:
-        """Declare parameters, topics and services."""
-        super().__init__('controller')
-        self.declare_parameter('explore', False, text('explore from the start', read_only=True))
-        self.declare_parameter('seed', 0, whole('seed of the exploration'))
-        self.settings = Settings()
-        self.core = Core(self.robot, self.settings, self.get_parameter('seed').value)
-        self._declare_settings()
-        self.cause = ''
-        self.stiffness: StiffnessSolution | None = None
+    def __init__(self, **options: Any) -> None:
+        """Declare topics and services; options are those of Node."""
+        super().__init__('controller', **options)
+        self.core = Core(self.robot, seed=self.parameter('seed'))
+        for name in parameters_of(Settings):
+            self.follow_parameter(name, partial(self._configure, name))
+        self.told: list[str] = []
         self.publishers_of = {
             LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
             TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
@@ -63,41 +56,11 @@ class Controller(Shell):
         self.create_service(Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
-        if self.get_parameter('explore').value:
+        if self.parameter('explore'):
             self.core.explore(True)
 
-    def _declare_settings(self) -> None:
-        for setting in fields(Settings):
-            if setting.metadata:
-                self._declare_setting(setting)
-        self.settable(
-            'joint_stiffness',
-            [0.0],
-            ParameterDescriptor(
-                description='wished joint stiffness [N·m/rad], one per joint; 0 or []: as it comes',
-                dynamic_typing=True,  # `[]` is an array of bytes to rclpy
-            ),
-            self._set_stiffness,
-        )
-
-    def _declare_setting(self, setting: Field[Any]) -> None:
-        name, told = setting.name, setting.metadata
-        legal = told.get('legal')
-        if legal is None:
-            descriptor = number(told['meaning'], *told['range'])
-        else:
-            descriptor = text(f'{told["meaning"]}; one of: {", ".join(legal)}')
-
-        def setter(value: Any) -> None:
-            if legal is not None and value not in legal:
-                raise MusculoskeletalError(f'{value!r}; legal: {", ".join(legal)}')
-            setattr(self.settings, name, value)
-
-        self.settable(name, setting.default, descriptor, setter)
-
-    def _set_stiffness(self, wished: Iterable[Any]) -> None:
-        self.settings.joint_stiffness = read_stiffness(wished, self.robot.joint_count)
-        self.core.posture.start()
+    def _configure(self, name: str, value: Any) -> None:
+        self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, message: Float64MultiArray) -> None:
         rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
@@ -146,19 +109,14 @@ class Controller(Shell):
         if command is not None:
             self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
 
-    def state(self) -> tuple[bytes, str, dict[str, str]]:
+    def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
         report = control_report(self.robot, self.core, time.monotonic())
-        cause, found = self.core.safety.cause, self.core.posture.stiffness
-        if cause and cause != self.cause:
-            self.get_logger().warning(f'stopped: {cause}')
-        if found is not None and found is not self.stiffness:
-            for what, said in stiffness_values(self.robot, self.settings, found).items():
-                self.get_logger().info(f'{what}: {said}')
-        self.cause, self.stiffness = cause, found
-        return LEVELS[report.level], report.message, report.values
-
-
-def main() -> None:
-    """Run the node."""
-    run(Controller)
+        stopped = [report.message] if self.core.safety.cause else []
+        stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
+        for line in stopped + stiffness:
+            if line not in self.told:
+                log = self.get_logger().warning if line in stopped else self.get_logger().info
+                log(line)
+        self.told = stopped + stiffness
+        return report

@@ -7,8 +7,8 @@ joint_states or vision_joint_states, muscle_states, anomaly_detected → mae_che
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -21,10 +21,9 @@ from musculoskeletal_ae.learning.samples import Novelty
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import bytes_message
-from musculoskeletal_ae.nodes.parameters import declare_preset, number, text, whole
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
-from musculoskeletal_ae.nodes.running import run
-from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 POLL = 0.05  # [s] between looks at the training process
@@ -35,30 +34,30 @@ AUTO = 'auto'
 class Learner(Shell):
     """Node shell of online learning."""
 
-    def __init__(self) -> None:
-        """Declare parameters and topics, and start the training process."""
-        super().__init__('learner')
-        joint_topic = self._declare_joint_topic()
-        self.core = self._declare_core()
+    def __init__(self, **options: Any) -> None:
+        """Declare topics and start the training process; options are those of Node."""
+        super().__init__('learner', **options)
+        value = self.parameter
+        self.core = learner.Learner(
+            self.robot,
+            preset=value('preset'),
+            seed=value('seed'),
+            steps=value('update_steps'),
+            period=1.0 / self.rate,
+            rest=RestSettings(
+                value('rest_time'), value('rest_joint_rate'), value('rest_length_rate')
+            ),
+            novelty=Novelty(value('new_joint_distance'), value('new_tension_distance')),
+            training=TrainingProcess,
+            directory=self._directory(value('state_directory')),
+        )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.running = False
-        self.settable(
-            'fresh', False, text('true: drop the saved state for `checkpoint`'), self._start_fresh
-        )
-        self.settable(
-            'checkpoint',
-            '',
-            text('MAE checkpoint to start from where no state is saved; set later: replaces it'),
-            self._take_checkpoint,
-        )
-        self.settable(
-            'relearn_muscles',
-            [''],
-            text('names of replaced or re-wired muscles, learned anew from now on'),
-            self._relearn,
-        )
+        self.follow_parameter('fresh', self._start_fresh)
+        self.follow_parameter('checkpoint', self._take_checkpoint)
+        self.follow_parameter('relearn_muscles', self._relearn)
         self.running = True
-        self.listen(JointState, joint_topic, self._joints, SENSOR)
+        self.listen(JointState, JOINT_TOPICS[value('joint_source')], self._joints, SENSOR)
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         self.create_service(SetBool, 'learner/enable', self._enable)
@@ -67,46 +66,7 @@ class Learner(Shell):
 
     # -- parameters -----------------------------------------------------------------------------
 
-    def _declare_joint_topic(self) -> str:
-        meaning = f'where θ comes from: {tuple(JOINT_TOPICS)}'
-        source = self.declare_parameter('joint_source', 'sensor', text(meaning, True)).value
-        if source not in JOINT_TOPICS:
-            legal = ', '.join(JOINT_TOPICS)
-            raise MusculoskeletalError(f'parameter joint_source: {source!r}; legal: {legal}')
-        return JOINT_TOPICS[source]
-
-    def _declare_core(self) -> learner.Learner:
-        def positive(name: str, default: float, meaning: str, most: float) -> float:
-            value = self.declare_parameter(name, default, number(meaning, 0.0, most, True)).value
-            return float(value)
-
-        rest, novelty = RestSettings(), Novelty()
-        return learner.Learner(
-            self.robot,
-            preset=declare_preset(self, 'how to learn'),
-            seed=self.declare_parameter('seed', 0, whole('random seed')).value,
-            steps=self.declare_parameter(
-                'update_steps',
-                learner.STEPS,
-                text('steps of training per update, preset default', True),
-            ).value,
-            period=1.0 / self.rate,
-            rest=RestSettings(
-                positive('rest_time', rest.window, 'how long the arm has to be still [s]', 10.0),
-                positive('rest_joint_rate', rest.joint_rate, 'fastest joint at rest [rad/s]', 1.0),
-                positive('rest_length_rate', rest.length_rate, 'fastest l at rest [m/s]', 1.0),
-            ),
-            novelty=Novelty(
-                positive('new_joint_distance', novelty.joint, 'to stored samples [rad]', 3.0),
-                positive('new_tension_distance', novelty.tension, 'to stored ones [N]', 500.0),
-            ),
-            training=TrainingProcess,
-            directory=self._declare_directory(),
-        )
-
-    def _declare_directory(self) -> Path | None:
-        meaning = "for samples and network; 'auto': below XDG_STATE_HOME; '': nothing kept"
-        value = self.declare_parameter('state_directory', AUTO, text(meaning, True)).value
+    def _directory(self, value: str) -> Path | None:
         if value != AUTO:
             return Path(value) if value else None
         home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
@@ -119,7 +79,7 @@ class Learner(Shell):
         if not self.running:
             self.core.replace(None)
             return
-        path = self.get_parameter('checkpoint').value
+        path = self.parameter('checkpoint')
         if not path:
             raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
         self._take_checkpoint(path)
@@ -130,8 +90,8 @@ class Learner(Shell):
         elif path and self.core.checkpoint is None:
             self.core.begin(checkpoint.load(path, self.robot))
 
-    def _relearn(self, names: Sequence[str]) -> None:
-        self.core.relearn(self.robot.muscle_indices(name for name in names if name))
+    def _relearn(self, names: tuple[str, ...]) -> None:
+        self.core.relearn(self.robot.muscle_indices(names))
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -170,28 +130,12 @@ class Learner(Shell):
         """Forget what is not a sample yet."""
         self.core.reset()
 
-    # -- diagnostics ----------------------------------------------------------------------------
-
-    def state(self) -> tuple[bytes, str, dict[str, str]]:
+    def report(self) -> Report:
         """Return what /diagnostics shows."""
-        level, message = OK, 'learning'
-        if self.core.trouble:
-            level, message = ERROR, self.core.trouble
-        elif self.core.checkpoint is None:
-            level, message = WARN, 'waiting for a checkpoint: set the parameter `checkpoint`'
-        elif not self.core.enabled:
-            level, message = WARN, 'stopped by learner/enable'
-        elif self.core.stopped_by_anomaly:
-            level, message = WARN, 'stopped by an anomaly until estimator/reset'
-        return level, message, {**self.core.values(), 'state': message}
+        return self.core.report()
 
     def destroy_node(self) -> None:
         """End the training process with the node."""
         if hasattr(self, 'core'):
             self.core.close()
         super().destroy_node()
-
-
-def main() -> None:
-    """Run the node."""
-    run(Learner)

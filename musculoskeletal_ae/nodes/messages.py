@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import JointState
 from std_msgs.msg import (
     Float64MultiArray,
     MultiArrayDimension,
@@ -26,6 +29,13 @@ def array_message(values: Array, *labels: str) -> Float64MultiArray:
         ]
     )
     return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+
+
+def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointState:
+    """Return a joint state of θ [rad] (D,)."""
+    message = JointState(name=joints, position=theta.tolist())
+    message.header.stamp = stamp
+    return message
 
 
 def bytes_message(data: bytes) -> UInt8MultiArray:

@@ -1,41 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How parameters are described to `ros2 param describe`."""
+"""The parameters of every node: one table, from which all else that tells of them is made.
+
+Declarations and `ros2 param describe` come from it (`shell`), `--help` of each node (`running`),
+and `config/nodes.yaml`:
+
+    python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml
+
+Imports nothing heavy, so that `--help` answers at once.
+"""
 
 from __future__ import annotations
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.node import Node
+import json
+from collections import Counter
+from dataclasses import replace
 
-from musculoskeletal_ae.presets import PRESETS, preset_named
+from musculoskeletal_ae.control.settings import Settings as ControlSettings
+from musculoskeletal_ae.parameters import (
+    CHECKPOINT,
+    PRESET,
+    RATE,
+    ROBOT,
+    SEED,
+    Parameter,
+    parameters_of,
+)
+
+SHARED = {'robot': ROBOT, 'rate': RATE}
+
+#: by node, then by name
+PARAMETERS: dict[str, dict[str, Parameter]] = {
+    'controller': {
+        **SHARED,
+        'checkpoint': CHECKPOINT,
+        'seed': SEED,
+        'explore': Parameter(False, 'explore from the start'),
+        **parameters_of(ControlSettings),
+    },
+    'estimator': {
+        **SHARED,
+        'checkpoint': CHECKPOINT,
+        'preset': PRESET,
+        'anomaly_threshold': Parameter(
+            0.0,
+            'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
+            'scaled units',
+            (0.0, 1e6),
+            settable=True,
+        ),
+    },
+    'hardware_emulator': {
+        **SHARED,
+        'seed': SEED,
+        'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
+        'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
+        'length_offset': Parameter(
+            (0.0,),
+            'error of the length sensors, one for all or one each',
+            'm',
+            settable=True,
+        ),
+        'joint_sensors': Parameter(True, 'publish joint_states'),
+        'marker_rate': Parameter(
+            0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
+        ),
+        'command_timeout': Parameter(
+            0.5,
+            'without a command for this long the modules go safe',
+            's',
+            (0.01, 60.0),
+            settable=True,
+        ),
+    },
+    'sim': {
+        **SHARED,
+        'checkpoint': CHECKPOINT,
+        'preset': PRESET,
+        'as_robot': Parameter(False, 'publish joint_states and muscle_states instead of sim/…'),
+    },
+    'learner': {
+        **SHARED,
+        'checkpoint': replace(
+            CHECKPOINT,
+            meaning='trained network to start from if no state is saved (set later: replaces it)',
+        ),
+        'preset': PRESET,
+        'seed': SEED,
+        'joint_source': Parameter(
+            'sensor', 'joint_states, or vision_joint_states', legal=('sensor', 'marker')
+        ),
+        'relearn_muscles': Parameter(
+            ('',), 'replaced or re-wired muscles, whose constants are learned anew', settable=True
+        ),
+        'fresh': Parameter(
+            False, 'drop the saved state and start from `checkpoint`', settable=True
+        ),
+        'state_directory': Parameter(
+            'auto', 'of samples and network (auto: below XDG_STATE_HOME; empty: keep nothing)'
+        ),
+        'rest_time': Parameter(0.3, 'how long the arm has to be still', 's', (0.0, 10.0)),
+        'rest_joint_rate': Parameter(0.02, 'fastest joint of a resting arm', 'rad/s', (0.0, 1.0)),
+        'rest_length_rate': Parameter(0.002, 'fastest muscle of a resting arm', 'm/s', (0.0, 1.0)),
+        'new_joint_distance': Parameter(
+            0.05, 'least distance of a new sample in one joint', 'rad', (0.0, 3.0)
+        ),
+        'new_tension_distance': Parameter(
+            10.0, 'least distance of a new sample in one tension', 'N', (0.0, 500.0)
+        ),
+        'update_steps': Parameter(
+            100, 'mini-batches of one update, preset default', '', (1, 100_000)
+        ),
+    },
+    'bringup_status': {
+        **SHARED,
+        'duration': Parameter(
+            0.0, 'time from the first estimate to the end (0: no end)', 's', (0.0, 1e9)
+        ),
+    },
+}
+
+HELP_TAIL = """\
+Give them as  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be
+set while the node runs. Names of topics:  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
 
 
-def text(description: str, read_only: bool = False) -> ParameterDescriptor:
-    """Describe a parameter that has no range."""
-    return ParameterDescriptor(description=description, read_only=read_only)
+def help_text(node: str) -> str:
+    """Return the part of a node's `--help` that tells of its parameters."""
+    lines = ['Parameters:', '']
+    for name, parameter in PARAMETERS[node].items():
+        mark = '*' if parameter.settable else ' '
+        lines.append(f' {mark} {name} (default: {json.dumps(parameter.default)})')
+        lines.append(f'       {_told(parameter)}')
+    return '\n'.join([*lines, '', HELP_TAIL])
 
 
-def whole(description: str) -> ParameterDescriptor:
-    """Describe a whole number of at least 0 that is read once, such as a seed."""
-    span = IntegerRange(from_value=0, to_value=2**63 - 1)
-    return ParameterDescriptor(description=description, integer_range=[span], read_only=True)
+def yaml_text() -> str:
+    """Return `config/nodes.yaml`: every parameter once, with its default."""
+    lines = [
+        '# Parameters of all nodes and their defaults. Made by',
+        '#     python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml',
+        '/**:',
+        '  ros__parameters:',
+    ]
+    users = Counter(name for table in PARAMETERS.values() for name in table)
+    sections: dict[str, dict[str, Parameter]] = {'shared': {}}
+    for node, table in PARAMETERS.items():
+        sections[node] = {}
+        for name, parameter in table.items():
+            sections['shared' if users[name] > 1 else node].setdefault(name, parameter)
+    for section, table in sections.items():
+        lines.append(f'    # {section}')
+        for name, parameter in table.items():
+            entry = f'    {name}: {json.dumps(parameter.default)}'
+            lines.append(f'{entry:<40} # {_told(parameter)}')
+    return '\n'.join(lines) + '\n'
 
 
-def declare_preset(node: Node, meaning: str) -> str:
-    """Declare `preset`, read once, and return it.
-
-    Raises:
-        MusculoskeletalError: If there is no such preset.
-    """
-    descriptor = text(f'{meaning}; one of: {", ".join(PRESETS)}', read_only=True)
-    preset = str(node.declare_parameter('preset', 'default', descriptor).value)
-    return preset_named(preset).name
+def _told(parameter: Parameter) -> str:
+    return f'{parameter.meaning}; {parameter.legal_values}'.removesuffix('; ')
 
 
-def number(
-    description: str, low: float, high: float, read_only: bool = False
-) -> ParameterDescriptor:
-    """Describe a number within [low, high]; rclpy refuses what lies outside, NaN included."""
-    span = FloatingPointRange(from_value=low, to_value=high)
-    return ParameterDescriptor(
-        description=description, floating_point_range=[span], read_only=read_only
-    )
+if __name__ == '__main__':
+    print(yaml_text(), end='')

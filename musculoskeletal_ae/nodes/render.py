@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `render`: one picture of the running arm as a PNG, no display needed."""
+"""The tool `render`: one picture of a running arm as a PNG, no display needed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import rclpy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments.picture import Line, save_picture
 from musculoskeletal_ae.nodes.qos import SENSOR
 from musculoskeletal_ae.nodes.tool import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
+from musculoskeletal_ae.robot.picture import Line, save_picture
 
 
 def _lines(message: MarkerArray) -> list[Line]:
@@ -31,19 +31,7 @@ def _lines(message: MarkerArray) -> list[Line]:
     ]
 
 
-def parse(arguments: list[str]) -> Namespace:
-    """Return the options of `render`."""
-    parser = Parser(
-        'render', 'Draws one picture of the running arm, no display needed. ' + ROS_HELP
-    )
-    parser.add_out('FILE.png', 'the picture', Path('arm.png'))
-    parser.add_argument('--topic', default='hardware_emulator/markers', help='a MarkerArray')
-    parser.add_argument('--timeout', type=positive, default=10.0, metavar='S', help='[s] to wait')
-    return parser.parse_args(arguments)
-
-
 def _render(options: Namespace, arguments: list[str]) -> int:
-    """Wait for one marker array and draw it."""
     start_ros(arguments)
     node = rclpy.create_node('render')
     received: list[MarkerArray] = []
@@ -51,7 +39,6 @@ def _render(options: Namespace, arguments: list[str]) -> int:
     deadline = time.monotonic() + options.timeout
     while not received and time.monotonic() < deadline:
         rclpy.spin_once(node, timeout_sec=0.1)
-    node.destroy_node()
     lines = _lines(received[0]) if received else []
     if not lines:
         raise MusculoskeletalError(
@@ -63,6 +50,16 @@ def _render(options: Namespace, arguments: list[str]) -> int:
     return 0
 
 
+def _parse(arguments: list[str]) -> Namespace:
+    parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
+    parser.add_out('FILE.png', default=Path('arm.png'))
+    parser.add_argument('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
+    parser.add_argument(
+        '--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]'
+    )
+    return parser.parse_args(arguments)
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Run the tool; exit status 0: drawn, 1: nothing to draw, 2: wrong options."""
-    return run_tool('render', parse, _render, argv)
+    """Wait for one marker array and draw it."""
+    return run_tool('render', _parse, _render, argv)

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import ast
 import sys
-from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import NoReturn
 
 import rclpy
@@ -14,6 +18,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.parameters import help_text
 
 # What rclpy raises for a value of the wrong type or beyond its range, given at the start.
 PARAMETER_ERRORS = (
@@ -22,11 +27,6 @@ PARAMETER_ERRORS = (
     rclpy_implementation.UnknownROSArgsError,
     rclpy_implementation.RCLInvalidROSArgsError,
 )
-
-USAGE = """
-This is a ROS 2 node. Parameters:  --ros-args -p NAME:=VALUE  or  --params-file FILE;
-names:  -r __ns:=/left_arm  -r TOPIC:=OTHER.  `ros2 param describe` tells each parameter's meaning.
-"""
 
 
 def reason(error: Exception) -> str:
@@ -39,33 +39,52 @@ def _refuse(error: object) -> NoReturn:
     sys.exit(1)
 
 
-def run(make: Callable[[], Node]) -> None:
+def help_of(node: str) -> str:
+    """Return what `--help` of a node says, without importing the node, which takes a second."""
+    spec = find_spec(f'musculoskeletal_ae.nodes.{node}')
+    assert spec is not None and spec.origin is not None
+    told = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding='utf-8')))
+    return f'{told}\n\n{help_text(node)}'
+
+
+def run(name: str) -> None:
     """Run one node on a single-threaded executor until it is asked to stop.
 
     What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
     """
     if {'--help', '-h'} & set(sys.argv[1:]):
-        print(f'{sys.modules[make.__module__].__doc__}\n{USAGE}')
+        print(help_of(name))
         return
+    node: Node | None = None
     try:
+        module = import_module(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
-    except (rclpy_implementation.RCLError, *PARAMETER_ERRORS) as error:
-        _refuse(reason(error))
-    node = None
-    try:
-        node = make()
+        node = getattr(module, name.title().replace('_', ''))()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except rclpy_implementation.RCLError:
+    except MusculoskeletalError as error:
+        _refuse(error)
+    except PARAMETER_ERRORS as error:
+        _refuse(reason(error))
+    except rclpy_implementation.RCLError as error:
+        if node is None:
+            _refuse(reason(error))
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
             raise
-    except (MusculoskeletalError, *PARAMETER_ERRORS) as error:
-        _refuse(error)
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+# The entry points of setup.py.
+bringup_status = partial(run, 'bringup_status')
+controller = partial(run, 'controller')
+estimator = partial(run, 'estimator')
+hardware_emulator = partial(run, 'hardware_emulator')
+learner = partial(run, 'learner')
+sim = partial(run, 'sim')

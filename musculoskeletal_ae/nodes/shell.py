@@ -9,26 +9,33 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
 
 from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
-from musculoskeletal_ae.mae import checkpoint as checkpoints
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import number, text
+from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.nodes.reception import Reception
+from musculoskeletal_ae.parameters import Parameter
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
 
 
 class Shell(Node):
@@ -36,24 +43,26 @@ class Shell(Node):
 
     Attributes:
         robot: The robot of the `robot` parameter.
+        rate: Rate of the muscle modules [Hz].
         rejected: How many messages were rejected, by topic and reason.
     """
 
-    def __init__(self, name: str) -> None:
-        """Start the node and load its robot."""
-        super().__init__(name)
-        self.declare_parameter('robot', 'musashi_left_arm', text('shipped name or directory', True))
-        self.declare_parameter(
-            'rate', 100.0, number('rate of the muscle modules [Hz]', 1.0, 1000.0, True)
-        )
-        self.robot = Robot.load(self.get_parameter('robot').value)
-        self.rate = float(self.get_parameter('rate').value)
+    def __init__(self, name: str, **options: Any) -> None:
+        """Start the node, declare its parameters and load its robot; options are those of Node."""
+        super().__init__(name, **options)
+        self._table = PARAMETERS[name]
+        self._setters: dict[str, Callable[[Any], object]] = {}
+        for key, parameter in self._table.items():
+            default = parameter.default
+            default = list(default) if isinstance(default, tuple) else default
+            self.declare_parameter(key, default, _descriptor(parameter))
+        self.robot = Robot.load(self.parameter('robot'))
+        self.rate: float = self.parameter('rate')
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected
-        self._setters: dict[str, Callable[[Any], None]] = {}
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._report_timer = self.create_timer(1.0, self._report, clock=STEADY)
+        self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
@@ -64,48 +73,47 @@ class Shell(Node):
 
     # -- what a node overrides ------------------------------------------------------------------
 
-    def state(self) -> tuple[bytes, str, dict[str, str]]:
-        """Return level, message and values for /diagnostics."""
-        return OK, 'running', {}
+    def report(self) -> Report:
+        """Return what /diagnostics shows."""
+        return Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
 
     # -- parameters -----------------------------------------------------------------------------
 
-    def settable(
-        self,
-        name: str,
-        default: Any,
-        descriptor: ParameterDescriptor,
-        setter: Callable[[Any], None],
-    ) -> None:
-        """Declare a parameter that may be set at run time.
+    def parameter(self, name: str) -> Any:
+        """Return a parameter's value; lists as tuples, without empty names.
 
-        Args:
-            name: Its name.
-            default: Its default.
-            descriptor: What it means, unit and range.
-            setter: Takes a new value and uses it, or raises a `MusculoskeletalError` or `OSError`.
+        Raises:
+            MusculoskeletalError: If the value is not legal.
         """
-        self.declare_parameter(name, default, descriptor)
+        return self._checked(name, self.get_parameter(name).value, lambda value: value)
+
+    def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
+        """Call `setter` with a parameter's value, now and whenever it is set.
+
+        The setter raises a `MusculoskeletalError` or `OSError` to refuse a value.
+        """
+        self._checked(name, self.get_parameter(name).value, setter)
         self._setters[name] = setter
+
+    def _checked(self, name: str, value: Any, setter: Callable[[Any], Any]) -> Any:
         try:
-            setter(self.get_parameter(name).value)
+            return setter(self._table[name].checked(value))
         except (MusculoskeletalError, OSError) as error:
             raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
-    def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         taken: list[str] = []
-        for parameter in parameters:
-            if parameter.name in self._setters:
-                try:
-                    self._setters[parameter.name](parameter.value)
-                except (MusculoskeletalError, OSError) as error:
-                    for name in reversed(taken):  # all or nothing
-                        self._setters[name](self.get_parameter(name).value)
-                    return SetParametersResult(successful=False, reason=str(error))
-                taken.append(parameter.name)
+        for name, value in ((p.name, p.value) for p in parameters if p.name in self._setters):
+            try:
+                self._checked(name, value, self._setters[name])
+            except MusculoskeletalError as error:
+                for before in reversed(taken):  # all or nothing
+                    self.follow_parameter(before, self._setters[before])
+                return SetParametersResult(successful=False, reason=str(error))
+            taken.append(name)
         return SetParametersResult(successful=True)
 
     # -- checkpoints ----------------------------------------------------------------------------
@@ -119,27 +127,25 @@ class Shell(Node):
             use: Takes a checked network.
             unfit: Is told why one that came by topic cannot be used; the one in use stays.
         """
-        self.mae: Mae | None = None
 
         def take(mae: Mae) -> None:
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
                 raise CheckpointError(f'cannot be computed with ({error})') from error
-            self.mae = mae
 
         def from_file(path: str) -> None:
             if path:
-                take(checkpoints.load(path, self.robot))
+                take(checkpoint.load(path, self.robot))
 
         def from_topic(message: UInt8MultiArray) -> None:
             try:
-                take(checkpoints.from_bytes(bytes(message.data), self.robot))
+                take(checkpoint.from_bytes(bytes(message.data), self.robot))
             except CheckpointError as error:
                 unfit(str(error))
                 raise
 
-        self.settable('checkpoint', '', text('MAE checkpoint file; empty: wait for one'), from_file)
+        self.follow_parameter('checkpoint', from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 
     # -- messages -------------------------------------------------------------------------------
@@ -151,30 +157,50 @@ class Shell(Node):
 
         The callback raises a `MusculoskeletalError` to reject the message.
         """
-        # rclpy accepts (message, info) callbacks; its annotations do not know them.
         full = self.resolve_topic_name(topic)
         receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
+        # rclpy accepts (message, info) callbacks; its annotations do not know them.
         self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
     # -- diagnostics ----------------------------------------------------------------------------
 
     def _report(self) -> None:
-        level, summary, values = self.state()
+        report = self.report()
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
-        for topic, count in self._reception.take_received().items():
-            values[f'{topic} rate'] = f'{count / elapsed:.1f} Hz'
-        values['rejected'] = str(sum(self.rejected.values()))
-        values |= {f'rejected {reason}': str(n) for reason, n in self.rejected.items()}
+        values = {
+            **report.values,
+            **{
+                f'{topic} rate': f'{count / elapsed:.1f} Hz'
+                for topic, count in self._reception.take_received().items()
+            },
+            'rejected': str(sum(self.rejected.values())),
+            **{f'rejected {reason}': str(count) for reason, count in self.rejected.items()},
+        }
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         status = DiagnosticStatus(
-            level=level,
+            level=LEVELS[report.level],
             name=f'{self.get_fully_qualified_name()}: state',
-            message=summary,
-            hardware_id=str(self.robot.description.directory.name),
+            message=report.message,
+            hardware_id=self.robot.description.directory.name,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=parameter.description,
+        read_only=not parameter.settable,
+        dynamic_typing=parameter.is_number_list,  # `[]` is an array of bytes to rclpy
+    )
+    if parameter.within is not None:
+        low, high = parameter.within
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    return descriptor

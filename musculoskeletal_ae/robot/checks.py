@@ -14,18 +14,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot import moment_arms as arms
-from musculoskeletal_ae.robot.moment_arms import Finding
+from musculoskeletal_ae.robot.moment_arms import Finding, moment_arm_faults, moment_arm_warnings
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.stiffness import joint_stiffness
-from musculoskeletal_ae.robot.tension import holding_tension
+from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
+from musculoskeletal_ae.robot.tension import TensionProgramme
 
-WISHED_TENSION = 60.0  # [N]
+DESIRED_TENSION = 60.0  # [N]
 REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
 LEAST_INERTIA = 1e-6  # [kg·m² or kg]; with less a joint cannot be simulated
@@ -42,7 +39,6 @@ class RobotCheck:
         tension: Holding tension [N], shape (N, M); NaN where the posture is not held.
         missing_torque: Torque lacking where a posture is not held [N·m], shape (N, D).
         stiffness: Smallest joint-stiffness eigenvalue [N·m/rad], shape (N,); NaN if not held.
-        softest_joint: Joint that moves most along that eigenvector, shape (N,); -1 if not held.
         one_sided: Smallest eigenvalue with muscles at the bias tension slack, shape (N,).
         faults: Why the arm is not sound; empty if it is.
         warnings: What deserves a look but is not judged.
@@ -53,20 +49,19 @@ class RobotCheck:
     tension: Array
     missing_torque: Array
     stiffness: Array
-    softest_joint: NDArray[np.int_]
     one_sided: Array
     faults: tuple[Finding, ...]
     warnings: tuple[Finding, ...]
 
     @property
-    def held(self) -> NDArray[np.bool_]:
+    def held(self) -> Bools:
         """Whether each posture is held, shape (N,)."""
         return np.isfinite(self.stiffness)
 
     @property
-    def stiff(self) -> NDArray[np.bool_]:
+    def stiff(self) -> Bools:
         """Whether each posture is held and stiff enough, shape (N,)."""
-        return self.held & (self.stiffness >= REQUIRED_STIFFNESS)
+        return self.stiffness >= REQUIRED_STIFFNESS
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
@@ -75,53 +70,54 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     Args:
         robot: The nominal body.
         postures: How many postures are drawn.
-        seed: Seed of the draw.
+        seed: Random seed of the postures.
 
     Raises:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
     """
-    actions = arms.read_declared_actions(robot.description)
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     jacobian = robot.routes.muscle_jacobian(theta)
     torque = robot.kinematics.holding_torque(theta)
-    low, high = robot.tension.bias, robot.tension.limit
-    tension = np.full((postures, robot.muscle_count), np.nan)
-    missing = np.zeros((postures, robot.joint_count))
-    stiffness, one_sided = np.full(postures, np.nan), np.full(postures, np.nan)
-    softest = np.full(postures, -1)
-    for n in range(postures):
-        try:
-            tension[n] = holding_tension(jacobian[n], torque[n], low, high, WISHED_TENSION)
-        except InfeasibleError:
-            best = lsq_linear(-jacobian[n].T, torque[n], (low, high)).x
-            missing[n] = torque[n] + jacobian[n].T @ best
-            continue
-        values, vectors = np.linalg.eigh(joint_stiffness(robot, theta[n], tension[n]))
-        stiffness[n], softest[n] = values[0], np.abs(vectors[:, 0]).argmax()
-        slack = tension[n] <= low + SLACK_MARGIN
-        one_sided[n] = np.linalg.eigvalsh(joint_stiffness(robot, theta[n], tension[n], slack))[0]
-    description, arm = robot.description, -jacobian
+    measured = [_measure(robot, *at) for at in zip(theta, jacobian, torque, strict=True)]
+    tension, missing, stiffness, softest, one_sided = map(np.array, zip(*measured, strict=True))
     return RobotCheck(
         postures=theta,
-        moment_arms=arm,
+        moment_arms=-jacobian,
         tension=tension,
         missing_torque=missing,
         stiffness=stiffness,
-        softest_joint=softest,
         one_sided=one_sided,
         faults=(
-            *arms.wrong_signs(arm, actions, description),
-            *arms.one_way_joints(arm, description),
-            *arms.useless_muscles(arm, description),
+            *moment_arm_faults(robot.description, -jacobian),
             *_inertia_faults(robot, theta),
             *_holding_faults(robot, stiffness, softest, missing),
         ),
-        warnings=tuple(arms.flipping_muscles(arm, description)),
+        warnings=tuple(moment_arm_warnings(robot.description, -jacobian)),
     )
 
 
+def _measure(
+    robot: Robot, theta: Array, jacobian: Array, torque: Array
+) -> tuple[Array, Array, float, int, float]:
+    """Return tension, missing torque, stiffness, softest joint, one-sided stiffness at θ (D,)."""
+    bias = robot.tension.bias
+    programme = TensionProgramme(jacobian, torque, bias, robot.tension.limit)
+    try:
+        tension = programme.nearest(DESIRED_TENSION)
+    except InfeasibleError:
+        missing = programme.compromise().missing_torque
+        return np.full(robot.muscle_count, np.nan), missing, np.nan, -1, np.nan
+    hessian = muscle_hessian(robot.routes.muscle_jacobian, theta)
+    k = robot.muscle_stiffness(theta, tension)
+    taut = np.where(tension > bias + SLACK_MARGIN, k, 0.0)
+    values, vectors = np.linalg.eigh(joint_stiffness(jacobian, hessian, k, tension))
+    one_sided = np.linalg.eigvalsh(joint_stiffness(jacobian, hessian, taut, tension))[0]
+    softest = int(np.abs(vectors[:, 0]).argmax())
+    return tension, np.zeros(robot.joint_count), values[0], softest, one_sided
+
+
 def _inertia_faults(robot: Robot, theta: Array) -> list[Finding]:
-    least = robot.kinematics.joint_inertia(theta).min(axis=0)
+    least = np.min([robot.kinematics.joint_inertia(posture) for posture in theta], axis=0)
     return [
         Finding(
             'no_inertia',
@@ -133,11 +129,8 @@ def _inertia_faults(robot: Robot, theta: Array) -> list[Finding]:
     ]
 
 
-def _holding_faults(
-    robot: Robot, stiffness: Array, softest: NDArray[np.int_], missing: Array
-) -> list[Finding]:
-    held = np.isfinite(stiffness)
-    stiff = held & (np.nan_to_num(stiffness) >= REQUIRED_STIFFNESS)
+def _holding_faults(robot: Robot, stiffness: Array, softest: Ints, missing: Array) -> list[Finding]:
+    held, stiff = np.isfinite(stiffness), stiffness >= REQUIRED_STIFFNESS
     required = f'required {100 * REQUIRED_SHARE:.0f} %'
     faults = []
     if held.mean() < REQUIRED_SHARE:

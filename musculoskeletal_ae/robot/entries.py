@@ -1,82 +1,101 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of single entries of a YAML file; every complaint names the file and the entry."""
+"""Entries of muscles.yaml; every complaint names the file and the entry."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.files import read_yaml
 
 
-class EntryReader:
-    """Checks entries of one muscles.yaml; every complaint names the file and the entry."""
+class Entry:
+    """A value of a YAML file and where it stands.
 
-    def __init__(self, file: Path) -> None:
-        """Check entries of one file."""
-        self.file = file
+    Attributes:
+        where: Its place, for messages.
+        value: The value; any YAML type until one of the methods has checked it.
+    """
 
-    def document(self) -> object:
-        """Return the parsed file."""
-        return read_yaml(self.file, refusal)
+    def __init__(self, file: Path, where: str, value: Any, inside: str) -> None:
+        """Keep a value; `inside` stands before the names of its own entries."""
+        self.file, self.where, self.value, self._inside = file, where, value, inside
 
-    def fail(self, entry: str, problem: str) -> RobotDescriptionError:
-        """Return the error that says what is wrong with an entry."""
-        return RobotDescriptionError(f'{self.file}: {entry}: {problem}')
+    def fail(self, problem: str) -> RobotDescriptionError:
+        """Return the error that says what is wrong with this entry."""
+        return RobotDescriptionError(f'{self.file}: {self.where}: {problem}')
 
-    def mapping(self, value: object, entry: str, legal: tuple[str, ...]) -> dict[str, Any]:
-        """Return a mapping that has legal keys only."""
-        if not isinstance(value, dict):
-            raise self.fail(entry, f'expected a mapping with keys {listed(legal)}, got {value!r}')
-        for key in value:
+    def called(self, name: str) -> Entry:
+        """Return the same entry under a name that people know it by."""
+        return Entry(self.file, name, self.value, f'{name}: ')
+
+    # -- mappings and lists ---------------------------------------------------------------------
+
+    def mapping(self, *legal: str) -> Entry:
+        """Return this mapping, all of whose keys are legal."""
+        if not isinstance(self.value, dict):
+            raise self.fail(f'expected a mapping with keys {listed(legal)}, got {self.value!r}')
+        for key in self.value:
             if key not in legal:
-                raise self.fail(entry, f'unknown key {key!r}; legal keys: {listed(legal)}')
-        return value
+                raise self.fail(f'unknown key {key!r}; legal keys: {listed(legal)}')
+        return self
 
-    def required(self, mapping: dict[str, Any], key: str, entry: str) -> Any:
-        """Return the value of a key that must be there."""
-        if mapping.get(key) is None:
-            raise self.fail(entry, f'key {key!r} is missing')
-        return mapping[key]
+    def get(self, key: str, default: Any = None) -> Entry:
+        """Return the entry of a key, with a default where it is left out."""
+        return self._part(f'{self._inside}{key}', self.value.get(key, default))
 
-    def sequence(self, value: object, entry: str, at_least: int, of_what: str) -> list[Any]:
-        """Return a list of at least so many things."""
+    def __getitem__(self, key: str) -> Entry:
+        """Return the entry of a key that must be there."""
+        if self.value.get(key) is None:
+            raise self.fail(f'key {key!r} is missing')
+        return self.get(key)
+
+    def items(self, at_least: int, of_what: str) -> list[Entry]:
+        """Return the entries of a list of at least so many things."""
+        value = self.value
         if not isinstance(value, list) or len(value) < at_least:
             count = f'{len(value)} given' if isinstance(value, list) else f'got {value!r}'
-            raise self.fail(entry, f'expected a list of at least {at_least} {of_what}, {count}')
-        return value
+            raise self.fail(f'expected a list of at least {at_least} {of_what}, {count}')
+        return [self._part(f'{self.where}[{i}]', item) for i, item in enumerate(value)]
 
-    def number(self, value: object, entry: str, positive: bool = False) -> float:
-        """Return a finite number."""
-        result = math.nan
+    def _part(self, where: str, value: Any) -> Entry:
+        return Entry(self.file, where, value, f'{where}.')
+
+    # -- single values --------------------------------------------------------------------------
+
+    def number(self, above: float = -math.inf, least: float = -math.inf) -> float:
+        """Return a finite number above one bound and at least another."""
+        value, result = self.value, math.nan
         if isinstance(value, int | float) and not isinstance(value, bool):
             # An integer too long for a float overflows; no such number means anything here.
             result = float(value) if abs(value) < 1e300 else math.inf
         if not math.isfinite(result):
             hint = ' (YAML reads 1e5 as text; write 1.0e+5)' if isinstance(value, str) else ''
-            raise self.fail(entry, f'expected a finite number, got {value!r}{hint}')
-        if positive and result <= 0.0:
-            raise self.fail(entry, f'expected a number > 0, got {result:g}')
+            raise self.fail(f'expected a finite number, got {value!r}{hint}')
+        if result <= above:
+            raise self.fail(f'expected a number > {above:g}, got {result:g}')
+        if result < least:
+            raise self.fail(f'expected a number >= {least:g}, got {result:g}')
         return result
 
-    def name(self, value: object, entry: str) -> str:
+    def name(self) -> str:
         """Return a text that is not empty."""
-        if not isinstance(value, str) or not value.strip():
-            raise self.fail(entry, f'expected a name, got {value!r}')
-        return value
+        if not isinstance(self.value, str) or not self.value.strip():
+            raise self.fail(f'expected a name, got {self.value!r}')
+        return self.value
 
-    def unique(self, names: list[str], entry: str) -> tuple[str, ...]:
-        """Return names of which none is written twice."""
+    def unique(self, names: list[str]) -> tuple[str, ...]:
+        """Return the names in this entry, none of which may be there twice."""
         for name, count in Counter(names).items():
             if count > 1:
-                raise self.fail(entry, f'{name!r} is listed twice; names must be unique')
+                raise self.fail(f'{name!r} is listed twice; names must be unique')
         return tuple(names)
 
 
-def listed(names: tuple[str, ...] | list[str]) -> str:
+def listed(names: Iterable[str]) -> str:
     """Return names as they stand in a message."""
     return ', '.join(names)
 

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kinematics and gravity of the arm, by pinocchio, in the order of θ that muscles.yaml gives.
 
-Pinocchio reads the URDF and answers for single postures. Training asks for the link poses of many
-thousand postures at once; those are computed here with numpy over pinocchio's own joint placements
-and axes (a test holds the two together).
+Pinocchio reads the URDF and answers for single postures. Training and simulation ask for the poses
+of thousands at once; those are computed here with numpy (a test holds the two together). The pose
+of a joint in its parent is its fixed placement times, by Rodrigues,
+
+    exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
+
+or 1 + θ a for one that slides: a sum of constant matrices, the same operation for every joint.
 """
 
 from __future__ import annotations
@@ -20,12 +24,12 @@ PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismati
 
 
 class JointPoses(NamedTuple):
-    """World poses of pinocchio's joints for N postures; index 0 is the root link.
+    """Poses of pinocchio's joints in the root link's frame for N postures; index 0 is that link.
 
     Attributes:
         rotation: Shape (N, J, 3, 3).
         translation: Joint origins [m], shape (N, J, 3).
-        axis: Joint axes in the root link's frame, shape (N, J, 3); index 0 is unused.
+        axis: Joint axes, shape (N, J, 3); zero at index 0.
     """
 
     rotation: Array
@@ -55,56 +59,66 @@ class Kinematics:
         self.lower: Array = self.model.lowerPositionLimit[self.order].copy()
         self.upper: Array = self.model.upperPositionLimit[self.order].copy()
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
-        self._read_tree(ids)
-
-    def _read_tree(self, ids: list[int]) -> None:
-        joint_count = self.model.njoints
+        count = self.model.njoints
         self.parent = np.array(self.model.parents)
         self.placement_rotation = np.stack([m.rotation for m in self.model.jointPlacements])
         self.placement_translation = np.stack([m.translation for m in self.model.jointPlacements])
-        self.local_axis = np.zeros((joint_count, 3))
-        self.prismatic = np.zeros(joint_count, dtype=bool)
-        pin.computeJointJacobians(self.model, self.data, pin.neutral(self.model))
-        for i in range(1, joint_count):
-            local = pin.getJointJacobian(self.model, self.data, i, pin.ReferenceFrame.LOCAL)
-            # pinocchio returns one column as a plain vector
-            subspace = local.reshape(6, -1)[:, self.model.joints[i].idx_v]
-            self.prismatic[i] = self.model.joints[i].shortname() in PRISMATIC
-            self.local_axis[i] = subspace[:3] if self.prismatic[i] else subspace[3:]
+        self.prismatic = np.array([joint.shortname() in PRISMATIC for joint in self.model.joints])
+        self.local_axis = np.zeros((count, 3))
+        # Pose in the parent = placement + a(θ) · first + b(θ) · second.
+        self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])
+        self._first, self._second = np.zeros((2, count, 4, 4))
+        for i, turn in enumerate(self.placement_rotation[1:], 1):
+            joint = self.model.joints[i].createData()
+            self.model.joints[i].calc(joint, pin.neutral(self.model))
+            axis = np.ravel(joint.S).reshape(2, 3)[0 if self.prismatic[i] else 1]
+            self.local_axis[i], cross = axis, pin.skew(axis)
+            if self.prismatic[i]:
+                self._first[i, :3, 3] = turn @ axis
+            else:
+                self._first[i, :3, :3], self._second[i, :3, :3] = turn @ cross, turn @ cross @ cross
         #: position in θ of joint i of pinocchio's tree
-        self.theta_index = np.full(joint_count, -1)
+        self.theta_index = np.full(count, -1)
         self.theta_index[ids] = np.arange(len(ids))
         #: moved_by[i, k]: joint i of the tree hangs on joint k of θ
-        self.moved_by = np.zeros((joint_count, len(ids)), dtype=bool)
-        for i in range(1, joint_count):
+        self.moved_by = np.zeros((count, len(ids)), dtype=bool)
+        for i in range(1, count):
             self.moved_by[i] = self.moved_by[self.parent[i]]
             self.moved_by[i, self.theta_index[i]] = True
 
-    def link_attachment(self, link: str) -> tuple[int, Array, Array]:
-        """Return (joint of the tree, rotation, translation) that carries a link's frame."""
+    def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
+        """Return the joint of the tree that carries a link's point, and the point in its frame."""
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
-        return frame.parentJoint, frame.placement.rotation, frame.placement.translation
+        return frame.parentJoint, frame.placement.act(xyz)
+
+    def transforms(self, theta: Array) -> Array:
+        """Return the pose of every joint in the root link's frame.
+
+        Args:
+            theta: θ [rad], shape (N, D).
+
+        Returns:
+            Homogeneous transforms, shape (N, J, 4, 4); index 0 is the root link.
+        """
+        angle = theta[:, self.theta_index[1:], None, None]
+        first, second = np.sin(angle), 1.0 - np.cos(angle)
+        if self.prismatic.any():
+            slides = self.prismatic[1:, None, None]
+            first, second = np.where(slides, angle, first), np.where(slides, 0.0, second)
+        poses = np.empty((len(theta), *self._placement.shape))
+        poses[:, 0] = self._placement[0]
+        poses[:, 1:] = self._placement[1:] + first * self._first[1:] + second * self._second[1:]
+        for i in range(2, len(self.parent)):
+            if self.parent[i] > 0:
+                poses[:, i] = poses[:, self.parent[i]] @ poses[:, i]
+        return poses
 
     def joint_poses(self, theta: Array) -> JointPoses:
-        """Return the world poses of all joints for θ of shape (N, D)."""
-        count, joints = len(theta), len(self.parent)
-        rotation = np.zeros((count, joints, 3, 3))
-        translation = np.zeros((count, joints, 3))
-        axis = np.zeros((count, joints, 3))
-        rotation[:, 0] = np.eye(3)
-        for i in range(1, joints):
-            up = self.parent[i]
-            angle = theta[:, self.theta_index[i]]
-            local = rotation[:, up] @ self.placement_rotation[i]
-            offset = rotation[:, up] @ self.placement_translation[i]
-            axis[:, i] = local @ self.local_axis[i]
-            translation[:, i] = translation[:, up] + offset
-            if self.prismatic[i]:
-                rotation[:, i] = local
-                translation[:, i] += axis[:, i] * angle[:, None]
-            else:
-                rotation[:, i] = local @ _axis_rotation(self.local_axis[i], angle)
-        return JointPoses(rotation, translation, axis)
+        """Return the poses of all joints in parts, for θ of shape (N, D)."""
+        poses = self.transforms(theta)
+        rotation = poses[..., :3, :3]
+        axis = np.einsum('njab,jb->nja', rotation, self.local_axis)
+        return JointPoses(rotation, poses[..., :3, 3], axis)
 
     def _q(self, theta: Array) -> Array:
         q = np.empty(self.model.nq)
@@ -119,10 +133,14 @@ class Kinematics:
         torque: Array = gravity[self.order]
         return torque
 
+    def gravity_gradient(self, theta: Array) -> Array:
+        """Return ∂g/∂θ [N·m/rad], shape (D, D), at θ (D,)."""
+        gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, self._q(theta))
+        columns: Array = gradient[np.ix_(self.order, self.order)]
+        return columns
+
     def joint_inertia(self, theta: Array) -> Array:
-        """Return what each joint moves, the others held [kg·m² or kg]: (..., D) as θ."""
-        if theta.ndim > 1:
-            return np.stack([self.joint_inertia(row) for row in theta])
+        """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
         inertia: Array = np.diag(pin.crba(self.model, self.data, self._q(theta)))[self.order]
         return inertia
 
@@ -145,11 +163,3 @@ class Kinematics:
         """Return the pose of the end effector in the root link's frame."""
         pin.forwardKinematics(self.model, self.data, self._q(theta))
         return pin.updateFramePlacement(self.model, self.data, self.end_effector_frame).copy()
-
-
-def _axis_rotation(axis: Array, angle: Array) -> Array:
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    rotation: Array = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
-    return rotation

@@ -12,7 +12,6 @@ even where the arm could still hold itself.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,25 +20,15 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription
-from musculoskeletal_ae.robot.entries import refusal
+from musculoskeletal_ae.robot.entries import listed, refusal
 
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
 MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
-SIGNS = {'+': 1, '-': -1, '−': -1}
 
 
-class Action(NamedTuple):
-    """What a muscle is meant to do: turn joint `joint` in direction `sign` (indices, ±1)."""
-
-    muscle: int
-    joint: int
-    sign: int
-
-
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """Something about a robot that a person should know.
 
     Attributes:
@@ -53,46 +42,55 @@ class Finding:
     remedy: str
 
 
-def read_declared_actions(description: RobotDescription) -> tuple[Action, ...]:
-    """Read `moment_arms.csv` of a robot directory; none declared if there is no such file.
+def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
+    """Return (muscle, joint) → ±1 of `moment_arms.csv`; nothing if there is no such file.
 
     Raises:
         RobotDescriptionError: Naming the file, the line and the legal values.
     """
     file = description.directory / DECLARATION_FILE
+    legal = (description.muscles, description.joints, ('+', '-'))
+    actions: dict[tuple[int, int], int] = {}
     if not os.path.lexists(file):
-        return ()
-    legal = (description.muscles, description.joints, tuple(SIGNS)[:2])
-    actions: list[Action] = []
+        return actions
     for line, text, cells in read_csv(file, COLUMNS, refusal):
         where = f'{file}: line {line}'
         if len(cells) != len(COLUMNS):
             raise RobotDescriptionError(f'{where}: expected 3 values, got {text.strip()!r}')
-        cells[2] = '-' if cells[2] == '−' else cells[2]
-        for column, cell, names in zip(COLUMNS, cells, legal, strict=True):
+        row = [*cells[:2], cells[2].replace('−', '-')]
+        for column, cell, names in zip(COLUMNS, row, legal, strict=True):
             if cell not in names:
                 raise RobotDescriptionError(
-                    f'{where}: unknown {column} {cell!r}; legal: {", ".join(names)}'
+                    f'{where}: unknown {column} {cell!r}; legal: {listed(names)}'
                 )
-        muscle, joint = legal[0].index(cells[0]), legal[1].index(cells[1])
-        if any((a.muscle, a.joint) == (muscle, joint) for a in actions):
-            raise RobotDescriptionError(f'{where}: {cells[0]} at {cells[1]} is declared twice')
-        actions.append(Action(muscle, joint, SIGNS[cells[2]]))
-    return tuple(actions)
+        muscle, joint, sign = (names.index(cell) for cell, names in zip(row, legal, strict=True))
+        if (muscle, joint) in actions:
+            raise RobotDescriptionError(f'{where}: {row[0]} at {row[1]} is declared twice')
+        actions[muscle, joint] = 1 - 2 * sign
+    return actions
 
 
-def wrong_signs(
-    moment_arms: Array, actions: tuple[Action, ...], description: RobotDescription
-) -> list[Finding]:
-    """Return a fault for each declared action that too many postures contradict.
+def moment_arm_faults(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+    """Return what makes an arm unsound.
 
     Args:
-        moment_arms: r [m], shape (N, M, D).
-        actions: Declared actions.
-        description: Names.
+        description: Names, and the directory of the declared actions.
+        moment_arms: r in N postures [m], shape (N, M, D).
+
+    Raises:
+        RobotDescriptionError: If `moment_arms.csv` is not valid.
     """
+    return [
+        *_wrong_signs(description, moment_arms),
+        *_one_way_joints(description, moment_arms),
+        *_useless_muscles(description, moment_arms),
+    ]
+
+
+def _wrong_signs(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+    """Declared actions that too many postures contradict."""
     faults = []
-    for muscle, joint, sign in actions:
+    for (muscle, joint), sign in read_declared_actions(description).items():
         arm = moment_arms[:, muscle, joint]
         against = np.mean(arm * sign <= 0.0)
         if against <= TOLERATED_SHARE:
@@ -113,40 +111,23 @@ def wrong_signs(
     return faults
 
 
-def useless_muscles(moment_arms: Array, description: RobotDescription) -> list[Finding]:
-    """Return a fault for each muscle whose moment arms are short at every joint and posture."""
-    longest = np.abs(moment_arms).max(axis=(0, 2))
-    return [
-        Finding(
-            'useless_muscle',
-            f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
-            f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
-        )
-        for name, arm in zip(description.muscles, longest, strict=True)
-        if arm < MATTERS
-    ]
-
-
-def one_way_joints(moment_arms: Array, description: RobotDescription) -> list[Finding]:
-    """Return a fault for each joint that too often has muscles on one side only."""
-    lacks_positive = np.max(moment_arms, axis=1) <= MATTERS
-    lacks_negative = np.min(moment_arms, axis=1) >= -MATTERS
-    share = np.mean(lacks_positive | lacks_negative, axis=0)
+def _one_way_joints(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+    """Joints that too often have muscles on one side only."""
+    lacks = {
+        '+': np.max(moment_arms, axis=1) <= MATTERS,
+        '-': np.min(moment_arms, axis=1) >= -MATTERS,
+    }
+    median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
     faults = []
-    for joint in np.flatnonzero(share > TOLERATED_SHARE):
-        lacking = {
-            '+': float(np.mean(lacks_positive[:, joint])),
-            '-': float(np.mean(lacks_negative[:, joint])),
-        }
+    for joint in np.flatnonzero(np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE):
         missing = ' and '.join(
-            f'{sign} (in {100 * part:.0f} % of postures)'
-            for sign, part in lacking.items()
-            if part > 0.0
+            f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'
+            for sign, lacking in lacks.items()
+            if lacking[:, joint].any()
         )
-        median = np.median(moment_arms[:, :, joint], axis=0)
         acting = ', '.join(
-            f'{description.muscles[m]} ({1e3 * median[m]:+.0f} mm)'
-            for m in np.flatnonzero(np.abs(moment_arms[:, :, joint]).max(axis=0) > MATTERS)
+            f'{description.muscles[m]} ({1e3 * median[m, joint]:+.0f} mm)'
+            for m in np.flatnonzero(longest[:, joint] > MATTERS)
         )
         faults.append(
             Finding(
@@ -159,8 +140,22 @@ def one_way_joints(moment_arms: Array, description: RobotDescription) -> list[Fi
     return faults
 
 
-def flipping_muscles(moment_arms: Array, description: RobotDescription) -> list[Finding]:
-    """Return a warning for each muscle whose main action changes sign over the range."""
+def _useless_muscles(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+    """Muscles whose moment arms are short at every joint and posture."""
+    longest = np.abs(moment_arms).max(axis=(0, 2))
+    return [
+        Finding(
+            'useless_muscle',
+            f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
+            f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
+        )
+        for name, arm in zip(description.muscles, longest, strict=True)
+        if arm < MATTERS
+    ]
+
+
+def moment_arm_warnings(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+    """Return the muscles whose main action changes sign over the range; arguments as for faults."""
     median = np.median(moment_arms, axis=0)
     warnings = []
     for m, joint in enumerate(np.abs(median).argmax(axis=1)):

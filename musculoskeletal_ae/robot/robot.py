@@ -13,6 +13,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, load_description
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
+from musculoskeletal_ae.robot.stiffness import muscle_stiffness
 
 
 class Robot:
@@ -80,6 +81,11 @@ class Robot:
         relative = absolute - self.routes.length_at_zero
         lengths: Array = relative - self.series_elastic.elongation(absolute, tension)
         return lengths
+
+    def muscle_stiffness(self, theta: Array, tension: Array) -> Array:
+        """Return k(θ, T) [N/m] of MSC and the elastic unit in series, θ (..., D), T (..., M)."""
+        absolute = self.routes.absolute_lengths(theta)
+        return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
 
     def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
         """Return θ uniform in the joint limits [rad], shape (count, D).

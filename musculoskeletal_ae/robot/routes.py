@@ -11,7 +11,7 @@ the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,7 +23,16 @@ CHUNK = 4096
 
 
 class Routes:
-    """The routes of M muscles over D joints as functions of θ."""
+    """The routes of M muscles over D joints as functions of θ.
+
+    Attributes:
+        joint: Joint of the tree that carries each point, shape (P,).
+        point: In that joint's frame [m], shape (P, 3).
+        first: Point where each straight segment starts, shape (S,).
+        second: Point where it ends, shape (S,).
+        muscle: Muscle it belongs to, shape (S,).
+        length_at_zero: f_geo,abs(0) [m], shape (M,).
+    """
 
     def __init__(
         self, kinematics: Kinematics, routes: Sequence[Sequence[tuple[str, Array]]]
@@ -35,49 +44,22 @@ class Routes:
             routes: For each muscle its points as (link, xyz in the link's frame [m]).
         """
         self._kinematics = kinematics
-        joint: list[int] = []
-        point: list[Array] = []
-        first: list[int] = []
-        second: list[int] = []
-        muscle: list[int] = []
-        for m, route in enumerate(routes):
-            for i, (link, xyz) in enumerate(route):
-                tree_joint, rotation, translation = kinematics.link_attachment(link)
-                if i > 0:
-                    first.append(len(point) - 1)
-                    second.append(len(point))
-                    muscle.append(m)
-                joint.append(tree_joint)
-                point.append(rotation @ xyz + translation)
-        self.joint = np.array(joint)
-        self.point: Array = np.array(point, dtype=float)
-        self.first, self.second = np.array(first), np.array(second)
-        self.muscle = np.array(muscle)
-        self._sum = np.zeros((len(routes), len(first)))
-        self._sum[self.muscle, np.arange(len(first))] = 1.0
+        attached = [kinematics.attach(link, xyz) for route in routes for link, xyz in route]
+        self.joint = np.array([joint for joint, _ in attached])
+        self.point: Array = np.array([point for _, point in attached], dtype=float)
+        owner = np.repeat(np.arange(len(routes)), [len(route) for route in routes])
+        self.first = np.flatnonzero(owner[:-1] == owner[1:])
+        self.second, self.muscle = self.first + 1, owner[self.first]
+        self._sum: Array = 1.0 * (np.arange(len(routes))[:, None] == self.muscle)
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
 
     def points(self, theta: Array) -> Array:
         """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
         return self._points(self._kinematics.joint_poses(theta))
 
-    def _points(self, poses: JointPoses) -> Array:
-        rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
-        points: Array = np.einsum('npij,pj->npi', rotation, self.point) + translation
-        return points
-
     def absolute_lengths(self, theta: Array) -> Array:
         """Return f_geo,abs(θ) [m]: θ (..., D) gives (..., M)."""
-        if theta.ndim != 2:
-            rows = self.absolute_lengths(theta.reshape(-1, theta.shape[-1]))
-            return rows.reshape(*theta.shape[:-1], len(self._sum))
-        if len(theta) > CHUNK:
-            parts = range(0, len(theta), CHUNK)
-            return np.concatenate([self.absolute_lengths(theta[i : i + CHUNK]) for i in parts])
-        points = self.points(theta)
-        segment = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
-        lengths: Array = segment @ self._sum.T
-        return lengths
+        return _in_chunks(self._absolute_lengths, theta)
 
     def relative_lengths(self, theta: Array) -> Array:
         """Return f_geo(θ) [m], zero at θ = 0: θ (..., D) gives (..., M)."""
@@ -85,12 +67,20 @@ class Routes:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return G(θ) [m/rad]: θ (..., D) gives (..., M, D)."""
-        if theta.ndim != 2:
-            rows = self.muscle_jacobian(theta.reshape(-1, theta.shape[-1]))
-            return rows.reshape(*theta.shape[:-1], *rows.shape[1:])
-        if len(theta) > CHUNK:
-            parts = range(0, len(theta), CHUNK)
-            return np.concatenate([self.muscle_jacobian(theta[i : i + CHUNK]) for i in parts])
+        return _in_chunks(self._muscle_jacobian, theta)
+
+    def _points(self, poses: JointPoses) -> Array:
+        rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
+        points: Array = np.einsum('npij,pj->npi', rotation, self.point) + translation
+        return points
+
+    def _absolute_lengths(self, theta: Array) -> Array:
+        points = self.points(theta)
+        segment = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
+        lengths: Array = segment @ self._sum.T
+        return lengths
+
+    def _muscle_jacobian(self, theta: Array) -> Array:
         kin = self._kinematics
         poses = kin.joint_poses(theta)
         points = self._points(poses)
@@ -107,11 +97,10 @@ class Routes:
             jacobian[:, :, k] = np.einsum('nsi,nsi->ns', direction, rate) @ self._sum.T
         return jacobian
 
-    def muscle_hessian(self, theta: Array, step: float = 1e-5) -> Array:
-        """Return ∂²l/∂θ² [m/rad²], θ (D,) gives (M, D, D), by central differences of G."""
-        offsets = step * np.eye(len(theta))
-        forward = self.muscle_jacobian(theta + offsets)
-        backward = self.muscle_jacobian(theta - offsets)
-        raw = (forward - backward).transpose(1, 2, 0) / (2.0 * step)
-        hessian: Array = 0.5 * (raw + raw.transpose(0, 2, 1))
-        return hessian
+
+def _in_chunks(function: Callable[[Array], Array], theta: Array) -> Array:
+    """Return a function of θ (N, D) for θ of any leading shape, evaluated CHUNK rows at a time."""
+    rows = theta.reshape(-1, theta.shape[-1])
+    parts = [function(rows[i : i + CHUNK]) for i in range(0, max(len(rows), 1), CHUNK)]
+    values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return values.reshape(*theta.shape[:-1], *values.shape[1:])

@@ -16,9 +16,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-DEFAULT_FORCE = 100.0  # [N]
-DEFAULT_RATE = 30.0  # [1/m]
-DEFAULT_WIRE_STRETCH = 2.0e-5  # [1/N], metres of stretch per metre of wire and newton
+#: [N]; [1/m]; [1/N], metres of stretch per metre of wire and newton
+DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}
 
 
 @dataclass(frozen=True)
@@ -56,36 +55,3 @@ class SeriesElastic:
         """Return ∂L_e/∂l_abs [m/m], shape (..., M)."""
         slope: Array = self.wire_stretch * np.maximum(tension, 0.0)
         return slope
-
-
-def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
-    """Fit L_e to a one-muscle testbed table by least squares.
-
-    Args:
-        tension: Tensions of the table [N], shape (N,).
-        absolute_length: Muscle lengths of the table [m], shape (N,).
-        elongation: Measured elongations [m], shape (N,).
-
-    Returns:
-        Constants of one muscle (arrays of shape (1,)).
-
-    Raises:
-        ValueError: If there are fewer than four rows, or they do not pin down three constants.
-    """
-    from scipy.optimize import least_squares  # a tool's need; the nodes do without scipy
-
-    table = np.column_stack([tension, absolute_length, elongation])
-    if len(table) < 4 or not np.isfinite(table).all():
-        raise ValueError(f'a testbed table needs at least 4 finite rows, got {len(table)} rows')
-    if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
-        raise ValueError('a testbed table needs several tensions at several muscle lengths')
-
-    def model(log_constants: Array) -> SeriesElastic:
-        force, rate, stretch = np.exp(log_constants)[:, None]
-        return SeriesElastic(force, rate, stretch)
-
-    def residual(log_constants: Array) -> Array:
-        return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
-
-    start = np.log([DEFAULT_FORCE, DEFAULT_RATE, DEFAULT_WIRE_STRETCH])
-    return model(least_squares(residual, start, x_scale='jac').x)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle tensions that produce a joint torque, by quadratic programming.
 
-    hard:   min ‖T − T_wish‖²            subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
+    hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
 
-(Kawamura 2016). T_wish = 0 is the least tension that holds τ, also the QP bound of the control
-experiment; T_wish = 60 N the well-tensed arm by which `check_robot` judges.
+(Kawamura 2016). T_desired = 0 gives the least tension that holds τ, also the QP bound of the
+control experiment; T_desired = 60 N the well-tensed arm by which `check_robot` judges.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ import quadprog
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 
+# [N] left between the limits of a muscle that is held at one value (hot, ruptured): without any,
+# quadprog takes its own rounding for infeasibility.
+ROOM = 1e-8
 SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of some hundred N
 
 
@@ -33,51 +36,81 @@ class Exertion(NamedTuple):
     missing_torque: Array
 
 
+class TensionProgramme:
+    """Quadratic programmes over the tensions that produce a torque within their limits."""
+
+    def __init__(
+        self, muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
+    ) -> None:
+        """State the constraints.
+
+        Args:
+            muscle_jacobian: G [m/rad], shape (M, D).
+            torque: τ [N·m], shape (D,).
+            low: Least tension [N], scalar or shape (M,).
+            high: Highest tension [N], scalar or shape (M,).
+
+        Raises:
+            InfeasibleError: If an entry is not finite; quadprog would answer with zeros, as if all
+                were well.
+        """
+        self._jacobian, self._torque = muscle_jacobian, torque
+        count = len(muscle_jacobian)
+        eye = np.eye(count)
+        self._constraints = np.hstack([-muscle_jacobian, eye, -eye])
+        low = np.broadcast_to(low, count)
+        self._bounds = np.concatenate([torque, low, -np.maximum(high, low + ROOM)])
+        _require_finite(self._constraints, self._bounds)
+
+    def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
+        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,), over the limits alone if not `hard`.
+
+        Raises:
+            InfeasibleError: If no tension within the limits produces the torque, or an entry is
+                not finite.
+        """
+        _require_finite(quadratic, linear)
+        equalities = len(self._torque) if hard else 0
+        first = len(self._torque) - equalities
+        constraints, bounds = self._constraints[:, first:], self._bounds[first:]
+        try:
+            solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)
+        except ValueError as error:
+            raise InfeasibleError(
+                f'no tension within its limits produces the torque {np.round(self._torque, 2)} N·m'
+            ) from error
+        tension: Array = solution[0]
+        return tension
+
+    def nearest(self, desired: Array | float) -> Array:
+        """Return the tensions nearest to desired ones; errors as for `minimum`."""
+        count = len(self._jacobian)
+        return self.minimum(np.eye(count), np.array(np.broadcast_to(desired, count), dtype=float))
+
+    def compromise(self) -> Exertion:
+        """Return the soft form: what comes nearest to the torque, and of that the least."""
+        jacobian = self._jacobian
+        quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * np.eye(len(jacobian))
+        tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
+        return Exertion(tension, self._torque + jacobian.T @ tension)
+
+
 def holding_tension(
     muscle_jacobian: Array,
     torque: Array,
     low: Array | float,
     high: Array | float,
-    wish: Array | float,
+    desired: Array | float,
 ) -> Array:
-    """Return the tensions nearest to a wished one that produce a joint torque.
+    """Return the tensions nearest to desired ones [N] that produce a joint torque, shape (M,).
 
-    Args:
-        muscle_jacobian: G [m/rad], shape (M, D).
-        torque: τ [N·m], shape (D,).
-        low: Least tension [N], scalar or shape (M,).
-        high: Highest tension [N], scalar or shape (M,).
-        wish: Tension each muscle would like to have [N], scalar or shape (M,).
-
-    Returns:
-        T [N], shape (M,).
+    Arguments as for `TensionProgramme`.
 
     Raises:
-        InfeasibleError: If no tension within the limits produces the torque, or an entry of G or τ
-            is not finite.
+        InfeasibleError: If no tension within the limits produces the torque, or an entry is not
+            finite.
     """
-    muscles, joints = muscle_jacobian.shape
-    constraints, bounds = _limits(muscles, low, high)
-    return _solve(
-        np.eye(muscles),
-        np.array(np.broadcast_to(wish, muscles), dtype=float),
-        np.hstack([-muscle_jacobian, constraints]),
-        np.concatenate([torque, bounds]),
-        joints,
-    )
-
-
-def nearest_tension(
-    muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
-) -> Array:
-    """Return the tensions within their limits that come nearest to a joint torque (soft form).
-
-    The small weight ε picks the least of equally near tensions. Arguments, result and errors as
-    for `holding_tension`.
-    """
-    muscles = len(muscle_jacobian)
-    quadratic = muscle_jacobian @ muscle_jacobian.T + SOFT_WEIGHT * np.eye(muscles)
-    return _solve(quadratic, -muscle_jacobian @ torque, *_limits(muscles, low, high), 0)
+    return TensionProgramme(muscle_jacobian, torque, low, high).nearest(desired)
 
 
 def least_tension(
@@ -86,37 +119,18 @@ def least_tension(
     """Return the least tensions that produce a joint torque, or else come nearest to it.
 
     Hard where it can be, soft where the limits do not allow it. Arguments as for
-    `holding_tension`.
+    `TensionProgramme`.
 
     Raises:
-        InfeasibleError: If an entry of G or τ is not finite.
+        InfeasibleError: If an entry is not finite.
     """
+    programme = TensionProgramme(muscle_jacobian, torque, low, high)
     try:
-        tension = holding_tension(muscle_jacobian, torque, low, high, 0.0)
+        return Exertion(programme.nearest(0.0), np.zeros(len(torque)))
     except InfeasibleError:
-        tension = nearest_tension(muscle_jacobian, torque, low, high)
-        return Exertion(tension, torque + muscle_jacobian.T @ tension)
-    return Exertion(tension, np.zeros(len(torque)))
+        return programme.compromise()
 
 
-def _limits(muscles: int, low: Array | float, high: Array | float) -> tuple[Array, Array]:
-    eye = np.eye(muscles)
-    bounds = np.concatenate([np.broadcast_to(low, muscles), -np.broadcast_to(high, muscles)])
-    return np.hstack([eye, -eye]), bounds
-
-
-def _solve(
-    quadratic: Array, linear: Array, constraints: Array, bounds: Array, equalities: int
-) -> Array:
-    # quadprog answers a NaN with zeros, as if all were well.
-    if not all(np.isfinite(part).all() for part in (linear, constraints, bounds)):
-        raise InfeasibleError('a muscle Jacobian or torque is not finite')
-    try:
-        solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)
-    except ValueError as error:
-        raise InfeasibleError(
-            'no tension within its limits produces the torque '
-            f'{np.round(bounds[:equalities], 2)} N·m'
-        ) from error
-    tension: Array = solution[0]
-    return tension
+def _require_finite(*parts: Array) -> None:
+    if not all(np.isfinite(part).all() for part in parts):
+        raise InfeasibleError('a muscle Jacobian, torque or limit is not finite')

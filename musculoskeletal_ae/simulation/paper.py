@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.length import msc_compensation
+from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact_mae import ExactMae, rest_readings
@@ -13,24 +15,24 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import METHODS, Settings
-from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
 DT = 0.01
 REST = np.array([-0.3, -1.0])
 OTHER = np.array([0.1, -0.5])
+COLD = np.full(ROBOT.muscle_count, 30.0)
 
 
 class Bench:
     """A controller that is fed healthy sensor data unless told otherwise."""
 
     def __init__(self, mae=None, **chosen):
-        self.settings = Settings(**chosen)
-        self.core = Controller(ROBOT, self.settings)
+        self.core = Controller(ROBOT, Settings(**chosen))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)
-        self.now, self.theta, self.tension = 100.0, REST, None
+        self.now, self.theta, self.tension, self.temperature = 100.0, REST, None, COLD
         self.blind = set()
 
     def step(self, count=1):
@@ -39,13 +41,15 @@ class Bench:
         for _ in range(count):
             self.now += DT
             if 'muscles' not in self.blind:
-                self.core.muscles(
-                    Muscles(*rest_readings(ROBOT, self.theta, self.tension)), self.now
-                )
+                length, tension = rest_readings(ROBOT, self.theta, self.tension)
+                self.core.muscles(Muscles(length, tension, self.temperature), self.now)
             if 'estimate' not in self.blind:
                 self.core.estimated(self.theta, self.now)
             sent.append(self.core.step(self.now))
         return sent
+
+    def configure(self, **chosen):
+        self.core.configure(replace(self.core.settings, **chosen))
 
     def target(self, theta, effort=(0.0, 0.0)):
         self.core.target(dict(zip(ROBOT.joints, zip(theta, effort))))
@@ -68,7 +72,7 @@ EVENTS = {
     'swap': lambda bench: bench.core.use(shifted()),
     'moved': lambda bench: setattr(bench, 'theta', REST + 0.1),
     **{
-        name: lambda bench, name=name: setattr(bench.settings, 'method', name)
+        name: lambda bench, name=name: bench.configure(method=name)
         for name in METHODS
         if name != 'tension'
     },
@@ -93,7 +97,7 @@ def test_whatever_happens_lengths_are_finite_and_never_faster_than_the_rate_limi
     lengths = values(sent)
     assert np.isfinite(lengths).all()
     if len(lengths) > 1:
-        assert np.abs(np.diff(lengths, axis=0)).max() <= bench.settings.rate_limit * DT + 1e-9
+        assert np.abs(np.diff(lengths, axis=0)).max() <= bench.core.settings.rate_limit * DT + 1e-9
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -142,12 +146,12 @@ def test_going_over_to_tensions_and_back_changes_no_pull_by_a_step():
     bench.tension = np.linspace(40.0, 80.0, ROBOT.muscle_count)
     bench.target(REST)
     bench.step(200)
-    bench.settings.method = 'tension'
+    bench.configure(method='tension')
     first = bench.step()[0]
     assert first.kind == TENSION
-    most = ROBOT.stiffness * bench.settings.rate_limit * DT
+    most = ROBOT.stiffness * bench.core.settings.rate_limit * DT
     assert np.abs(first.value - bench.tension).max() <= most + 1e-9
-    bench.settings.method = 'proposed'
+    bench.configure(method='proposed')
     first = bench.step()[0]
     pull = 30.0 + ROBOT.stiffness * (ROBOT.muscle_lengths(REST, bench.tension) - first.value)
     np.testing.assert_allclose(pull, bench.tension, atol=most)
@@ -159,7 +163,7 @@ def test_effort_is_exerted_by_proposed_and_said_to_be_ignored_where_it_is():
     plain = bench.step(200)[-1].value
     bench.target(REST, (1.0, 0.0))
     assert np.abs(bench.step(200)[-1].value - plain).max() > 1e-4
-    bench.settings.method = 'first'
+    bench.configure(method='first')
     bench.step()
     assert 'exerts no effort' in bench.report().message
 
@@ -289,7 +293,8 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
     core = Controller(robot, Settings(first_duration=1.0))
     core.use(ExactMae(robot))
     core.target(dict(zip(robot.joints, ((v, 0.0) for v in theta))))
-    length, tension, temperature = rest_readings(robot, theta)
+    length, tension = rest_readings(robot, theta)
+    temperature = np.full(robot.muscle_count, 30.0)
     planned = []
     for step in range(1200):
         if step == 300:
@@ -324,7 +329,7 @@ def test_a_new_network_keeps_the_correction_so_that_the_arm_does_not_sway():
     bench = Bench(first_duration=0.5)
     bench.target(OTHER)
     before = bench.step(1500)[-1].value
-    bench.settings.feedback_gain = 0.0
+    bench.configure(feedback_gain=0.0)
     bench.core.use(ExactMae(ROBOT))
     np.testing.assert_allclose(values(bench.step(300)), before[None].repeat(300, 0), atol=1e-9)
 
@@ -337,3 +342,34 @@ def test_a_push_is_not_worked_against_where_stiffness_or_the_paper_rules(chosen)
     bench.theta = REST + 0.1
     bench.core.estimated(bench.theta, bench.now)
     np.testing.assert_allclose(bench.step(300)[-1].value, still, atol=1e-9)
+
+
+def test_another_desired_stiffness_is_ramped_to_and_one_that_fits_no_joint_is_refused():
+    bench = Bench(method='stiffness', first_duration=0.5)
+    bench.target(REST)
+    before = bench.step(100)[-1].value
+    free = bench.core.posture.stiffness
+    stiffer = 0.25 * free.lowest + 0.75 * free.highest
+    with pytest.raises(MusculoskeletalError, match='2 numbers'):
+        bench.configure(joint_stiffness=(1.0, 2.0, 3.0))
+    np.testing.assert_array_equal(bench.step(50)[-1].value, before)
+    bench.configure(joint_stiffness=(float(stiffer[0]), 0.0))
+    after = values(bench.step(100))
+    assert np.abs(np.diff(after, axis=0)).max() <= bench.core.settings.rate_limit * DT + 1e-9
+    assert np.abs(after[-1] - before).max() > 1e-4
+    assert bench.core.posture.stiffness.stiffness[0, 0] == pytest.approx(stiffer[0], rel=0.01)
+    bench.configure(joint_stiffness=(1e4, 0.0))
+    bench.step(100)
+    assert 'clamped' in bench.report().values[f'joint stiffness {ROBOT.joints[0]}']
+
+
+def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm():
+    for method in METHODS:
+        bench = Bench(method=method, first_duration=0.5)
+        bench.target(REST)
+        bench.step(60)
+        bench.temperature = np.linspace(60.0, 100.0, ROBOT.muscle_count)
+        bench.target(OTHER)
+        bench.step(100)
+        assert bench.core.safety.cause == ''
+        assert bench.core.limit.min() == ROBOT.tension.bias

@@ -30,9 +30,11 @@ def jacobian(robot):
     return robot.routes.muscle_jacobian(0.5 * (robot.lower + robot.upper))
 
 
-def holding(robot, wish=0.0):
+def holding(robot, desired=0.0):
     torque = robot.kinematics.holding_torque(0.5 * (robot.lower + robot.upper))
-    return holding_tension(jacobian(robot), torque, robot.tension.bias, robot.tension.limit, wish)
+    return holding_tension(
+        jacobian(robot), torque, robot.tension.bias, robot.tension.limit, desired
+    )
 
 
 def step(feedback, robot, error, tension, gain=GAIN):
@@ -58,7 +60,7 @@ def test_least_tension_is_left_alone(robot):
 
 def test_relief_pays_out_what_pulls_against_each_other_and_exerts_no_torque(robot):
     feedback = rested(robot)
-    needless = holding(robot, wish=90.0)
+    needless = holding(robot, desired=90.0)
     before = feedback.relief
     step(feedback, robot, np.zeros(robot.joint_count), needless)
     change = feedback.relief - before
@@ -72,7 +74,7 @@ def test_both_are_bounded(robot):
     feedback = rested(robot)
     error = np.full(robot.joint_count, 1.0)
     for _ in range(3000):
-        step(feedback, robot, error, holding(robot, wish=150.0))
+        step(feedback, robot, error, holding(robot, desired=150.0))
     assert np.abs(feedback.correction).max() == pytest.approx(CORRECTION)
     assert np.abs(feedback.relief).max() == pytest.approx(RELIEF)
     feedback.reset()

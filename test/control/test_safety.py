@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What leaves is never faster, stronger or less finite than allowed, whatever control wishes."""
+"""What leaves is never faster, stronger or less finite than allowed, whatever control commands."""
 
 from __future__ import annotations
 
@@ -33,6 +33,12 @@ def muscles(length=0.0, tension=BIAS):
     return Muscles(np.full(COUNT, length), np.full(COUNT, tension), COLD)
 
 
+def step(guard, desired, now=None, limit=LIMIT, fresh=True):
+    """Step a guard that has just been told how the muscles are."""
+    guard.muscles(now or muscles())
+    return guard.step(desired, limit, DT, fresh)
+
+
 def vectors(low, high):
     return st.lists(st.floats(low, high), min_size=COUNT, max_size=COUNT).map(np.array)
 
@@ -42,14 +48,14 @@ def vectors(low, high):
     st.floats(0.001, 1.0),
 )
 def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_the_limit(
-    wishes, rate
+    commands, rate
 ):
     guard, before = SafetyFilter(ROBOT, Settings(rate_limit=rate)), None
-    for wish, length, limit in wishes:
+    for desired, length, limit in commands:
         # What two readings of three say is believed.
         for _ in range(2):
             now = Muscles(length.copy(), np.full(COUNT, BIAS), COLD)
-            sent = guard.step(Command(LENGTH, wish), now, limit, DT).value
+            sent = step(guard, Command(LENGTH, desired), now, limit).value
             if before is None:
                 before = unchanging(ROBOT, LENGTH, now).value
             assert (sent - before >= -rate * DT - 1e-12).all()
@@ -64,10 +70,10 @@ def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_t
 def test_one_wrong_reading_lets_no_muscle_go(glitch):
     settings = Settings()
     guard = SafetyFilter(ROBOT, settings)
-    wish = Command(LENGTH, np.full(COUNT, -0.01))
-    before = [guard.step(wish, muscles(), LIMIT, DT).value for _ in range(30)][-1]
+    desired = Command(LENGTH, np.full(COUNT, -0.01))
+    before = [step(guard, desired).value for _ in range(30)][-1]
     for length in (0.0, glitch, 0.0, 0.0):
-        sent = guard.step(wish, muscles(length), LIMIT, DT).value
+        sent = step(guard, desired, muscles(length)).value
         assert np.abs(sent - before).max() <= settings.rate_limit * DT + 1e-12
         before = sent
 
@@ -75,17 +81,17 @@ def test_one_wrong_reading_lets_no_muscle_go(glitch):
 def test_a_sensor_that_stays_wrong_pays_out_to_the_longest_the_muscle_can_be_at_most():
     guard = SafetyFilter(ROBOT, Settings())
     for _ in range(10):
-        sent = guard.step(unchanging(ROBOT, LENGTH, muscles()), muscles(5.0), LIMIT, DT).value
+        sent = step(guard, unchanging(ROBOT, LENGTH, muscles()), muscles(5.0)).value
     theta = ROBOT.random_postures(2000, np.random.default_rng(3))
     assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
 
 
 @given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))
-def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(wishes):
+def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(commands):
     settings = Settings()
     guard, before = SafetyFilter(ROBOT, settings), np.full(COUNT, BIAS)
-    for wish, limit in wishes:
-        sent = guard.step(Command(TENSION, wish), muscles(), limit, DT).value
+    for desired, limit in commands:
+        sent = step(guard, Command(TENSION, desired), limit=limit).value
         assert (sent >= BIAS).all()
         assert (sent <= limit).all()
         assert (sent - before <= ROBOT.stiffness * settings.rate_limit * DT + 1e-9).all()
@@ -96,10 +102,10 @@ def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths
 @pytest.mark.parametrize('kind', [LENGTH, TENSION])
 def test_a_command_that_is_not_finite_stops_the_arm_and_the_last_one_stays(kind, value):
     guard = SafetyFilter(ROBOT, Settings())
-    good = guard.step(unchanging(ROBOT, kind, muscles()), muscles(), LIMIT, DT)
+    good = step(guard, unchanging(ROBOT, kind, muscles()))
     bad = good.value.copy()
     bad[2] = value
-    sent = guard.step(Command(kind, bad), muscles(), LIMIT, DT)
+    sent = step(guard, Command(kind, bad))
     assert np.isfinite(sent.value).all()
     if np.isnan(value):
         assert 'not finite' in guard.cause
@@ -113,7 +119,7 @@ def test_a_stop_holds_then_pays_out_to_the_measured_length_and_keeps_commanding(
     guard.stop('first')
     guard.stop('second')
     assert guard.cause == 'first'
-    sent = [guard.step(None, muscles(), LIMIT, DT).value[0] for _ in range(60)]
+    sent = [step(guard, None).value[0] for _ in range(60)]
     assert sent[8] == -0.012
     assert np.diff(sent).max() <= 0.001 + 1e-12
     assert np.diff(sent).min() >= 0.0
@@ -125,7 +131,7 @@ def test_without_fresh_lengths_a_stop_pays_out_to_the_longest_the_muscle_can_be(
     guard.command = Command(LENGTH, np.full(COUNT, -0.05))
     guard.stop('muscle_states are old')
     for _ in range(1000):
-        sent = guard.step(None, muscles(-0.05), LIMIT, DT, fresh=False).value
+        sent = step(guard, None, muscles(-0.05), fresh=False).value
     theta = ROBOT.random_postures(500, np.random.default_rng(3))
     assert (sent > ROBOT.routes.relative_lengths(theta).max(axis=0) - 0.01).all()
 
@@ -134,7 +140,7 @@ def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
     guard = SafetyFilter(ROBOT, Settings(hold_time=0.1))
     guard.command = Command(TENSION, np.full(COUNT, 120.0))
     guard.stop('asked')
-    sent = [guard.step(None, muscles(), LIMIT, DT).value[0] for _ in range(60)]
+    sent = [step(guard, None).value[0] for _ in range(60)]
     assert sent[8] == 120.0
     assert -np.diff(sent).min() <= ROBOT.stiffness * 0.1 * DT + 1e-9
     assert sent[-1] == BIAS

@@ -14,12 +14,18 @@ from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.training import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.robot.robot import Robot
 
 
 @pytest.fixture(scope='session')
-def initial(arm26_mae):
+def arm26() -> Robot:
+    return Robot.load('arm26')
+
+
+@pytest.fixture(scope='session')
+def initial(trained):
     """Return a network of the geometric model, trained for a moment."""
-    return arm26_mae
+    return trained['default']
 
 
 def drawn_body(robot, features: int, seed: int, scale: float) -> CorrectedBody:

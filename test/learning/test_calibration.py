@@ -16,7 +16,7 @@ from musculoskeletal_ae.learning.calibration import (
     calibrate,
     distances,
 )
-from musculoskeletal_ae.mae.evaluation import residuals
+from musculoskeletal_ae.mae.residuals import residuals
 
 from .conftest import Stage, job
 
@@ -67,7 +67,7 @@ def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(lea
     mae = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
 
     def distance(tension, length):
-        return distances(mae.anomaly, residuals(mae, tension, length))
+        return distances(mae.anomaly, residuals(mae.estimate(tension, length), tension, length))
 
     _, tension, length = stage.states(2000)
     threshold = mae.anomaly.thresholds[DISTANCE]

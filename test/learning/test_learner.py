@@ -9,7 +9,7 @@ import pytest
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.training import Training, Update
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 
 DT = 0.01
 

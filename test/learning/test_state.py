@@ -265,11 +265,11 @@ def test_samples_that_came_while_the_disk_was_full_are_written_when_it_is_not(be
     with full_disk():
         accept(learner, stage, 4)
         learner.poll(0.0)
-        assert 'cannot be saved' in learner.trouble
+        assert 'cannot be saved' in learner.report().message
         with pytest.raises(StateError):
             learner.save()
     learner.poll(0.1)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     accept(learner, stage, 2)
     same(begun().samples, learner.samples)
 
@@ -280,9 +280,9 @@ def test_a_network_that_could_not_be_saved_is_saved_later(begun, stage):
     with full_disk():
         while not learner.updates:
             learner.poll(0.0)
-        assert 'cannot be saved' in learner.trouble
+        assert 'cannot be saved' in learner.report().message
     learner.poll(0.1)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     assert begun().mae.version == learner.mae.version
 
 
@@ -295,9 +295,9 @@ def test_a_learner_that_starts_with_a_full_disk_goes_on_with_what_it_has(begun, 
         same(learner.samples, before.samples)
         assert learner.mae.version == before.mae.version
         accept(learner, stage, 1)
-        assert learner.trouble
+        assert learner.report().level == 'error'
     learner.poll(0.0)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     same(begun().samples, learner.samples)
 
 
@@ -308,12 +308,12 @@ def test_a_directory_that_is_deleted_is_noticed_at_once_and_made_again(begun, st
     learner._state._next_look = 0.0
     states.PAUSE = 3600.0
     learner.poll(0.0)
-    assert learner.trouble
+    assert learner.report().level == 'error'
     accept(learner, stage, 1)
-    assert learner.trouble  # long enough to be seen
+    assert learner.report().level == 'error'  # long enough to be seen
     states.PAUSE = learner._state._next_look = 0.0
     learner.poll(0.1)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     accept(learner, stage, 1)
     same(begun().samples, learner.samples)
     assert len(learner.samples) == 5
@@ -325,10 +325,10 @@ def test_a_directory_that_becomes_read_only_is_noticed_at_once(begun, stage, mon
     with monkeypatch.context() as patch:  # root may write whatever the mode says
         patch.setattr(os, 'access', lambda *_: False)
         learner.poll(0.0)
-        assert 'read-only' in learner.trouble
+        assert 'read-only' in learner.report().message
         accept(learner, stage, 1)
     learner.poll(0.1)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     same(begun().samples, learner.samples)
 
 
@@ -337,9 +337,9 @@ def test_a_muscle_that_was_relearned_with_a_full_disk_is_on_disk_when_that_is_no
     accept(learner, stage, 3)
     with full_disk():
         learner.relearn([2])
-        assert learner.trouble
+        assert learner.report().level == 'error'
     learner.poll(0.0)
-    assert learner.trouble == ''
+    assert learner.report().level == 'ok'
     assert not any(known[2] for known in begun().samples.known)
 
 

@@ -152,11 +152,11 @@ NODE = """
 
 
 @pytest.fixture
-def node(arm26_checkpoint, tmp_path):
+def node(trained_file, tmp_path):
     file = tmp_path / 'node.py'
     file.write_text(textwrap.dedent(NODE))
     node = subprocess.Popen(
-        [sys.executable, str(file), arm26_checkpoint],
+        [sys.executable, str(file), trained_file],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -9,13 +9,19 @@ import os
 import pytest
 from graph import Graph
 
+from musculoskeletal_ae.robot.robot import Robot
+
 _counter = itertools.count(1)
 
 
 @pytest.fixture(scope='session')
-def trained(arm26_checkpoint) -> str:
-    """Return a checkpoint file of arm26, trained for a few seconds."""
-    return arm26_checkpoint
+def arm26() -> Robot:
+    return Robot.load('arm26')
+
+
+@pytest.fixture(scope='session')
+def trained(trained_file) -> str:
+    return trained_file
 
 
 @pytest.fixture

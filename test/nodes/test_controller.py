@@ -14,10 +14,10 @@ from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
 from musculoskeletal_ae.control.stiffness import stiffness_command
-from musculoskeletal_ae.control.stiffness_model import push_deflection
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.robot.stiffness import push_deflection
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
@@ -94,7 +94,7 @@ def test_a_push_measures_the_stiffness_that_was_wished_within_the_reported_range
         turned.append(ends[0] - ends[1])
         weight = robot.kinematics.holding_torque(theta)
         found = stiffness_command(robot, mae, theta, weight, wish, robot.tension.limit)
-        expected.append(push_deflection(robot, theta, found.stiffness, wrench)[0])
+        expected.append(push_deflection(robot.kinematics, theta, found.stiffness, wrench)[0])
     assert turned[0] / turned[1] == pytest.approx(expected[0] / expected[1], rel=0.2)
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e4, 0.0])[0]
     arm.says('clamped')

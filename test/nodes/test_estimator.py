@@ -14,7 +14,7 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.nodes.messages import array_message, bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 

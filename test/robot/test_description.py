@@ -6,7 +6,8 @@ import pytest
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.robot.description import load_description, shipped_robots
+from musculoskeletal_ae.robot.description import load_description
+from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
 

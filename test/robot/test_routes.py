@@ -38,23 +38,6 @@ def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angle
     )
 
 
-def test_muscle_hessian_is_symmetric_and_the_second_derivative_of_length(robot):
-    for theta in robot.random_postures(3, np.random.default_rng(1)):
-        hessian = robot.routes.muscle_hessian(theta)
-        np.testing.assert_array_equal(hessian, hessian.transpose(0, 2, 1))
-        curvature = [
-            (
-                robot.routes.absolute_lengths(theta + d)
-                - 2 * robot.routes.absolute_lengths(theta)
-                + robot.routes.absolute_lengths(theta - d)
-            )
-            / 1e-8
-            for d in 1e-4 * np.eye(robot.joint_count)
-        ]
-        diagonal = np.einsum('mii->im', hessian)
-        np.testing.assert_allclose(diagonal, curvature, atol=1e-4)
-
-
 def test_relative_length_is_zero_at_theta_zero(robot):
     zero = np.zeros(robot.joint_count)
     np.testing.assert_array_equal(robot.routes.relative_lengths(zero), np.zeros(robot.muscle_count))

@@ -7,25 +7,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot.tension import holding_tension, least_tension
+from musculoskeletal_ae.robot.tension import TensionProgramme, holding_tension, least_tension
 
 LOW, HIGH = 30.0, 200.0
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 60.0]))
-def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_nearer(seed, wish):
+def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_nearer(seed, desired):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     inside = rng.uniform(LOW, HIGH, 8)  # so that a solution exists
     torque = -jacobian.T @ inside
-    tension = holding_tension(jacobian, torque, LOW, HIGH, wish)
+    tension = holding_tension(jacobian, torque, LOW, HIGH, desired)
     np.testing.assert_allclose(-jacobian.T @ tension, torque, atol=1e-8)
     assert (tension >= LOW - 1e-8).all()
     assert (tension <= HIGH + 1e-8).all()
     # Optimality of a convex problem: the gradient points away from every feasible point.
     for other in [inside, *(holding_tension(jacobian, torque, LOW, HIGH, w) for w in (0.0, 150.0))]:
-        assert (tension - wish) @ (other - tension) >= -1e-6
+        assert (tension - desired) @ (other - tension) >= -1e-6
 
 
 def test_a_torque_out_of_reach_is_refused():
@@ -44,7 +44,7 @@ def test_limits_may_differ_between_muscles():
     jacobian = np.array([[0.05], [-0.05], [0.05]])
     high = np.array([200.0, 200.0, 0.0])  # the third is ruptured
     tension = holding_tension(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high, 60.0)
-    np.testing.assert_allclose(tension, [70.0, 50.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(tension, [70.0, 50.0, 0.0], atol=1e-6)
 
 
 def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
@@ -59,11 +59,32 @@ def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
         )
 
 
+@settings(max_examples=100)
+@given(st.integers(0, 10_000), st.floats(0.0, 3.0))
+def test_muscles_that_are_held_at_one_tension_leave_a_problem_that_is_solved(seed, share):
+    rng = np.random.default_rng(seed)
+    jacobian = rng.uniform(-0.06, 0.06, (8, 3))
+    torque = -share * jacobian.T @ rng.uniform(LOW, HIGH, 8)
+    high = np.where(rng.random(8) < 0.5, LOW, HIGH)  # half of them as hot as may be
+    tension, missing = least_tension(jacobian, torque, LOW, high)
+    assert (tension >= LOW - 1e-6).all()
+    assert (tension <= high + 1e-6).all()
+    np.testing.assert_allclose(missing, torque + jacobian.T @ tension, atol=1e-6)
+
+
+@pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_what_is_not_finite_is_refused_instead_of_solved(bad):
     jacobian = np.array([[0.05], [-0.05]])
     with pytest.raises(InfeasibleError, match='finite'):
         least_tension(jacobian, np.array([bad]), LOW, HIGH)
+    with pytest.raises(InfeasibleError, match='finite'):
+        least_tension(jacobian, np.array([0.0]), LOW, np.array([HIGH, bad]))
+    programme = TensionProgramme(jacobian, np.array([0.0]), LOW, HIGH)
+    with pytest.raises(InfeasibleError, match='finite'):
+        programme.minimum(np.full((2, 2), bad), np.zeros(2))
+    with pytest.raises(InfeasibleError, match='finite'):
+        programme.nearest(bad)
     jacobian[0, 0] = bad
     with pytest.raises(InfeasibleError, match='finite'):
         least_tension(jacobian, np.array([0.0]), LOW, HIGH)

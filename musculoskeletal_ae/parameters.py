@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a parameter is: default, meaning, unit, legal values. Nothing here knows ROS.
+
+Settings that a user may choose are a frozen dataclass whose fields say all of this:
+
+    @dataclass(frozen=True)
+    class Settings:
+        hold_time: float = Parameter(0.5, 'how long a stop holds', 's', (0.0, 60.0)).field()
+
+`nodes/parameters.py` collects them into the tables of the nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.options import DEFAULT_ROBOT
+from musculoskeletal_ae.presets import DEFAULT, PRESETS
+
+UNBOUNDED = 2**63 - 1  # the greatest whole number that a ROS parameter holds
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A value that a user may choose.
+
+    Attributes:
+        default: Its default, which also says its type; a tuple for a list of numbers or names.
+        meaning: What it is, in a phrase.
+        unit: Of its value, such as 'rad/s'.
+        within: Least and greatest legal value of a number.
+        legal: The words that it may be; empty for any.
+        settable: Whether it may be set while a node runs; else it is read once, at the start.
+    """
+
+    default: Any
+    meaning: str
+    unit: str = ''
+    within: tuple[float, float] | None = None
+    legal: tuple[str, ...] = ()
+    settable: bool = False
+
+    @property
+    def description(self) -> str:
+        """What `ros2 param describe` says above the range: meaning, unit, legal words."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        return f'{self.meaning}{unit}' + (f'; {self.legal_values}' if self.legal else '')
+
+    @property
+    def legal_values(self) -> str:
+        """Legal words, or range and unit, for people to read; '' for any."""
+        if self.legal:
+            return f'one of: {", ".join(self.legal)}'
+        if self.within is None:
+            return f'in {self.unit}' if self.unit else ''
+        low, high = self.within
+        span = f'at least {low:g}' if high >= UNBOUNDED else f'{low:g} to {high:g}'
+        return f'{span} {self.unit}'.rstrip()
+
+    @property
+    def is_number_list(self) -> bool:
+        """Whether it is a list of numbers."""
+        return isinstance(self.default, tuple) and not isinstance(self.default[0], str)
+
+    def field(self, **options: Any) -> Any:
+        """Return the dataclass field that this parameter sets; options override those of it."""
+        return field(**{'default': self.default, 'metadata': {'parameter': self}, **options})
+
+    def checked(self, value: Any) -> Any:
+        """Return a value as it is used: lists as tuples, without empty names.
+
+        Raises:
+            MusculoskeletalError: If it is no legal word, or no list of finite numbers.
+        """
+        if self.legal and value not in self.legal:
+            raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
+        if not isinstance(self.default, tuple):
+            return value
+        if not self.is_number_list:
+            return tuple(name for name in value if name)
+        try:
+            numbers = tuple(float(number) for number in value)
+        except (TypeError, ValueError):
+            numbers = (math.nan,)
+        if not all(map(math.isfinite, numbers)):
+            raise MusculoskeletalError(f'{value!r}; legal: a list of finite numbers')
+        return numbers
+
+
+def parameters_of(settings: type) -> dict[str, Parameter]:
+    """Return the parameters of a settings dataclass by name."""
+    return {f.name: f.metadata['parameter'] for f in fields(settings) if 'parameter' in f.metadata}
+
+
+ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')
+RATE = Parameter(100.0, 'rate of the muscle modules', 'Hz', (1.0, 1000.0))
+CHECKPOINT = Parameter(
+    '', 'file of a trained network (empty: wait for one on mae_checkpoint)', settable=True
+)
+PRESET = Parameter(
+    DEFAULT.name, 'the best we can measure, or as printed in the paper', legal=tuple(PRESETS)
+)
+SEED = Parameter(0, 'random seed: which arm is emulated, exploration, learning', '', (0, UNBOUNDED))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where robot directories are: those that come with the package by name, others by path.
+
+Imports nothing heavy: the help of a command lists the robots.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+
+
+def shipped_robots() -> dict[str, Path]:
+    """Return the directories of the robots that come with the package, by name."""
+    here = Path(__file__).resolve()
+    roots = [here.parents[2] / 'config']
+    # Installed by colcon: <prefix>/lib/pythonX.Y/site-packages/musculoskeletal_ae/robot/…
+    roots += [up / 'share' / 'musculoskeletal_ae' / 'config' for up in here.parents]
+    shipped: dict[str, Path] = {}
+    for root in roots:
+        for file in sorted(root.glob('*/muscles.yaml')):
+            shipped.setdefault(file.parent.name, file.parent)
+    return shipped
+
+
+def find_robot(robot: str | Path) -> Path:
+    """Return the directory of a shipped robot's name or of a path.
+
+    Raises:
+        RobotDescriptionError: If there is neither.
+    """
+    shipped = shipped_robots()
+    if str(robot) in shipped:
+        return shipped[str(robot)]
+    try:
+        directory = Path(robot).expanduser()
+        if str(robot) and directory.is_dir():
+            return directory.resolve()
+    except (RuntimeError, ValueError, OSError):  # no such home, a NUL or a name too long in it
+        pass
+    raise RobotDescriptionError(
+        f'robot {str(robot)!r} is neither a directory nor a shipped robot '
+        f'({", ".join(sorted(shipped))}); give one of these names, or a directory with '
+        'robot.urdf and muscles.yaml'
+    )

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's three steps, at postures that the arm can hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import write_robot
+
+from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
+
+
+def steps(seed, count):
+    exploration = Exploration(ROBOT, seed)
+    return [exploration.next_step() for _ in range(count)]
+
+
+def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
+    one, two, three, other = steps(0, 4)
+    assert [(s.method, s.duration) for s in (one, two, three)] == [
+        ('first', 5.0),
+        ('second', 2.0),
+        ('first', 3.0),
+    ]
+    np.testing.assert_array_equal(one.theta, two.theta)
+    np.testing.assert_array_equal(one.theta, three.theta)
+    assert np.abs(other.theta - one.theta).max() > 0.0
+    np.testing.assert_array_equal(one.tension, np.full(ROBOT.muscle_count, BIAS))
+    assert ((three.tension >= BIAS) & (three.tension <= LIMIT)).all()
+    assert np.ptp(three.tension) > 0.0
+
+
+def test_every_posture_can_be_held_and_lies_within_the_joint_limits():
+    for step in steps(1, 90)[1::3]:
+        assert ((step.theta >= ROBOT.lower) & (step.theta <= ROBOT.upper)).all()
+        assert ((step.tension >= BIAS - 1e-6) & (step.tension <= LIMIT + 1e-6)).all()
+        held = -ROBOT.routes.muscle_jacobian(step.theta).T @ step.tension
+        np.testing.assert_allclose(held, ROBOT.kinematics.holding_torque(step.theta), atol=1e-6)
+
+
+def test_a_seed_gives_its_own_stream_again():
+    one, again, other = (steps(seed, 9) for seed in (3, 3, 4))
+    for a, b in zip(one, again):
+        np.testing.assert_array_equal(a.theta, b.theta)
+        np.testing.assert_array_equal(a.tension, b.tension)
+    assert not np.array_equal(one[0].theta, other[0].theta)
+
+
+def test_an_arm_that_holds_no_posture_is_refused_with_a_remedy(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, tension={'bias': 30.0, 'limit': 30.001}))
+    with pytest.raises(RobotDescriptionError, match='run check_robot'):
+        Exploration(robot, 0).next_step()

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lengths for a posture: on the geometric model, where the optimum is known, and on a network."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from exact_mae import ExactMae
+
+from bench.control_nominal import posture_table
+from bench.timings import eager_proposed, eager_proposed_paper
+from musculoskeletal_ae.control import methods
+from musculoskeletal_ae.control.methods import first_command, msc_compensation
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.mae.descent import Loss, descend
+from musculoskeletal_ae.mae.network import from_mae
+from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
+
+
+@pytest.fixture(scope='module', params=['musashi_left_arm', 'arm26'])
+def robot(request):
+    return Robot.load(request.param)
+
+
+def holdable(robot, seed):
+    """Return a random posture, its holding torque and the least tension."""
+    rng = np.random.default_rng(seed)
+    for theta in robot.random_postures(100, rng):
+        torque = robot.kinematics.holding_torque(theta)
+        jacobian = robot.routes.muscle_jacobian(theta)
+        try:
+            return theta, torque, holding_tension(jacobian, torque, 30.0, 200.0, 0.0)
+        except InfeasibleError:
+            continue
+    raise AssertionError('no posture can be held')
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_tension(robot, seed):
+    theta, torque, least = holdable(robot, seed)
+    bias = np.full(robot.muscle_count, robot.tension.bias)
+    found = methods.proposed(robot, ExactMae(robot), theta, torque, bias, robot.tension.limit)
+    arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
+    arm.reset(theta + 0.1)
+    for _ in range(150):
+        arm.command_length(found.length)
+        arm.step(0.02)
+    assert np.linalg.norm(arm.theta - theta) < 0.01
+    # The wire's stretch grows with its length, which lowers its torque by up to half a percent.
+    assert np.linalg.norm(found.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
+    assert not found.missing_torque.any()
+
+
+def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
+    theta, torque, _ = holdable(robot, 7)
+    mae, limit = ExactMae(robot), robot.tension.limit
+    start = np.full(robot.muscle_count, 30.0)
+    found = methods.proposed(robot, mae, theta, torque, start, limit)
+    jacobian = mae.muscle_jacobian(theta, found.tension)
+    np.testing.assert_allclose(jacobian.T @ found.tension, -torque, atol=0.02)
+    for desired in np.random.default_rng(0).uniform(30.0, limit, (10, robot.muscle_count)):
+        other = holding_tension(jacobian, torque, robot.tension.bias, limit, desired)
+        assert np.linalg.norm(found.tension) <= np.linalg.norm(other) + 0.1
+
+
+def test_torque_beyond_the_muscles_is_told_and_tensions_stay_within_their_limits(robot):
+    theta, torque, _ = holdable(robot, 1)
+    limit = np.linspace(60.0, 120.0, robot.muscle_count)
+    found = methods.proposed(robot, ExactMae(robot), theta, torque + 500.0, limit, limit)
+    assert (found.tension >= 30.0 - 1e-6).all()
+    assert (found.tension <= limit + 1e-6).all()
+    assert np.linalg.norm(found.missing_torque) > 100.0
+
+
+def test_an_image_that_is_not_finite_is_refused_and_never_commanded(robot):
+    theta, torque, _ = holdable(robot, 1)
+    torque[0] = np.nan
+    bias = np.full(robot.muscle_count, 30.0)
+    with pytest.raises(InfeasibleError, match='not finite'):
+        methods.proposed(robot, ExactMae(robot), theta, torque, bias, 200.0)
+
+
+def test_the_command_lies_below_the_length_by_what_the_module_needs_to_pull(robot):
+    theta, _, least = holdable(robot, 2)
+    mae = ExactMae(robot)
+    short = mae.lengths(theta, least) - first_command(robot, mae, theta, least)
+    np.testing.assert_allclose(30.0 + robot.stiffness * short, least)
+    assert msc_compensation(robot, np.full(robot.muscle_count, 30.0)).max() == 0.0
+
+
+def test_preset_paper_lowers_the_printed_loss(trained):
+    robot, mae = Robot.load('arm26'), trained['paper']
+    theta, torque, _ = holdable(robot, 0)
+    tension = np.full(6, 100.0)
+    terms = methods.paper_terms(robot, mae, theta, torque, tension)
+    start = mae.encode(Mask.THETA_TENSION, theta, tension)
+    end = descend(mae, start, terms, methods.SEARCH)
+    assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
+    solution = methods.proposed_paper(robot, mae, theta, torque, tension)
+    np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_torch_and_its_autograd_solve_for_the_same_lengths(trained, seed):
+    robot = Robot.load('arm26')
+    theta, torque, _ = holdable(robot, seed)
+    tension = np.full(6, 40.0)
+    for preset, ours, theirs in (
+        ('default', partial(methods.proposed, limit=200.0), eager_proposed),
+        ('paper', methods.proposed_paper, eager_proposed_paper),
+    ):
+        mae = trained[preset]
+        plain = theirs(robot, from_mae(mae), theta, torque, tension)
+        # Single precision there; a wrong term moves lengths by millimetres.
+        solution = ours(robot, mae, theta, torque, tension)
+        np.testing.assert_allclose(solution.length, plain, atol=1e-5)
+
+
+def test_on_a_network_proposed_settles_nearer_than_first_and_near_the_least_tension(trained):
+    robot = Robot.load('arm26')
+    table = posture_table(robot, trained['default'], trained['paper'], 4)
+    error, tension, bound = {name: rows.mean(axis=0) for name, rows in table.items()}['proposed']
+    assert error < 0.03
+    assert error < 0.2 * table['first'].mean(axis=0)[0]
+    assert tension == pytest.approx(bound, rel=0.02)
+    # The true body's own lengths for the least tension leave nothing.
+    assert table['bound: QP on the true body'][:, 0].max() < 0.01

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+
+def test_settings_cannot_be_changed_in_place():
+    with pytest.raises(FrozenInstanceError):
+        Settings().method = 'first'
+
+
+@pytest.mark.parametrize('given', [(), (0.0,)])
+def test_no_joint_stiffness_is_as_it_comes_for_every_joint(given):
+    assert Settings(joint_stiffness=given).desired_stiffness(3) == (0.0, 0.0, 0.0)
+    assert Settings(joint_stiffness=(5.0, 0.0)).desired_stiffness(2) == (5.0, 0.0)
+
+
+@pytest.mark.parametrize('given', [(1.0,), (1.0, 2.0, 3.0), (1.0, -1), (np.nan, 1), (np.inf, 1)])
+def test_joint_stiffness_that_is_not_one_number_a_joint_is_refused(given):
+    with pytest.raises(MusculoskeletalError, match='legal: 2 numbers of at least 0'):
+        Settings(joint_stiffness=given).desired_stiffness(2)
+
+
+def test_only_preset_default_solves_the_balance_of_torques():
+    assert Settings(preset='default').by_balance
+    assert not Settings(preset='paper').by_balance

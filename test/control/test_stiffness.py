@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stiffness as the network sees it, against the geometric model and a push on the nominal arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from exact_mae import ExactMae
+
+from bench.control_nominal import stiffness_ratios
+from musculoskeletal_ae.control.stiffness import MARGINS, StiffnessModel, stiffness_command
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
+
+THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('musashi_left_arm')
+
+
+@pytest.fixture(scope='module')
+def mae(robot):
+    return ExactMae(robot)
+
+
+def solve(robot, mae, desired):
+    torque = robot.kinematics.holding_torque(THETA)
+    return stiffness_command(robot, mae, THETA, torque, desired, robot.tension.limit)
+
+
+def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
+    tension = np.random.default_rng(0).uniform(40.0, 190.0, robot.muscle_count)
+    model = StiffnessModel.read(robot, mae, THETA, tension)
+    jacobian = robot.routes.muscle_jacobian
+    k = robot.muscle_stiffness(THETA, tension)
+    true = joint_stiffness(jacobian(THETA), muscle_hessian(jacobian, THETA), k, tension)
+    # A hundredth: the cubic through the elongation, the wire's stretch, the wide step of the slope.
+    np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
+    np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
+
+
+def test_its_slope_by_the_tension_is_the_difference_quotient(robot, mae):
+    tension = np.full(robot.muscle_count, 90.0)
+    model = StiffnessModel.read(robot, mae, THETA, tension)
+    for i, step in enumerate(1e-3 * np.eye(robot.muscle_count)):
+        ahead, behind = (model.joint_stiffness(tension + s * step) for s in (1.0, -1.0))
+        np.testing.assert_allclose(
+            model.slope(tension)[:, i], np.diag(ahead - behind) / 2e-3, rtol=1e-5, atol=1e-8
+        )
+
+
+@pytest.mark.parametrize('joint', range(5))
+def test_a_stiffness_within_the_reported_range_is_met_and_the_posture_held(robot, mae, joint):
+    free = solve(robot, mae, np.zeros(5))
+    torque = robot.kinematics.holding_torque(THETA)
+    for share in (0.1, 0.5, 0.9):
+        desired = np.zeros(5)
+        desired[joint] = free.lowest[joint] + share * (free.highest[joint] - free.lowest[joint])
+        found = solve(robot, mae, desired)
+        tension = found.command.tension
+        assert found.stiffness[joint, joint] == pytest.approx(desired[joint], rel=0.01)
+        held = -mae.muscle_jacobian(THETA, tension).T @ tension
+        np.testing.assert_allclose(held, torque, atol=0.03)
+        assert (tension >= robot.tension.bias + MARGINS[-2] - 1e-6).all()
+        assert (tension <= robot.tension.limit + 1e-6).all()
+
+
+def test_no_tension_that_holds_the_posture_leaves_the_reported_range(robot, mae):
+    free = solve(robot, mae, np.zeros(5))
+    assert (free.lowest < free.highest).all()
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        found = solve(robot, mae, rng.uniform(0.0, 60.0, 5))
+        assert (np.diag(found.stiffness) >= free.lowest * 0.98).all()
+        assert (np.diag(found.stiffness) <= free.highest * 1.02).all()
+
+
+def test_a_stiffness_beyond_the_range_gives_the_end_of_the_range(robot, mae):
+    free = solve(robot, mae, np.zeros(5))
+    for beyond, end in ((1e4, free.highest), (1e-3, free.lowest)):
+        found = solve(robot, mae, np.array([0.0, 0.0, 0.0, 0.0, beyond]))
+        assert found.stiffness[4, 4] == pytest.approx(end[4], rel=0.02)
+
+
+def test_a_torque_beyond_the_muscles_leaves_no_choice_and_is_told(robot, mae):
+    found = stiffness_command(robot, mae, THETA, np.full(5, 300.0), np.full(5, 20.0), 200.0)
+    assert np.linalg.norm(found.command.missing_torque) > 100.0
+    np.testing.assert_array_equal(found.lowest, found.highest)
+    assert np.isfinite(found.command.length).all()
+
+
+def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
+    measured, predicted = stiffness_ratios(robot, mae, 3).T
+    np.testing.assert_allclose(measured / predicted, 1.0, atol=0.2)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One table of parameters, and what is made from it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, yaml_text
+from musculoskeletal_ae.parameters import Parameter
+
+FILE = Path(__file__).resolve().parents[2] / 'config' / 'nodes.yaml'
+NUMBERS = Parameter((0.0,), 'numbers')
+
+
+def test_the_file_of_parameters_is_the_one_that_the_table_makes():
+    remedy = 'run: python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml'
+    assert FILE.read_text(encoding='utf-8') == yaml_text(), remedy
+
+
+@pytest.mark.parametrize('node', PARAMETERS)
+def test_the_file_holds_every_parameter_of_every_node_with_its_default(node):
+    # A name means the same in all nodes, since one file serves them all.
+    held = yaml.safe_load(yaml_text())['/**']['ros__parameters']
+    for name, parameter in PARAMETERS[node].items():
+        default = parameter.default
+        assert held[name] == (list(default) if isinstance(default, tuple) else default)
+
+
+@pytest.mark.parametrize('node', PARAMETERS)
+def test_help_tells_every_parameter_and_loads_nothing_heavy(node):
+    code = f"""
+import sys
+sys.argv[1:] = ['--help']
+from musculoskeletal_ae.nodes import running
+running.{node}()
+print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[-1] == 'loaded'
+    assert lines[0].startswith(f'The node `{node}`: ')
+    for name, parameter in PARAMETERS[node].items():
+        told = [line for line in lines if f' {name} (default: ' in line]
+        assert len(told) == 1
+        assert told[0].startswith(' *') is parameter.settable
+        below = lines[lines.index(told[0]) + 1]
+        assert parameter.meaning in below and parameter.unit in below
+        assert all(word in below for word in parameter.legal)
+
+
+def test_a_word_that_is_not_legal_is_refused_with_those_that_are():
+    with pytest.raises(MusculoskeletalError, match="'other'; legal: one, two"):
+        Parameter('one', 'a word', legal=('one', 'two')).checked('other')
+
+
+def test_empty_names_are_no_names():
+    assert Parameter(('',), 'names').checked(['', 'biceps', '']) == ('biceps',)
+
+
+def test_an_empty_list_of_numbers_is_the_byte_array_that_ros_makes_of_it():
+    assert NUMBERS.checked([]) == NUMBERS.checked(b'') == ()
+    assert NUMBERS.checked([1, 2.5]) == (1.0, 2.5)
+
+
+@pytest.mark.parametrize('value', [None, 3.0, 'word', ['word'], [float('nan')], [float('inf')]])
+def test_what_is_no_list_of_finite_numbers_is_refused(value):
+    with pytest.raises(MusculoskeletalError, match='finite numbers'):
+        NUMBERS.checked(value)
