@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test's view of a real ROS graph: real processes, real DDS, waits with deadlines."""
+"""A test's view of a real ROS graph: nodes here or in processes, real DDS, waits with deadlines."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import rclpy
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
@@ -71,6 +72,7 @@ class Graph:
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.processes: list[Process] = []
+        self.hosted: list[Node] = []
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -82,6 +84,19 @@ class Graph:
         process = Process(name, [*executable(name), *arguments])
         self.processes.append(process)
         return process
+
+    def host(self, kind: type[Node], **parameters: Any) -> Any:
+        """Run a node with parameters in this process, where a process of its own adds nothing."""
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = kind(
+            context=self.context,
+            namespace=self.namespace,
+            use_global_arguments=False,
+            parameter_overrides=overrides,
+        )
+        self.hosted.append(node)
+        self.executor.add_node(node)
+        return node
 
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
         """Subscribe; return the list that messages are appended to."""
@@ -140,7 +155,8 @@ class Graph:
         """Leave the graph and end what was started."""
         for process in self.processes:
             process.end()
-        self.node.destroy_node()
+        for node in (*self.hosted, self.node):
+            node.destroy_node()
         rclpy.shutdown(context=self.context)
 
 

@@ -56,6 +56,7 @@ class Shell(Node):
             default = parameter.default
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
+            self.parameter(key)
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')
         self._reception = Reception(lambda text: self.get_logger().warning(text))
