@@ -19,11 +19,6 @@ def arm26() -> Robot:
     return Robot.load('arm26')
 
 
-@pytest.fixture(scope='session')
-def trained(trained_file) -> str:
-    return trained_file
-
-
 @pytest.fixture
 def graph():
     """Return a graph whose topics no other test sees: a namespace of its own."""

@@ -23,8 +23,8 @@ HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
 
 @pytest.fixture
-def arm(graph, arm26, trained):
-    return ControlledArm(graph, arm26, trained)
+def arm(graph, arm26, trained_file):
+    return ControlledArm(graph, arm26, trained_file)
 
 
 def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
@@ -65,9 +65,9 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     arm.goes_to(THERE)
 
 
-def test_a_push_measures_the_stiffness_that_was_wished_within_the_reported_range(arm, trained):
+def test_a_push_measures_the_stiffness_that_was_wished_within_the_reported_range(arm, trained_file):
     theta, robot = np.array([0.3, -0.8]), arm.robot
-    mae = checkpoint.load(trained, robot)
+    mae = checkpoint.load(trained_file, robot)
     # A torque on the shoulder alone, large against friction.
     wrench = 3.0 * np.linalg.pinv(robot.kinematics.end_effector_jacobian(theta).T)[:, 0]
     assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
@@ -118,11 +118,11 @@ def test_exploration_moves_the_arm_and_a_target_ends_it(arm):
     arm.goes_to(HERE)
 
 
-def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained):
+def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
     arm.target(HERE)
     arm.goes_to(HERE)
     publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    with open(trained, 'rb') as file:  # noqa: PTH123
+    with open(trained_file, 'rb') as file:  # noqa: PTH123
         publisher.publish(bytes_message(file.read()))
     before = len(arm.sent())
     arm.graph.wait(lambda: len(arm.sent()) > before + 100, 'commands')

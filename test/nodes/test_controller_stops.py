@@ -20,8 +20,8 @@ HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
 
 @pytest.fixture
-def arm(graph, arm26, trained):
-    arm = ControlledArm(graph, arm26, trained)
+def arm(graph, arm26, trained_file):
+    arm = ControlledArm(graph, arm26, trained_file)
     arm.target(HERE)
     graph.wait(lambda: len(arm.sent()) > 30, 'commands')
     return arm
@@ -122,8 +122,8 @@ def test_an_unfit_checkpoint_file_is_refused_and_nothing_stops(arm):
     assert 'stopped' not in arm.state().message
 
 
-def test_without_joint_sensors_and_without_a_learner_it_moves(graph, arm26, trained):
-    arm = ControlledArm(graph, arm26, trained, joint_sensors=False)
+def test_without_joint_sensors_and_without_a_learner_it_moves(graph, arm26, trained_file):
+    arm = ControlledArm(graph, arm26, trained_file, joint_sensors=False)
     arm.target(HERE)
     graph.wait(lambda: len(arm.sent()) > 200, 'commands')
     assert 'stopped' not in arm.state().message

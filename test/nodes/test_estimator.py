@@ -26,8 +26,8 @@ from musculoskeletal_ae.nodes.qos import LATCHED
 
 
 @pytest.fixture
-def estimator(graph, trained):
-    graph.estimator = graph.host(Estimator, robot='arm26', checkpoint=trained)
+def estimator(graph, trained_file):
+    graph.estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
     graph.listen(JointState, 'estimated_joint_states')
     graph.listen(JointState, 'vision_joint_states')
     graph.listen(Float64MultiArray, 'estimated_muscle_states')
@@ -115,7 +115,7 @@ def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimato
 
 
 def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refused(
-    estimator, healthy, trained, tmp_path
+    estimator, healthy, trained_file, tmp_path
 ):
     answer(estimator, healthy)
     broken = tmp_path / 'broken.safetensors'
@@ -123,9 +123,9 @@ def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refu
     success, reason = estimator.set_parameter('estimator', 'checkpoint', str(broken))
     assert not success
     assert 'broken.safetensors' in reason
-    copy = shutil.copy(trained, tmp_path / 'copy.safetensors')
+    copy = shutil.copy(trained_file, tmp_path / 'copy.safetensors')
     assert estimator.set_parameter('estimator', 'checkpoint', str(copy)) == (True, '')
-    mae = replace(checkpoint.load(trained), version=41)
+    mae = replace(checkpoint.load(trained_file), version=41)
     publisher = estimator.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
     core, rejected = estimator.estimator.core, estimator.estimator.rejected
@@ -238,8 +238,8 @@ def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected
 # -- the process ---------------------------------------------------------------------------------
 
 
-def test_it_ends_quietly_on_ctrl_c(graph, trained):
-    process = graph.start('estimator', robot='arm26', checkpoint=trained)
+def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
+    process = graph.start('estimator', robot='arm26', checkpoint=trained_file)
     graph.wait(lambda: graph.node.count_publishers('anomaly') > 0, 'the estimator')
     status, output = process.end(signal.SIGINT)
     graph.processes.remove(process)

@@ -112,9 +112,9 @@ def state(tmp_path):
 
 
 @pytest.fixture
-def host(graph, arm26, trained):
+def host(graph, arm26, trained_file):
     return lambda **parameters: HostedLearner(
-        graph, arm26, **{'checkpoint': trained, 'state_directory': '', **parameters}
+        graph, arm26, **{'checkpoint': trained_file, 'state_directory': '', **parameters}
     )
 
 
@@ -165,7 +165,7 @@ def test_enable_stops_and_resumes(host, graph):
 
 
 def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backup(
-    host, graph, trained, state, tmp_path
+    host, graph, trained_file, state, tmp_path
 ):
     learner = host(state_directory=state)
     learner.learn(lambda: learner.samples >= 2, 'samples')
@@ -176,7 +176,7 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
     assert 'broken' in reason
     assert learner.samples >= 2
     before = len(graph.received['mae_checkpoint'])
-    assert graph.set_parameter('learner', 'checkpoint', trained) == (True, '')
+    assert graph.set_parameter('learner', 'checkpoint', trained_file) == (True, '')
     assert learner.samples == 0
     graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
     assert (Path(state) / 'backup-1' / FILE).exists()
@@ -261,8 +261,8 @@ def alive(pid):
     return True
 
 
-def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
-    process = start(graph, checkpoint=trained, state_directory=state)
+def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained_file, state):
+    process = start(graph, checkpoint=trained_file, state_directory=state)
     arm = Arm(graph, arm26)
     learn(graph, arm, lambda: samples(graph) >= 4, 'samples')
     stored, version = samples(graph), versions(graph, arm26)[-1]
@@ -276,14 +276,14 @@ def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
     graph.wait(lambda: not alive(worker), 'the end of the orphaned training process')
 
 
-def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained):
+def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained_file):
     from geometry_msgs.msg import PoseStamped
 
     graph.start('hardware_emulator', robot='arm26', joint_sensors=False, marker_rate=30.0)
-    graph.start('estimator', robot='arm26', checkpoint=trained)
-    graph.start('controller', robot='arm26', checkpoint=trained, explore=True)
+    graph.start('estimator', robot='arm26', checkpoint=trained_file)
+    graph.start('controller', robot='arm26', checkpoint=trained_file, explore=True)
     graph.start(
-        'learner', robot='arm26', checkpoint=trained, state_directory='', joint_source='marker'
+        'learner', robot='arm26', checkpoint=trained_file, state_directory='', joint_source='marker'
     )
     graph.listen(JointState, 'vision_joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
@@ -317,8 +317,8 @@ def test_two_learners_do_not_share_a_directory(graph, host, state):
     assert 'Traceback' not in output
 
 
-def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained):
-    process = start(graph, checkpoint=trained, state_directory='')
+def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained_file):
+    process = start(graph, checkpoint=trained_file, state_directory='')
     graph.wait(lambda: 'training process' in values(graph), 'the training process')
     worker = int(values(graph)['training process'])
     status, output = process.end(signal.SIGINT)

@@ -24,18 +24,18 @@ from musculoskeletal_ae.validity import read_array
 
 
 @pytest.fixture
-def arm(graph, trained):
+def arm(graph, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(Float64MultiArray, 'sim/muscle_states')
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.simulator = graph.host(Sim, robot='arm26', checkpoint=trained)
+    graph.simulator = graph.host(Sim, robot='arm26', checkpoint=trained_file)
     graph.next('sim/muscle_states')
     return graph
 
 
 @pytest.fixture
-def mae(arm26, trained):
-    return checkpoint.load(trained, arm26)
+def mae(arm26, trained_file):
+    return checkpoint.load(trained_file, arm26)
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
 
 
-def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, mae, trained):
+def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, mae, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.host(Sim, robot='arm26')
@@ -159,16 +159,16 @@ def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, 
         graph.wait(lambda v=version: f"value='{v}'" in str(state(graph).values), f'{version}')
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
-    assert graph.set_parameter('sim', 'checkpoint', trained)[0]
+    assert graph.set_parameter('sim', 'checkpoint', trained_file)[0]
 
 
-def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, arm26, trained):
+def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, arm26, trained_file):
     graph.listen(JointState, 'joint_states')
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(String, 'robot_description', LATCHED)
-    graph.start('sim', robot='arm26', checkpoint=trained, as_robot=True)
-    graph.start('estimator', robot='arm26', checkpoint=trained)
-    graph.start('controller', robot='arm26', checkpoint=trained, first_duration=1.0)
+    graph.start('sim', robot='arm26', checkpoint=trained_file, as_robot=True)
+    graph.start('estimator', robot='arm26', checkpoint=trained_file)
+    graph.start('controller', robot='arm26', checkpoint=trained_file, first_duration=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
     assert graph.received['robot_description'][0].data == arm26.description.urdf
@@ -182,9 +182,9 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     assert graph.node.count_publishers('sim/joint_states') == 0
 
 
-def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained):
+def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_file):
     graph.listen(JointState, 'sim/joint_states')
-    graph.host(Sim, robot='arm26', checkpoint=trained, preset='paper')
+    graph.host(Sim, robot='arm26', checkpoint=trained_file, preset='paper')
     theta = np.array(graph.next('sim/joint_states', 20).position)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
     with pytest.raises(MusculoskeletalError, match=r'parameter preset: .*default, paper'):
