@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -14,10 +14,14 @@ RATE_LIMIT = 0.2  # [m/s]
 
 
 class ControlledArm:
-    """The whole loop of arm26 in a test's graph."""
+    """The whole loop of arm26 in a test's graph.
 
-    def __init__(self, graph, robot, checkpoint, **hardware):
+    The nodes run in the test's process, but for those whose processes are to be killed.
+    """
+
+    def __init__(self, graph, robot, checkpoint, processes=(), **hardware):
         self.graph, self.robot, self.checkpoint = graph, robot, checkpoint
+        self.processes = processes
         for kind, topic in (
             (Float64MultiArray, 'muscle_states'),
             (Float64MultiArray, 'muscle_length_command'),
@@ -27,32 +31,32 @@ class ControlledArm:
             (DiagnosticArray, '/diagnostics'),
         ):
             graph.listen(kind, topic, 1000)
-        self.hardware = self.start_hardware(**hardware)
-        self.estimator = self.start_estimator()
+        self.hardware = self.start('hardware_emulator', seed=1, **hardware)
+        self.estimator = self.start('estimator', checkpoint=checkpoint)
         self.controller = self.start_controller()
-        graph.next('estimated_joint_states')
         self.targets = graph.publisher(JointState, 'target_joint_states')
+        self.says('no target')  # it knows posture and network
 
-    def start_hardware(self, **chosen):
-        return self.graph.start('hardware_emulator', robot='arm26', seed=1, **chosen)
-
-    def start_estimator(self):
-        return self.graph.start('estimator', robot='arm26', checkpoint=self.checkpoint)
+    def start(self, name, **parameters):
+        make = self.graph.start if name in self.processes else self.graph.run
+        return make(name, robot='arm26', **parameters)
 
     def start_controller(self):
-        return self.graph.start(
+        return self.start(
             'controller',
-            robot='arm26',
             checkpoint=self.checkpoint,
             first_duration=1.0,
             second_duration=0.5,
             rate_limit=RATE_LIMIT,
+            max_age=1.0,  # a loaded machine is not the cause of a stop
         )
 
-    def kill(self, process, number):
-        """End a node without the graph taking it for an accident."""
+    def kill(self, process):
+        """Kill a node without the graph taking it for an accident; the others go on meanwhile."""
         self.graph.processes.remove(process)
-        process.end(number)
+        process.process.kill()
+        self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
+        process.process.stdout.close()
 
     def target(self, theta, effort=()):
         self.targets.publish(
@@ -81,7 +85,11 @@ class ControlledArm:
         self.graph.wait(lambda: self.tension().max() < bias + 8.0, 'tensions near the bias')
 
     def state(self, node='controller'):
-        """Return the node's last diagnostic status."""
+        """Return what a node says of itself: the controller now, others once a second."""
+        if node == 'controller' and node not in self.processes:
+            level, message, values = self.controller.state()
+            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+            return DiagnosticStatus(level=level, message=message, values=pairs)
         name = f'{self.graph.namespace}/{node}: state'
         for message in reversed(self.graph.received['/diagnostics']):
             for status in message.status:
@@ -89,13 +97,10 @@ class ControlledArm:
                     return status
         return DiagnosticStatus()
 
-    def reachable(self, joint):
-        """Return the range of a joint's stiffness that the controller reports."""
-        key = f'joint stiffness {joint}'
+    def said(self, key):
+        """Return a value of the controller's diagnostics, once it is there."""
         self.says(key)
-        said = {pair.key: pair.value for pair in self.state().values}[key]
-        low, high = said.split('reachable ')[1].split(',')[0].split(' to ')
-        return float(low), float(high)
+        return {pair.key: pair.value for pair in self.state().values}[key]
 
     def says(self, words, node='controller'):
         """Wait until the node's diagnostics contain words."""

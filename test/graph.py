@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test's view of a real ROS graph: real processes, real DDS, waits with deadlines."""
+"""A test's view of a real ROS graph: real DDS, nodes or their processes, waits with deadlines."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import rclpy
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
@@ -70,7 +72,26 @@ class Graph:
         self.executor.add_node(self.node)
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
+        self.nodes: list[Node] = []
         self.processes: list[Process] = []
+
+    def run(self, name: str, **parameters: Any) -> Node:
+        """Run a node in this process, in this graph's namespace; it works while the test waits."""
+        module = import_module(f'musculoskeletal_ae.nodes.{name}')
+        node: Node = getattr(module, name.title().replace('_', ''))(
+            context=self.context,
+            namespace=self.namespace,
+            parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
+        )
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def end(self, node: Node) -> None:
+        """End a node that runs in this process."""
+        self.nodes.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -140,6 +161,8 @@ class Graph:
         """Leave the graph and end what was started."""
         for process in self.processes:
             process.end()
+        for node in list(self.nodes):
+            self.end(node)
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
