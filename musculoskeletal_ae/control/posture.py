@@ -24,7 +24,7 @@ from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
 from musculoskeletal_ae.control.feedback import RestFeedback
 from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stiffness import StiffnessSolution, stiffness_command
+from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -83,7 +83,6 @@ class PostureControl:
         theta: θ_target [rad], shape (D,), or None before the first target.
         effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
         solution: Command of the last goal and what it is expected to bring, or None.
-        stiffness: What the last goal of `stiffness` expects, or None.
         feedback: Corrections at rest.
     """
 
@@ -94,7 +93,6 @@ class PostureControl:
         self.theta: Array | None = None
         self.effort: Array = np.zeros(robot.joint_count)
         self.solution: Solution | None = None
-        self.stiffness: StiffnessSolution | None = None
         self.feedback = RestFeedback(robot)
         self._exploration: Exploration | None = None
         self._goals: list[Goal] = []
@@ -204,7 +202,7 @@ class PostureControl:
 
     def _solve(self, mae: Mae, theta: Array, limit: Array) -> Solution:
         robot, current = self._robot, self._current
-        self.solution = self.stiffness = self._jacobian = None
+        self.solution = self._jacobian = None
         nothing = np.zeros(robot.joint_count)
         if self._method == 'geometric':
             bias = np.full(robot.muscle_count, robot.tension.bias)
@@ -216,8 +214,7 @@ class PostureControl:
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':
             desired = np.array(self.settings.desired_stiffness(robot.joint_count))
-            self.stiffness = stiffness_command(robot, mae, theta, torque, desired, limit)
-            return self.stiffness.command
+            return stiffness_command(robot, mae, theta, torque, desired, limit)
         if self.settings.by_balance:
             return methods.proposed(robot, mae, theta, torque, current, limit)
         return methods.proposed_paper(robot, mae, theta, torque, current)

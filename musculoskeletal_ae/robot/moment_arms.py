@@ -95,14 +95,14 @@ def _wrong_signs(description: RobotDescription, moment_arms: Array) -> list[Find
         against = np.mean(arm * sign <= 0.0)
         if against <= TOLERATED_SHARE:
             continue
-        expected, found = ('+', '-') if sign > 0 else ('-', '+')
+        expected, actual = ('+', '-') if sign > 0 else ('-', '+')
         if not arm.any():
-            found = '0, it does not cross the joint,'
+            actual = '0, it does not cross the joint,'
         faults.append(
             Finding(
                 'wrong_sign',
                 f'muscle {description.muscles[muscle]!r} has a moment arm of wrong sign at joint '
-                f'{description.joints[joint]!r}: expected {expected}, found {found} in '
+                f'{description.joints[joint]!r}: expected {expected}, found {actual} in '
                 f'{100 * against:.0f} % of postures (median {1e3 * np.median(arm):+.1f} mm)',
                 'lead its route along the other side of the joint axis, or correct '
                 f'{DECLARATION_FILE}',

@@ -66,17 +66,17 @@ def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_j
     assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
     assert not arm.graph.set_parameter('controller', 'joint_stiffness', [1.0, 2.0, 3.0])[0]
     arm.target([0.3, -0.8])
-    told = arm.said(f'joint stiffness {joint}')
-    low, high = map(float, told.split('reachable ')[1].split(' to '))
+    text = arm.said(f'joint stiffness {joint}')
+    low, high = map(float, text.split('reachable ')[1].split(' to '))
     pulls = []
     for share in (0.125, 0.875):
         desired = low + share * (high - low)
         done, _ = arm.graph.set_parameter('controller', 'joint_stiffness', [desired, 0.0])
         assert done
         planned = pytest.approx(desired, rel=0.01)
-        arm.graph.wait(lambda p=planned: posture.stiffness.stiffness[0, 0] == p, 'the plan')
+        arm.graph.wait(lambda p=planned: posture.solution.stiffness.expected[0, 0] == p, 'the plan')
         arm.goes_to([0.3, -0.8], within=0.2)
-        pulls.append(np.linalg.norm(posture.stiffness.command.tension))
+        pulls.append(np.linalg.norm(posture.solution.tension))
     assert pulls[1] > pulls[0] + 20.0  # the stiffer, the tenser
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e4, 0.0])[0]
     arm.says('clamped')
