@@ -32,9 +32,11 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         *config_files(),
     ],
-    # What it needs from PyPI is pinned in .ci/requirements.txt. Listing it here too would make
-    # every console script check versions at start, and rosdep does not read it.
+    # What it needs is in package.xml (rosdep) and requirements.txt (pip, pinned). Listing it here
+    # too would make every console script check versions at start.
     install_requires=['setuptools'],
+    # colcon test looks here for the kind of tests there are.
+    extras_require={'test': ['pytest']},
     zip_safe=False,
     maintainer='musculoskeletal_ae maintainers',
     maintainer_email='maintainers@musculoskeletal-ae.org',

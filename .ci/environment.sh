@@ -12,8 +12,8 @@
 
 : "${repository:?is set before this file is sourced}"
 
-TORCH=2.13.0
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
+TORCH=$(sed -n 's/^torch==//p' "$repository/requirements.txt")
 
 venv=$repository/.venv
 executables=$repository/install/musculoskeletal_ae/lib/musculoskeletal_ae
@@ -225,14 +225,14 @@ urllib.request.urlopen(sys.argv[1] + "/torch/", timeout=5).read(1)' \
 requirements_stamp() { # FILE…
   {
     "$python" -c 'import sys; print(sys.version)' </dev/null
-    echo "$ros torch $TORCH"
+    echo "$ros"
     cat "$@"
   } | sha256sum
 }
 
 install_packages() { # [test]
   local file title='installing torch, pinocchio, numba and colcon'
-  local -a base=("$repository/.ci/requirements.txt") files arguments=() torch=("torch==$TORCH")
+  local -a base=("$repository/requirements.txt") files arguments=() torch=()
   if [ "$ros" = wheels ]; then
     base+=("$repository/.ci/requirements-ros.txt")
     title+=', the ROS 2 Jazzy wheels'

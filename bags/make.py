@@ -9,7 +9,6 @@ controller send.
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import subprocess
@@ -30,8 +29,10 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import Float64MultiArray
 
+from musculoskeletal_ae.options import Parser
+
 ROBOT = 'musashi_left_arm'
-# One individual in all bags, so that what is learnt from one can be tried on another.
+# One individual in all bags, so that what is learned from one can be tried on another.
 INDIVIDUAL = 1
 RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
 TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
@@ -122,8 +123,8 @@ RECORDINGS: dict[str, tuple[Callable[[Arm], None], int]] = {
 
 def main() -> None:
     """Record one bag into this folder."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('name', choices=RECORDINGS)
+    parser = Parser('make.py', 'Records one bag of the emulated arm into this folder.')
+    parser.add_argument('name', choices=RECORDINGS, help='what the arm does')
     name = parser.parse_args().name
     bag = Path(__file__).resolve().parent / name
     if bag.exists():

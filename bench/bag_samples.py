@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from musculoskeletal_ae.bags import definitions
+from musculoskeletal_ae.bags import message_types
 from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import DIAGNOSTICS, TOPICS, interface_name
 from musculoskeletal_ae.bags.writer import BagWriter
@@ -32,13 +33,23 @@ class Sample(NamedTuple):
     data: bytes
 
 
+def encode(message: object, type_name: str) -> bytes:
+    """Return a message as serialized bytes."""
+    return bytes(message_types.TYPESTORE.serialize_cdr(message, type_name))
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a type's messages, without ROS."""
+    return message_types.TYPESTORE.types[type_name]
+
+
 def filled(type_name: str, rng: random.Random) -> Any:
     """Return a message of a type with a random value in every field."""
-    kind = definitions.message_class(type_name)
-    return kind(
+    fields = message_types.TYPESTORE.fielddefs[type_name][1]
+    return message_class(type_name)(
         **{
             field: _value(node, rng)
-            for field, node in definitions.fields(type_name)
+            for field, node in fields
             if field != 'structure_needs_at_least_one_member'
         }
     )
@@ -46,14 +57,14 @@ def filled(type_name: str, rng: random.Random) -> Any:
 
 def _value(node: Any, rng: random.Random) -> Any:
     kind, detail = node
-    if kind == definitions.BASE:
+    if kind == Nodetype.BASE:
         return _basic(detail[0], rng)
-    if kind == definitions.NAME:
+    if kind == Nodetype.NAME:
         return filled(detail, rng)
     (inner, inner_detail), count = detail
-    count = count if kind == definitions.ARRAY else rng.randrange(4)
+    count = count if kind == Nodetype.ARRAY else rng.randrange(4)
     values = [_value((inner, inner_detail), rng) for _ in range(count)]
-    if inner != definitions.BASE or inner_detail[0] == 'string':
+    if inner != Nodetype.BASE or inner_detail[0] == 'string':
         return values
     name = {'bool': 'bool', 'byte': 'uint8', 'char': 'uint8'}.get(inner_detail[0], inner_detail[0])
     return np.array(values, dtype=name)
@@ -70,13 +81,13 @@ def _basic(name: str, rng: random.Random) -> Any:
 def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
     """Return `count` messages in order, over all topics of the interface in turn."""
     rng = random.Random(seed)  # noqa: S311 - test data
-    found = []
+    content = []
     for i, name in zip(range(count), list(TOPICS) * (count // len(TOPICS) + 1), strict=False):
-        data = definitions.encode(filled(TOPICS[name].type, rng), TOPICS[name].type)
+        data = encode(filled(TOPICS[name].type, rng), TOPICS[name].type)
         topic = name if name == DIAGNOSTICS else f'{namespace}/{name}'
         time = START + i * PERIOD
-        found.append(Sample(topic, TOPICS[name].type, time, time - rng.randrange(100_000), data))
-    return found
+        content.append(Sample(topic, TOPICS[name].type, time, time - rng.randrange(100_000), data))
+    return content
 
 
 def write_ours(path: Path, content: list[Sample], compression: str, finish: bool) -> None:
@@ -107,8 +118,8 @@ def write_mcap(path: Path, content: list[Sample], **options: Any) -> None:
         channels: dict[str, int] = {}
         for topic, kind, log_time, publish_time, data in content:
             if kind not in schemas:
-                text = definitions.definition(kind).encode()
-                schemas[kind] = writer.register_schema(kind, definitions.ENCODING, text)
+                text = message_types.definition(kind).encode()
+                schemas[kind] = writer.register_schema(kind, message_types.ENCODING, text)
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, 'cdr', schemas[kind])
             writer.add_message(channels[topic], log_time, data, publish_time)

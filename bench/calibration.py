@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far the emulated arms are from their model: the calibration of `Spread`.
 
+    python -m bench calibration [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 5]
+
 The constants of `emulator.individual.Spread` were set once, over seeds 0–9 of musashi_left_arm, so
 that on the held-out motion (5 minutes at 100 Hz, mean of ‖θ_est − θ_true‖ over all samples)
 
@@ -9,8 +11,8 @@ that on the held-out motion (5 minutes at 100 Hz, mean of ‖θ_est − θ_true�
 
 and are not touched to improve a result. Attachments that are 8.5 mm off in each coordinate give
 lengths about 5 mm off.
-`ros2 run musculoskeletal_ae calibrate_emulator` makes this table (least squares on
-the geometric model, without a network, and both presets before any learning, in rad):
+It makes this table (least squares on the geometric model, without a network, and both presets
+before any learning, in rad):
 
     seed  lengths off [mm]  oracle [rad]  least squares  default  paper
        0               4.3         0.045          0.183    0.262  0.408
@@ -28,22 +30,25 @@ the geometric model, without a network, and both presets before any learning, in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from musculoskeletal_ae.mae.initial import initial_mae
+from tqdm import tqdm
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.experiments.least_squares import mean_error, nominal, oracle
-from musculoskeletal_ae.experiments.recording import motion, record
+from musculoskeletal_ae.experiments.least_squares import nominal, oracle
+from musculoskeletal_ae.experiments.recording import estimation_error, record
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 
 # Never used for learning.
 HELD_OUT_SEED = 9001
-# Every tenth sample is enough for least squares, which is slow.
-EVERY = 10
+EVERY = 10  # samples
 
 
 class Row(NamedTuple):
@@ -58,12 +63,7 @@ class Row(NamedTuple):
 
 
 def calibration(
-    robot: Robot,
-    default: Mae,
-    paper: Mae,
-    seeds: Sequence[int],
-    minutes: float = 5.0,
-    progress: Callable[[float], None] | None = None,
+    robot: Robot, default: Mae, paper: Mae, seeds: Iterable[int], minutes: float = 5.0
 ) -> list[Row]:
     """Measure individuals before any learning, on the held-out motion.
 
@@ -73,25 +73,23 @@ def calibration(
         paper: Initial network of preset `paper`.
         seeds: Individuals.
         minutes: Length of the motion.
-        progress: Called with robot seconds passed.
     """
-    goals = motion(robot, default, HELD_OUT_SEED, 60.0 * minutes)
     rows = []
     for seed in seeds:
         individual = Individual(robot, seed)
-        taken = record(EmulatedArm(robot, seed, individual), goals, progress)
-        theta, tension = taken.theta[::EVERY], taken.tension[::EVERY]
-        length = taken.length[::EVERY]
+        arm = EmulatedArm(robot, seed, individual)
+        taken = record(arm, default, HELD_OUT_SEED, 60.0 * minutes)
+        theta = taken.theta[::EVERY]
         true = individual.absolute_lengths(theta) - individual.length_at_zero
         off = true - robot.routes.relative_lengths(theta)
         rows.append(
             Row(
                 seed,
                 1e3 * float(np.sqrt(np.mean((off - off.mean(axis=0)) ** 2))),
-                mean_error(oracle(robot, individual).estimate(tension, length), theta),
-                mean_error(nominal(robot).estimate(tension, length), theta),
-                mean_error(default.estimate(taken.tension, taken.length).theta, taken.theta),
-                mean_error(paper.estimate(taken.tension, taken.length).theta, taken.theta),
+                oracle(robot, individual).error(taken),
+                nominal(robot).error(taken),
+                estimation_error(default, taken),
+                estimation_error(paper, taken),
             )
         )
     return rows
@@ -110,3 +108,24 @@ def _line(name: str, values: Sequence[float]) -> str:
     return f'{name}  {off:16.1f}' + ''.join(
         f'{error:{width}.3f}' for error, width in zip(errors, (14, 15, 9, 7), strict=True)
     )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Train both presets, record the motion on every individual and print the errors."""
+    parser = Parser('calibration', 'Prints how far the emulated arms are from their model.')
+    parser.add_robot()
+    parser.add_seeds(tuple(range(10)))
+    parser.add_minutes('duration of the held-out motion', 5.0)
+    args = parser.parse_args(argv)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
+        seeds = tqdm(args.seeds, unit='individual', disable=None)
+        print(table(calibration(robot, default, paper, seeds, args.minutes)))
+
+    return exit_status(work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

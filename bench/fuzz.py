@@ -10,7 +10,6 @@ reported, only their number counts. Anything else, or more than 5 s, is a failur
 
 from __future__ import annotations
 
-import argparse
 import random
 import resource
 import shutil
@@ -25,6 +24,7 @@ from typing import NamedTuple
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.options import Parser, whole
 
 LONGEST = 5.0  # [s] for one bag
 MESSAGES = 50
@@ -56,14 +56,14 @@ def bases(folder: Path, content: list[samples.Sample]) -> list[Base]:
         samples.write_ours(folder / compression, content, compression, finish=True)
     samples.write_ours(folder / 'killed', content, 'zstd', finish=False)
     samples.write_rosbags(folder / 'rosbags', content)
-    found = []
+    kinds = []
     for directory in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = {file.name: file.read_bytes() for file in sorted(directory.iterdir())}
-        found.append(Base(directory.name, files))
+        kinds.append(Base(directory.name, files))
     for name, options in samples.BARE.items():
         samples.write_mcap(folder / 'bare.mcap', content, **options)
-        found.append(Base(name, {'bare.mcap': (folder / 'bare.mcap').read_bytes()}))
-    return found
+        kinds.append(Base(name, {'bare.mcap': (folder / 'bare.mcap').read_bytes()}))
+    return kinds
 
 
 def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
@@ -120,7 +120,7 @@ def attempt(path: Path, base: Base, content: list[samples.Sample], unfinished: b
         outcome = f'crash: {type(error).__name__}: {error}'
     else:
         read = [message[:4] for message in messages]
-        checked = all(found.checked for found in bag.scans)
+        checked = all(file.checked for file in bag.files)
         if not checked:
             sound = len(read) == len(expected) or bool(bag.unfinished)
         else:
@@ -165,12 +165,12 @@ def fuzz(count: int, seed: int) -> tuple[Counter[str], list[str], float]:
     return outcomes, failures, slowest
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Print a summary; exit status 1 if there was a failure."""
-    parser = argparse.ArgumentParser(description='Damages bags at random and reads them.')
-    parser.add_argument('--count', type=int, default=10_000, help='bags (10000)')
-    parser.add_argument('--seed', type=int, default=0, help='(0)')
-    options = parser.parse_args()
+    parser = Parser('fuzz', 'Damages bags at random and reads them.')
+    parser.add_argument('--count', type=whole(1, 10_000_000), default=10_000, help='bags')
+    parser.add_seed('of the damage')
+    options = parser.parse_args(argv)
     # A reader that asks for what a damaged length claims then fails instead of taking the machine.
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     begin = time.monotonic()

@@ -36,8 +36,8 @@ from musculoskeletal_ae.experiments.online_learning import (
 from musculoskeletal_ae.experiments.recording import Recording, motion, record
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic

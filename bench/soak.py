@@ -29,7 +29,7 @@ from musculoskeletal_ae.experiments.online_learning import HELD_OUT_STREAM, held
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
 from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PART = 300.0  # [s] of robot time that is recorded and learned at once

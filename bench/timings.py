@@ -1,36 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of each step of the core beside the same step in plain torch, in one run.
 
-python -m bench.timings [--robot NAME|DIR] [--preset NAME]
+    python -m bench timings [--robot NAME|DIR] [--preset NAME]
+
+The torch side is the same algorithm with the same numbers going in; only the network runs in torch,
+and its gradients come from autograd.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from bench.timings_control import control_rows
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import first_command
-from musculoskeletal_ae.mae.evaluation import unseen_states
+from musculoskeletal_ae.control import methods as control
+from musculoskeletal_ae.control.methods import first_command, msc_compensation
+from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
-from musculoskeletal_ae.mae.training import initial_training
-from musculoskeletal_ae.mae.units import Mask, scale_vector
+from musculoskeletal_ae.mae.network import Network, from_mae
+from musculoskeletal_ae.mae.training import initial_mae, random_states
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 MANY = 4096
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One line of the table; without a torch side where there is nothing to compare.
 
     A call that does the work of several counts as so many.
@@ -61,10 +65,9 @@ def row_time(row: Row, function: Callable[[], object]) -> float:
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:
     """Return the steps of the network itself; weights do not matter for time."""
-    network, _ = initial_training(robot, preset, steps=1)
-    mae = to_mae(network, robot.joints, robot.muscles, preset, 'benchmark')
+    mae = initial_mae(robot, preset, steps=1).mae
     eager = from_mae(mae)
-    states = unseen_states(robot, 1, np.random.default_rng(0), 0.0, robot.tension.limit)
+    states = random_states(robot, 1, np.random.default_rng(0), robot.tension.limit)
     theta, tension, length = (part[0] for part in states)
     z = mae.encode(Mask.THETA_TENSION, theta, tension)
     scaled = torch.as_tensor(mae.decode_scaled(z), dtype=torch.float32)[None]
@@ -87,17 +90,104 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
             lambda: mae.decode_pullback(z)[1](gradient),
             lambda: _eager_gradient(eager, latent),
         ),
-        Row(
-            'decode and Jacobian by z',
-            lambda: mae.decode_jacobian_scaled(z),
-            lambda: torch.autograd.functional.jacobian(eager.decode, latent),
-        ),
         Row('muscle Jacobian G from ①', lambda: mae.muscle_jacobian(theta, tension)),
         Row(
             'the same by forward difference', lambda: mae.muscle_jacobian_difference(theta, tension)
         ),
-        *(Row(*row) for row in control_rows(robot, mae, eager)),
+        *control_rows(robot, mae, eager),
     ]
+
+
+def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
+    """Return the solves of the methods at one posture; weights do not matter for time."""
+    theta = 0.5 * (robot.lower + robot.upper)
+    torque = robot.kinematics.holding_torque(theta)
+    tension = np.full(robot.muscle_count, robot.tension.bias)
+    limit, joints = robot.tension.limit, robot.joint_count
+    return [
+        Row(
+            'control solve: proposed, default',
+            lambda: control.proposed(robot, mae, theta, torque, tension, limit),
+            lambda: eager_proposed(robot, eager, theta, torque, tension),
+        ),
+        Row(
+            'control solve: proposed, paper',
+            lambda: control.proposed_paper(robot, mae, theta, torque, tension),
+            lambda: eager_proposed_paper(robot, eager, theta, torque, tension),
+        ),
+        Row(
+            'control solve: stiffness',
+            lambda: stiffness_command(robot, mae, theta, torque, np.full(joints, 20.0), limit),
+        ),
+    ]
+
+
+def _enter(network: Network, theta: Tensor, tension: Tensor) -> Tensor:
+    """Return z = ①(θ, T) of scaled rows."""
+    length = torch.zeros(*theta.shape[:-1], network.muscles)
+    values = torch.cat([theta, tension, length], dim=-1)
+    mask = torch.full((len(values),), list(Mask).index(Mask.THETA_TENSION))
+    return network.encode(values, mask)
+
+
+def _tensor(values: Array) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
+
+
+def eager_proposed(
+    robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
+) -> Array:
+    """Return l_target [m] of preset `default`; arguments as for `control.proposed`."""
+    muscles = network.muscles
+    posture, bias = _tensor(theta), robot.tension.bias
+
+    def lengths(pull: Tensor, at: Tensor) -> Tensor:
+        return network.decode(_enter(network, at[None], pull[None]))[0, -muscles:]
+
+    for _ in range(control.SOLVES):
+        at_posture = partial(lengths, _tensor(TENSION_SCALE * tension))
+        slope = torch.autograd.functional.jacobian(at_posture, posture)
+        jacobian = slope.numpy().astype(float) / LENGTH_SCALE
+        tension = least_tension(jacobian, torque, bias, robot.tension.limit).tension
+    with torch.no_grad():
+        length = lengths(_tensor(TENSION_SCALE * tension), posture).numpy() / LENGTH_SCALE
+    command: Array = length + msc_compensation(robot, tension)
+    return command
+
+
+def eager_proposed_paper(
+    robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
+) -> Array:
+    """Return l_target [m] of preset `paper`; arguments as for `control.proposed_paper`."""
+    joints, muscles, step = network.joints, network.muscles, 0.01
+    with torch.no_grad():
+        postures = _tensor(theta) + torch.cat([torch.zeros(1, joints), step * torch.eye(joints)])
+        pulls = _tensor(TENSION_SCALE * tension).expand(joints + 1, -1)
+        latent = _enter(network, postures, pulls)
+        lengths = network.decode(latent)[:, -muscles:] / LENGTH_SCALE
+        jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE  # (D, M), acts on scaled T
+        z, aim, load = latent[0], _tensor(theta), _tensor(torque)
+        steps = torch.linspace(0.0, control.SEARCH.largest_step, control.SEARCH.candidates + 1)
+
+    def loss(y: Tensor) -> Tensor:
+        pull = y[..., joints : joints + muscles]
+        return (
+            control.TENSION_WEIGHT * pull.norm(dim=-1)
+            + control.POSTURE_WEIGHT * (y[..., :joints] - aim).norm(dim=-1)
+            + control.TORQUE_WEIGHT * (load + pull @ jacobian.T).norm(dim=-1)
+        )
+
+    for _ in range(control.SEARCH.epochs):
+        leaf = z.clone().requires_grad_()
+        gradient = torch.autograd.grad(loss(network.decode(leaf)), leaf)[0]
+        with torch.no_grad():
+            candidates = z - steps[:, None] * gradient / gradient.norm()
+            z = candidates[loss(network.decode(candidates)).argmin()]
+    with torch.no_grad():
+        state = network.decode(z).numpy().astype(float)
+    pulled = state[joints : joints + muscles] / TENSION_SCALE
+    command: Array = state[-muscles:] / LENGTH_SCALE + msc_compensation(robot, pulled)
+    return command
 
 
 class EagerLengths:
@@ -127,8 +217,7 @@ class EagerLengths:
 
 def simulation_rows(robot: Robot, preset: str) -> list[Row]:
     """Return one step of the simulator (its preset default), one arm and many at once."""
-    network, _ = initial_training(robot, preset, steps=200)
-    mae = to_mae(network, robot.joints, robot.muscles, preset, 'benchmark')
+    mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
     def step(arms: int, body: Any) -> Callable[[], object]:
@@ -159,20 +248,21 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
     return torch.autograd.grad(network.decode(leaf).sum(), leaf)
 
 
-def main(argv: list[str] | None = None) -> None:
+def measure(robot: Robot, preset: str) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='benchmark')
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--preset', default='default', choices=('default', 'paper'))
-    args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    robot = Robot.load(args.robot)
-    print(f'{args.robot}, preset {args.preset}, µs of one call (median), torch on one thread')
+    name = robot.description.directory.name
+    print(f'{name}, preset {preset}, µs of one call (median), torch on one thread')
     print(f'{"":<34}{"ours":>10}{"torch eager":>14}')
-    for row in mae_rows(robot, args.preset) + simulation_rows(robot, args.preset):
+    for row in mae_rows(robot, preset) + simulation_rows(robot, preset):
         eager = '' if row.torch_eager is None else f'{row_time(row, row.torch_eager):.1f}'
         print(f'{row.name:<34}{row_time(row, row.ours):>10.1f}{eager:>14}')
 
 
-if __name__ == '__main__':
-    main()
+def main(argv: list[str] | None = None) -> int:
+    """Measure on one robot with one preset."""
+    parser = Parser('timings', 'Times each step of the core beside the same in plain torch.')
+    parser.add_robot()
+    parser.add_preset()
+    args = parser.parse_args(argv)
+    return exit_status(lambda: measure(Robot.load(args.robot), args.preset))

@@ -4,13 +4,23 @@
 from __future__ import annotations
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.messages import read_array
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.validity import read_array
 
 RATE_LIMIT = 0.2  # [m/s]
+LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
+NODES = {
+    'hardware_emulator': HardwareEmulator,
+    'estimator': Estimator,
+    'controller': Controller,
+}
 
 
 class ControlledArm:
@@ -38,8 +48,9 @@ class ControlledArm:
         self.says('no target')  # it knows posture and network
 
     def start(self, name, **parameters):
-        make = self.graph.start if name in self.processes else self.graph.run
-        return make(name, robot='arm26', **parameters)
+        if name in self.processes:
+            return self.graph.start(name, robot='arm26', **parameters)
+        return self.graph.host(NODES[name], robot='arm26', **parameters)
 
     def start_controller(self):
         return self.start(
@@ -87,23 +98,25 @@ class ControlledArm:
     def state(self, node='controller'):
         """Return what a node says of itself: the controller now, others once a second."""
         if node == 'controller' and node not in self.processes:
-            level, message, values = self.controller.state()
-            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-            return DiagnosticStatus(level=level, message=message, values=pairs)
+            return self.controller.report()
         name = f'{self.graph.namespace}/{node}: state'
         for message in reversed(self.graph.received['/diagnostics']):
             for status in message.status:
                 if status.name == name:
-                    return status
-        return DiagnosticStatus()
+                    values = {pair.key: pair.value for pair in status.values}
+                    return Report(LEVELS[status.level], status.message, values)
+        return Report('warn', 'not heard of', {})
 
     def said(self, key):
         """Return a value of the controller's diagnostics, once it is there."""
         self.says(key)
-        return {pair.key: pair.value for pair in self.state().values}[key]
+        return self.state().values[key]
 
     def says(self, words, node='controller'):
         """Wait until the node's diagnostics contain words."""
-        self.graph.wait(
-            lambda: words in f'{self.state(node).message} {self.state(node).values}', repr(words)
-        )
+
+        def said():
+            state = self.state(node)
+            return words in f'{state.message} {state.values}'
+
+        self.graph.wait(said, repr(words))

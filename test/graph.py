@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test's view of a real ROS graph: real DDS, nodes or their processes, waits with deadlines."""
+"""A test's view of a real ROS graph: nodes here or in processes, real DDS, waits with deadlines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -72,26 +71,8 @@ class Graph:
         self.executor.add_node(self.node)
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
-        self.nodes: list[Node] = []
         self.processes: list[Process] = []
-
-    def run(self, name: str, **parameters: Any) -> Node:
-        """Run a node in this process, in this graph's namespace; it works while the test waits."""
-        module = import_module(f'musculoskeletal_ae.nodes.{name}')
-        node: Node = getattr(module, name.title().replace('_', ''))(
-            context=self.context,
-            namespace=self.namespace,
-            parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
-        )
-        self.executor.add_node(node)
-        self.nodes.append(node)
-        return node
-
-    def end(self, node: Node) -> None:
-        """End a node that runs in this process."""
-        self.nodes.remove(node)
-        self.executor.remove_node(node)
-        node.destroy_node()
+        self.hosted: list[Node] = []
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -103,6 +84,25 @@ class Graph:
         process = Process(name, [*executable(name), *arguments])
         self.processes.append(process)
         return process
+
+    def host(self, kind: type[Node], **parameters: Any) -> Any:
+        """Run a node with parameters in this process, where a process of its own adds nothing."""
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = kind(
+            context=self.context,
+            namespace=self.namespace,
+            use_global_arguments=False,
+            parameter_overrides=overrides,
+        )
+        self.hosted.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def end(self, node: Node) -> None:
+        """End a node that runs in this process."""
+        self.hosted.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
 
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
         """Subscribe; return the list that messages are appended to."""
@@ -161,9 +161,8 @@ class Graph:
         """Leave the graph and end what was started."""
         for process in self.processes:
             process.end()
-        for node in list(self.nodes):
-            self.end(node)
-        self.node.destroy_node()
+        for node in (*self.hosted, self.node):
+            node.destroy_node()
         rclpy.shutdown(context=self.context)
 
 

@@ -8,36 +8,29 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
+from musculoskeletal_ae.files import parse_yaml, read_yaml
 
 FILE = 'metadata.yaml'
 VERSION = 9
-# Of what rosbag2 writes no metadata comes near; YAML is slow to read.
-_LARGEST = 1 << 20
-_MARK = 'musculoskeletal_ae_unfinished'
-_NO_TIME = (1 << 63) - 1  # rosbag2's starting time of a bag without messages
-_FOREVER = QosTime(9223372036, 854775807)
-_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yaml'
+
+# A QoS profile as rosbag2 writes it in version 9.
+Qos = Mapping[str, Any]
+
+_MARK = 'musculoskeletal_ae_unfinished'
+_NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class TopicCount(NamedTuple):
-    """A topic with its type and number of messages."""
+    """What metadata.yaml says of a topic."""
 
     name: str
     type: str
@@ -46,8 +39,7 @@ class TopicCount(NamedTuple):
     type_hash: str = ''
 
 
-@dataclass(frozen=True)
-class Metadata:
+class Metadata(NamedTuple):
     """What metadata.yaml says.
 
     Attributes:
@@ -59,41 +51,36 @@ class Metadata:
     """
 
     files: Sequence[str]
-    topics: Sequence[TopicCount] = field(default=())
-    start: int | None = None
-    duration: int = 0
-    finished: bool = False
-
-    @property
-    def message_count(self) -> int:
-        """Number of all messages."""
-        return sum(topic.message_count for topic in self.topics)
+    topics: Sequence[TopicCount]
+    start: int | None
+    duration: int
+    finished: bool
 
 
 def offered_qos(latched: bool, depth: int = 10, reliable: bool = True) -> Qos:
     """Return a QoS profile as a publisher offers it."""
-    return Qos(
-        QosHistory.KEEP_LAST,
-        1 if latched else depth,
-        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
-        _FOREVER,
-        _FOREVER,
-        QosLiveliness.AUTOMATIC,
-        _FOREVER,
-        avoid_ros_namespace_conventions=False,
-    )
+    return {
+        'history': 'keep_last',
+        'depth': 1 if latched else depth,
+        'reliability': 'reliable' if reliable else 'best_effort',
+        'durability': 'transient_local' if latched else 'volatile',
+        'deadline': _FOREVER,
+        'lifespan': _FOREVER,
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': _FOREVER,
+        'avoid_ros_namespace_conventions': False,
+    }
 
 
 def qos_text(profiles: Sequence[Qos]) -> str:
     """Return QoS profiles as rosbag2 writes them into a channel's metadata."""
-    return yaml.safe_dump(dump_qos_v9(list(profiles)), sort_keys=False) if profiles else ''
+    return _yaml(list(profiles)) if profiles else ''
 
 
-def read_qos(text: str) -> list[Qos]:
+def read_qos(text: str) -> Sequence[Qos]:
     """Return the profiles of a channel's metadata; [] where they cannot be read."""
     try:
-        return parse_qos(text) if len(text) < _LARGEST else []
+        return dump_qos_v9(parse_qos(parse_yaml(text)))
     except Exception:  # noqa: BLE001 - the library lets many kinds out; QoS is a hint only
         return []
 
@@ -101,7 +88,8 @@ def read_qos(text: str) -> list[Qos]:
 def write_metadata(directory: Path, metadata: Metadata) -> None:
     """Write metadata.yaml in one step: a reader sees the old one or the new one."""
     start = {'nanoseconds_since_epoch': _NO_TIME if metadata.start is None else metadata.start}
-    duration, count = {'nanoseconds': metadata.duration}, metadata.message_count
+    duration = {'nanoseconds': metadata.duration}
+    count = sum(topic.message_count for topic in metadata.topics)
     content = {
         'version': VERSION,
         'storage_identifier': 'mcap',
@@ -114,7 +102,7 @@ def write_metadata(directory: Path, metadata: Metadata) -> None:
                     'name': topic.name,
                     'type': topic.type,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': dump_qos_v9(list(topic.qos)),
+                    'offered_qos_profiles': list(topic.qos),
                     'type_description_hash': topic.type_hash,
                 },
                 'message_count': topic.message_count,
@@ -131,17 +119,13 @@ def write_metadata(directory: Path, metadata: Metadata) -> None:
         'custom_data': None if metadata.finished else {_MARK: 'true'},
         'ros_distro': 'jazzy',
     }
-    # Aliases (&id001) are legal YAML, but no one expects them in a bag.
-    dumper = type('Plain', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
-    text = yaml.dump({'rosbag2_bagfile_information': content}, Dumper=dumper, sort_keys=False)
-    file = directory / FILE
-    new = file.with_suffix('.yaml.new')
+    new = directory / f'{FILE}.new'
     with new.open('w', encoding='utf-8') as stream:
-        stream.write(text)
+        stream.write(_yaml({'rosbag2_bagfile_information': content}))
         if metadata.finished:
             stream.flush()
             os.fsync(stream.fileno())
-    new.replace(file)
+    new.replace(directory / FILE)
 
 
 def read_metadata(directory: Path) -> Metadata:
@@ -152,22 +136,13 @@ def read_metadata(directory: Path) -> Metadata:
         BagError: If it cannot be used.
     """
     file = directory / FILE
-    try:
-        with file.open('rb') as stream:
-            text = stream.read(_LARGEST + 1)
-    except FileNotFoundError:
+    if not os.path.lexists(file):
         problem = 'is missing, so the recording was not ended'
-        raise UnfinishedBagError(file, None, problem, 'run `record --recover`') from None
-    except OSError as error:
-        raise BagError(file, None, f'cannot be read: {error.strerror}', REMEDY) from error
-    if len(text) > _LARGEST:
-        raise BagError(file, None, f'is larger than {_LARGEST} bytes', REMEDY)
+        raise UnfinishedBagError(file, None, problem, 'run `record --recover`')
     try:
-        return _checked(yaml.load(text, Loader=_Loader))  # noqa: S506 - a safe loader
-    # YAML lets out RecursionError, OverflowError and more.
-    except Exception as error:
-        problem = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        raise BagError(file, None, f'cannot be used: {problem}', REMEDY) from error
+        return _checked(read_yaml(file, _unusable))
+    except ValueError as error:
+        raise _unusable(file, str(error)) from error
 
 
 def _checked(content: Any) -> Metadata:
@@ -189,20 +164,30 @@ def _checked(content: Any) -> Metadata:
         raise ValueError('relative_file_paths must name each file once')
     topics = []
     for entry in _get(info, 'topics_with_message_count', list):
-        topic = _get(entry, 'topic_metadata', dict)
-        count = _get(entry, 'message_count', int)
+        topic, count = _get(entry, 'topic_metadata', dict), _get(entry, 'message_count', int)
         topics.append(TopicCount(_get(topic, 'name', str), _get(topic, 'type', str), count))
     if sum(topic.message_count for topic in topics) != _get(info, 'message_count', int):
         raise ValueError('message_count is not the sum over the topics')
     start = _get(_get(info, 'starting_time', dict), 'nanoseconds_since_epoch', int)
     duration = _get(_get(info, 'duration', dict), 'nanoseconds', int)
     custom = info.get('custom_data')
-    finished = not (isinstance(custom, Mapping) and _MARK in custom)
-    return Metadata(files, topics, start, duration, finished)
+    return Metadata(
+        files, topics, start, duration, not (isinstance(custom, dict) and _MARK in custom)
+    )
 
 
 def _get(entry: Any, key: str, kind: type) -> Any:
-    value = entry.get(key) if isinstance(entry, Mapping) else None
+    value = entry.get(key) if isinstance(entry, dict) else None
     if not isinstance(value, kind) or isinstance(value, bool):
         raise ValueError(f'{key} is missing or not of type {kind.__name__}')
     return value
+
+
+def _yaml(value: object) -> str:
+    # Aliases (&id001) are legal YAML, but no one expects them in a bag.
+    dumper = type('Plain', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
+    return str(yaml.dump(value, Dumper=dumper, sort_keys=False))
+
+
+def _unusable(file: Path, problem: str) -> BagError:
+    return BagError(file, None, f'cannot be used: {problem}', REMEDY)

@@ -10,26 +10,12 @@ import math
 from collections.abc import Collection, Iterator
 from itertools import chain
 
-from musculoskeletal_ae.bags.order import BagMessage
-from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import TOPICS, interface_name
+from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
-
-
-def latched_topics(bag: Bag) -> set[str]:
-    """Return the recorded names of topics whose last message reaches late joiners.
-
-    Those of the interface are latched even if the recorder took no note of it.
-    """
-    return {
-        name
-        for name, topic in bag.topics.items()
-        if 'transient_local' in topic.qos
-        or ((ours := TOPICS.get(interface_name(name))) and ours.latched)
-    }
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:

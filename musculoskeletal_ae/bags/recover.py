@@ -7,7 +7,7 @@ import itertools
 import shutil
 from pathlib import Path
 
-from musculoskeletal_ae.bags.metadata import read_qos
+from musculoskeletal_ae.bags.metadata import FILE, read_qos
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
@@ -27,37 +27,41 @@ def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None
     Raises:
         BagError: If the bag is damaged otherwise, or is finished already.
     """
-    try:
-        finished = not Bag.open(path).unfinished
-    except BagError:
-        finished = False
+    bag, finished = _open(path)
     if finished and out is None:
         raise BagError(path, None, 'the recording is finished', 'there is nothing to recover')
-    bag = _open(path)
-    backup = None
-    if out is None and path.is_dir():
-        path = path.resolve()
-        backup = _free(path, '.unfinished')
-    elif out is None:
-        out = path.with_name(f'{path.stem}_recovered')
+    if out is not None or not path.is_dir():
+        target = out or path.with_name(f'{path.stem}_recovered')
+        return target, _copy(bag, target), None
     # The new bag is complete before the old one is touched; its file carries the final name.
-    target = out or _free(path, '.recovering') / path.name
+    path = path.resolve()
+    backup, scratch = _free(path, '.unfinished'), _free(path, '.recovering')
     try:
-        _copy(bag, target)
-        count = Bag.open(target).message_count
+        count = _copy(bag, scratch / path.name)
     except BaseException:
-        if backup is not None:
-            shutil.rmtree(target.parent, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
         raise
-    if backup is not None:
-        path.rename(backup)
-        target.rename(path)
-        target.parent.rmdir()
-        target = path
-    return target, count, backup
+    path.rename(backup)
+    (scratch / path.name).rename(path)
+    scratch.rmdir()
+    return path, count, backup
 
 
-def _copy(bag: Bag, target: Path) -> None:
+def _open(path: Path) -> tuple[Bag, bool]:
+    """Open what is there, whatever metadata.yaml says; also return whether the bag is finished."""
+    try:
+        bag = Bag.open(path, unfinished=True)
+    except BagError as error:
+        files = sorted(path.glob('*.mcap')) if path.is_dir() else []
+        # metadata.yaml may be what is wrong: the messages are in the mcap file.
+        if len(files) == 1 and error.file == path / FILE:
+            return Bag.open(files[0], unfinished=True), False
+        raise
+    return bag, not bag.unfinished
+
+
+def _copy(bag: Bag, target: Path) -> int:
+    """Write a bag anew and read it again; return its number of messages."""
     with BagWriter(target) as writer:
         numbers = {
             topic.name: writer.add_topic(topic.name, topic.type, read_qos(topic.qos), topic.schema)
@@ -66,18 +70,7 @@ def _copy(bag: Bag, target: Path) -> None:
         for message in bag.messages():
             number = numbers[message.topic]
             writer.write(number, message.log_time, message.publish_time, message.data)
-
-
-def _open(path: Path) -> Bag:
-    """Open what is there, whatever metadata.yaml says."""
-    try:
-        return Bag.open(path, unfinished=True)
-    except BagError as error:
-        files = sorted(path.glob('*.mcap')) if path.is_dir() else []
-        # metadata.yaml may be what is wrong: the messages are in the mcap file.
-        if len(files) == 1 and error.file == path / 'metadata.yaml':
-            return Bag.open(files[0], unfinished=True)
-        raise
+    return Bag.open(target).message_count
 
 
 def _free(path: Path, suffix: str) -> Path:

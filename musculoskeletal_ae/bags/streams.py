@@ -3,22 +3,24 @@
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.selection import interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.messages import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.pairing import Paired, Pairing
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import LATE, QUANTITIES, SourceOrder, read_array, read_posture
 
 # A source time that lies further back than this is another publisher's clock, not a reordering.
-_REORDERING = 1_000_000_000  # [ns]
 
 
 class Series(NamedTuple):
@@ -56,25 +58,34 @@ class Streams:
     rejected: Counter[str]
 
     def pairs(self, period: float | None = None) -> Pairs:
-        """Pair each (T, l) with the nearest θ, if that is within half a period.
+        """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.pairing`).
 
         Args:
             period: Of muscle_states [s]; None for the median one of the recording.
         """
-        time, joint_time = self.muscles.time, self.joints.time
+        time = self.muscles.time
         if period is None:
             period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        if not len(joint_time):
-            found = nearest = np.zeros(0, dtype=int)
-        else:
-            right = np.searchsorted(joint_time, time).clip(0, len(joint_time) - 1)
-            left = (right - 1).clip(0)
-            closer_left = np.abs(time - joint_time[left]) <= np.abs(time - joint_time[right])
-            nearest = np.where(closer_left, left, right)
-            found = np.flatnonzero(np.abs(time - joint_time[nearest]) <= period / 2)
-        chosen = self.muscles.values[found]
-        theta = self.joints.values[nearest[found]]
-        return Pairs(time[found], theta, chosen[:, 0], chosen[:, 1])
+        pairing = Pairing(period)
+        paired: list[Paired | None] = []
+        joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
+        muscles = ((came, 1, row) for row, came in enumerate(time))
+        # A muscle message at the end of time gives out the last one.
+        end = [(math.inf, 1, -1)] if len(time) else []
+        for came, kind, row in heapq.merge(joints, muscles, end):
+            if kind == 0:
+                pairing.joints(came, self.joints.values[row])
+            else:
+                length, tension, _ = self.muscles.values[row]
+                paired.append(pairing.muscles(came, tension, length))
+        matched = [one for one in paired if one is not None and one.theta is not None]
+        shape = -1, self.muscles.values.shape[2]
+        return Pairs(
+            np.array([one.time for one in matched]),
+            np.array([one.theta for one in matched]).reshape(-1, self.joints.values.shape[1]),
+            np.array([one.length for one in matched]).reshape(shape),
+            np.array([one.tension for one in matched]).reshape(shape),
+        )
 
 
 def read_streams(
@@ -92,44 +103,46 @@ def read_streams(
         BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
     muscles = robot.muscle_count
-    topics = interface_topics(bag, namespace)
-    rejected: Counter[str] = Counter()
-
-    def series(topic: str, shape: tuple[int, ...], read: Callable[[Any], Array]) -> Series:
-        return _series(bag, topics.get(topic), shape, read, rejected)
-
-    return Streams(
-        series(joint_topic, (robot.joint_count,), lambda m: read_posture(m, robot.joints)),
-        series('muscle_states', (3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
-        series('muscle_length_command', (muscles,), lambda m: read_array(m, 1, muscles)),
-        series('muscle_tension_command', (muscles,), lambda m: read_array(m, 1, muscles)),
-        rejected,
-    )
-
-
-def _series(
-    bag: Bag,
-    topic: str | None,
-    shape: tuple[int, ...],
-    read: Callable[[Any], Array],
-    rejected: Counter[str],
-) -> Series:
-    times: list[float] = []
-    values: list[Array] = []
-    last_source, why = 0, ''
-    for message in bag.messages([topic]) if topic else ():
-        # As nodes do: of messages that come twice or late, the later ones are dropped.
-        if 0 <= last_source - message.publish_time < _REORDERING and message.publish_time:
-            rejected[f'{topic}: repeated or reordered'] += 1
+    streams = {
+        joint_topic: _Stream((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
+        'muscle_states': _Stream((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
+        'muscle_length_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
+        'muscle_tension_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
+    }
+    recorded = interface_topics(bag, namespace)
+    topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
+    start, rejected = bag.start, Counter[str]()
+    for message in bag.messages(topics):
+        topic, stream = message.topic, topics[message.topic]
+        if stream.order.is_late(message.publish_time):
+            rejected[f'{topic}: {LATE}'] += 1
             continue
-        last_source = message.publish_time
+        stream.order.take(message.publish_time)
         try:
-            values.append(read(bag.decode(message)))
-            times.append((message.log_time - bag.start) / 1e9)
+            stream.values.append(stream.read(bag.decode(message)))
+            stream.times.append((message.log_time - start) / 1e9)
         except MessageError as error:
             rejected[f'{topic}: {error.reason}'] += 1
-            why = str(error)
-    if why and not values:
-        problem = f'no message of {topic} fits the robot ({why})'
-        raise BagError(bag.path, None, problem, 'choose the robot it was recorded from')
-    return Series(np.array(times), np.array(values).reshape(len(values), *shape))
+            stream.problem = str(error)
+    for topic, stream in topics.items():
+        if stream.problem and not stream.values:
+            problem = f'no message of {topic} fits the robot ({stream.problem})'
+            raise BagError(bag.path, None, problem, 'choose the robot it was recorded from')
+    joints, states, lengths, tensions = (stream.series for stream in streams.values())
+    return Streams(joints, states, lengths, tensions, rejected)
+
+
+@dataclass
+class _Stream:
+    """A topic that is being read: the shape of its values, and what was wrong with the last one."""
+
+    shape: tuple[int, ...]
+    read: Callable[[Any], Array]
+    order: SourceOrder = field(default_factory=SourceOrder)
+    times: list[float] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
+    problem: str = ''
+
+    @property
+    def series(self) -> Series:
+        return Series(np.array(self.times), np.array(self.values).reshape(-1, *self.shape))

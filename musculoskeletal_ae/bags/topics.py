@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of INTERFACE.md, and the namespace a recording has them under."""
+"""The topics of the interface (doc/interface.md), and which of a bag's topics they are."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.exceptions import BagError
 
 
 class Topic(NamedTuple):
-    """One row of INTERFACE.md's table.
+    """One row of the table in doc/interface.md.
 
     Attributes:
         type: ROS message type.
@@ -29,6 +30,7 @@ _WRENCH = 'geometry_msgs/msg/WrenchStamped'
 _MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
+DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = {
     'joint_states': Topic(_JOINTS, sent=True),
@@ -57,46 +59,121 @@ TOPICS = {
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
 
 
-def _namespaces(name: str) -> set[str]:
-    return {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
+def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
+    """Return the recorded name of each topic of the interface, by its relative name.
+
+    Args:
+        bag: An opened bag.
+        namespace: The one that is meant where the bag has several.
+
+    Raises:
+        BagError: If there are several, or a topic has a type other than the interface's.
+    """
+    names = _relative_names(bag, namespace)
+    ours = {relative: name for name, relative in names.items() if relative in TOPICS}
+    for relative, name in ours.items():
+        _compare_type(bag, name, relative)
+    return ours
 
 
-def recorded_namespace(names: Iterable[str], wanted: str | None = None) -> str:
-    """Return the namespace ('' or '/left_arm') under which the topics were recorded.
+def select(
+    bag: Bag, wanted: Sequence[str], namespace: str | None, keep_names: bool
+) -> dict[str, str]:
+    """Return the name to publish each wanted topic on, by its recorded name.
+
+    Args:
+        bag: An opened bag.
+        wanted: `default` (what hardware, vision, user and controller sent), `all` (every topic of
+            the interface), or relative or recorded names; these may be foreign to the interface.
+        namespace: The one that is meant where the bag has several.
+        keep_names: Publish under the recorded names.
+
+    Raises:
+        BagError: If nothing is left, or a wanted topic is not there or cannot be used.
+    """
+    if keep_names and namespace is None:
+        # Several namespaces are no problem when all names stay as they are.
+        names = {name: interface_name(name) for name in bag.topics}
+    else:
+        names = _relative_names(bag, namespace)
+    has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
+    if list(wanted) in ([DEFAULT], [ALL]):
+        relevant = SENT if list(wanted) == [DEFAULT] else TOPICS
+        chosen = [name for name, relative in names.items() if relative in relevant]
+        if not chosen:
+            problem = f'has no topic to replay by default; {has}'
+            raise BagError(bag.path, None, problem, 'choose with --topics all or --topics NAME,…')
+    else:
+        chosen = []
+        for name in wanted:
+            named = [
+                recorded for recorded, relative in names.items() if name in (recorded, relative)
+            ]
+            if not named:
+                raise BagError(bag.path, None, f'topic {name} is not in the bag', has)
+            chosen += named
+    for name in chosen:
+        _compare_type(bag, name, names[name])
+    return {name: name if keep_names else names[name] for name in chosen}
+
+
+def latched_topics(bag: Bag) -> set[str]:
+    """Return the recorded names of topics whose last message reaches late joiners.
+
+    Those of the interface are latched even if the recorder took no note of it.
+    """
+    latched = {name for name, topic in TOPICS.items() if topic.latched}
+    return {
+        name
+        for name, topic in bag.topics.items()
+        if 'transient_local' in topic.qos or interface_name(name) in latched
+    }
+
+
+def namespaces(names: Iterable[str]) -> list[str]:
+    """Return the namespaces ('' or '/left_arm') under which the topics were recorded.
 
     `/sim/joint_states` alone may be the joint_states of a namespace `/sim`: of the namespaces that
-    explain all topics of the interface, the shortest is meant.
+    explain all topics of the interface, the shortest is meant. Only if none does there are several.
 
     Args:
         names: The recorded absolute names; foreign ones are of no account.
-        wanted: The namespace to take when there are several.
-
-    Raises:
-        MusculoskeletalError: If there are several and none is wanted.
     """
-    if wanted is not None:
-        return f'/{wanted.strip("/")}'.rstrip('/')
-    readings = [found for name in names if (found := _namespaces(name))]
-    if not readings:
-        return ''
-    common = set.intersection(*readings)
-    if common:
-        return min(common, key=len)
-    several = sorted({min(found, key=len) or '/' for found in readings})
-    raise MusculoskeletalError(
-        f'topics of the interface lie under several namespaces: {", ".join(several)}; '
-        'choose one with --from-namespace, or keep the recorded names with --keep-names'
-    )
-
-
-def relative_name(name: str, namespace: str) -> str:
-    """Return a recorded name without its namespace; a name outside it stays absolute."""
-    if name == DIAGNOSTICS or not name.startswith(f'{namespace}/'):
-        return name
-    return name[len(namespace) + 1 :]
+    readings = [
+        {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
+        for name in names
+    ]
+    readings = [reading for reading in readings if reading]
+    common = set.intersection(*readings) if readings else {''}
+    return [min(common, key=len)] if common else sorted({min(r, key=len) for r in readings})
 
 
 def interface_name(name: str) -> str:
     """Return the longest name of the interface that a recorded name ends in, or the name."""
     endings = [topic for topic in TOPICS if name.endswith(f'/{topic.lstrip("/")}')]
     return max(endings, key=len, default=name)
+
+
+def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
+    """Return each recorded name without the namespace; names outside it stay absolute."""
+    if namespace is None:
+        namespace, *others = namespaces(bag.topics)
+        if others:
+            several = ', '.join(name or '/' for name in (namespace, *others))
+            problem = f'topics of the interface lie under several namespaces: {several}'
+            remedy = (
+                'choose one with --from-namespace, or keep the recorded names with --keep-names'
+            )
+            raise BagError(bag.path, None, problem, remedy)
+    prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
+    return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}
+
+
+def _compare_type(bag: Bag, name: str, relative: str) -> None:
+    topic = bag.topics[name]
+    expected = TOPICS[relative].type if relative in TOPICS else topic.type
+    if topic.type != expected:
+        problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
+        raise BagError(bag.path, None, problem, 'rename the topic where it is recorded')
+    if topic.refused:
+        raise BagError(bag.path, None, f'topic {name} {topic.refused}', 'leave it out')

@@ -3,21 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
-from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags import definitions
-from musculoskeletal_ae.bags.metadata import Metadata, TopicCount, qos_text, write_metadata
+from musculoskeletal_ae.bags import message_types
+from musculoskeletal_ae.bags.metadata import Metadata, Qos, TopicCount, qos_text, write_metadata
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 # A chunk is also closed when it has grown to this size.
-_LARGEST_CHUNK = 1 << 20
+_LARGEST_CHUNK = 1 << 20  # [bytes]
 
 
 class BagWriter:
@@ -38,23 +38,22 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._pending: list[tuple[int, int, int, bytes]] = []
         self._pending_size = 0
-        self._times: tuple[int, int] | None = None
-        try:
+        self._counts: Counter[int] = Counter()
+        self._start: int | None = None
+        self._end = 0
+        with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
-                raise BagError(
-                    self.directory, None, 'is not empty', 'name a new directory to record to'
-                )
+                remedy = 'name a new directory to record to'
+                raise BagError(self.directory, None, 'is not empty', remedy)
             self._file = (self.directory / self._name).open('xb')
-        except OSError as error:
-            raise self._unwritable(error) from error
-        self._mcap = Writer(
-            self._file,
-            chunk_size=_LARGEST_CHUNK,
-            compression=COMPRESSIONS[compression],
-            enable_data_crcs=True,
-        )
-        self._mcap.start(profile='ros2')
+            self._mcap = Writer(
+                self._file,
+                chunk_size=_LARGEST_CHUNK,
+                compression=COMPRESSIONS[compression],
+                enable_data_crcs=True,
+            )
+            self._mcap.start(profile='ros2')
         self.flush()
         self._write_metadata(finished=False)
 
@@ -69,11 +68,11 @@ class BagWriter:
             qos: Profiles its publishers offer.
             schema: A definition to copy as it is, for a type that is not of ROS 2 Jazzy.
         """
-        if definitions.known(type_name):
-            text, type_hash = definitions.definition(type_name), definitions.type_hash(type_name)
-            schema = Schema(0, text.encode(), definitions.ENCODING, type_name)
-        else:
-            type_hash = ''
+        type_hash = ''
+        if message_types.known(type_name):
+            type_hash = message_types.type_hash(type_name)
+            text = message_types.definition(type_name).encode()
+            schema = Schema(0, text, message_types.ENCODING, type_name)
         if type_name not in self._schemas:
             schema = schema or Schema(0, b'', '', type_name)
             self._schemas[type_name] = self._mcap.register_schema(
@@ -102,67 +101,54 @@ class BagWriter:
     def flush(self) -> None:
         """Close the chunk and give it to the operating system."""
         # Callbacks of several topics come a little out of order; readers like files in order.
-        self._pending.sort(key=lambda entry: entry[0])
-        try:
-            for log_time, topic, publish_time, data in self._pending:
+        pending = sorted(self._pending, key=lambda entry: entry[0])
+        self._pending, self._pending_size = [], 0
+        with self._writing():
+            for log_time, topic, publish_time, data in pending:
                 self._mcap.add_message(topic, log_time, data, publish_time)
-                self._topics[topic] = self._topics[topic]._replace(
-                    message_count=self._topics[topic].message_count + 1
-                )
-            if self._pending:
-                first, last = self._pending[0][0], self._pending[-1][0]
-                earliest, latest = self._times or (first, last)
-                self._times = min(first, earliest), max(last, latest)
+                self._counts[topic] += 1
+                self._start = min(log_time, log_time if self._start is None else self._start)
+                self._end = max(log_time, self._end)
             self._mcap.flush()
-        except OSError as error:
-            raise self._unwritable(error) from error
-        finally:
-            self._pending, self._pending_size = [], 0
 
     @property
     def message_count(self) -> int:
         """Messages in the file."""
-        return sum(topic.message_count for topic in self._topics.values())
+        return sum(self._counts.values())
 
     def close(self) -> None:
         """End the file and its metadata.yaml."""
         self.flush()
-        try:
+        with self._writing():
             self._mcap.finish()
             self._file.close()
-        except OSError as error:
-            raise self._unwritable(error) from error
         self._write_metadata(finished=True)
 
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End the bag; after an error it stays marked as unfinished."""
-        if error is None:
+        if kind is None:
             self.close()
         else:
             self._file.close()
 
     def _write_metadata(self, finished: bool) -> None:
-        start, last = self._times or (None, 0)
         # Counts come with the end: until then readers go by what is in the mcap file.
-        topics = [t if finished else t._replace(message_count=0) for t in self._topics.values()]
-        if not finished:
-            start = None
-        duration = last - start if start is not None else 0
-        try:
+        topics, start, duration = list(self._topics.values()), None, 0
+        if finished and self._start is not None:
+            start, duration = self._start, self._end - self._start
+            topics = [t._replace(message_count=self._counts[n]) for n, t in self._topics.items()]
+        with self._writing():
             write_metadata(
                 self.directory, Metadata([self._name], topics, start, duration, finished)
             )
-        except OSError as error:
-            raise self._unwritable(error) from error
 
-    def _unwritable(self, error: OSError) -> BagError:
-        reason = error.strerror or str(error)
-        return BagError(self.directory, None, f'cannot be written: {reason}', 'name another place')
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            problem = f'cannot be written: {error.strerror or error}'
+            raise BagError(self.directory, None, problem, 'name another place') from error

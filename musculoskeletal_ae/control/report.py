@@ -3,23 +3,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 NOTABLE = 0.05  # [N·m] of missing torque
-
-
-class Report(NamedTuple):
-    """Level ('ok', 'warn' or 'error'), one line, and named values."""
-
-    level: str
-    message: str
-    values: dict[str, str]
 
 
 def control_report(robot: Robot, control: Controller, now: float) -> Report:

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
@@ -89,7 +89,6 @@ class EmulatedArm:
         self._payload = 0.0
         self._body = self._constants()
         muscles, joints = robot.muscle_count, robot.joint_count
-        self._length_offset = np.zeros(muscles)
         self._command = mechanics.Command(np.zeros(muscles), self.individual.length_bias.copy())
         tree_joints = self.individual.tree.parent.shape[0]
         self._scratch = mechanics.Scratch(
@@ -151,7 +150,7 @@ class EmulatedArm:
         self._kind = mechanics.SAFE
         self._age = 0.0
 
-    def _attach(self, which: NDArray[np.bool_]) -> None:
+    def _attach(self, which: Bools) -> None:
         """Wind the given muscles so that they carry T_bias in the present posture."""
         bias = np.full(self.robot.muscle_count, self.robot.tension.bias)
         length = self.individual.muscle_lengths(self.theta[None], bias)[0]
@@ -204,9 +203,16 @@ class EmulatedArm:
         """Push the end effector with force [N] and torque [N·m], axes of the root link, (6,)."""
         self._wrench[:] = wrench
 
-    def set_length_offset(self, offset: Array) -> None:
-        """Shift the length sensors by an offset [m], shape (M,), as after re-wiring."""
-        self._command.length_error[:] = self.individual.length_bias + offset
+    def set_length_offset(self, offset: Array | Sequence[float]) -> None:
+        """Shift the length sensors as re-wiring does: by one offset [m] for all, or one for each.
+
+        Raises:
+            MusculoskeletalError: If there are other numbers of them; nothing changes then.
+        """
+        if len(offset) not in (1, self.robot.muscle_count):
+            legal = f'1 or {self.robot.muscle_count} numbers [m]'
+            raise MusculoskeletalError(f'{list(offset)}; legal: {legal}')
+        self._command.length_error[:] = self.individual.length_bias + np.asarray(offset)
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:
         """Cut the named muscles and mend all others, which take up T_bias where they are.

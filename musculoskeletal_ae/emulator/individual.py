@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -132,9 +131,7 @@ class Individual:
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
 
-def _bone_heads(
-    robot: Robot, quantile: float, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], Array]:
+def _bone_heads(robot: Robot, quantile: float, rng: np.random.Generator) -> tuple[Ints, Array]:
     """Return for each segment the joint whose head it may wrap round, and the head's radius.
 
     The head sits at the joint centre nearest to the line. It is thick enough to touch the line in

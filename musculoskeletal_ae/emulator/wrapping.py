@@ -18,11 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
-
-Ints = NDArray[np.int64]
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 
 
 class Tree(NamedTuple):
@@ -40,7 +37,7 @@ class Tree(NamedTuple):
     rotation: Array
     translation: Array
     axis: Array
-    prismatic: NDArray[np.bool_]
+    prismatic: Bools
 
 
 class WrappedRoutes(NamedTuple):

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
-from musculoskeletal_ae.mae.mae import Mae, State
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Name of the distance threshold among the thresholds of the checkpoint.
@@ -102,11 +102,8 @@ class AnomalyDetector:
             length: Measured [m], shape (M,).
             dt: Time since the message before [s].
         """
-        tension_error = TENSION_SCALE * (state.tension - tension)
-        length_error = LENGTH_SCALE * (state.length - length)
-        anomaly = float(np.sqrt(tension_error @ tension_error))
-        anomaly += float(np.sqrt(length_error @ length_error))
-        error = np.concatenate([tension_error, length_error])
+        error = residuals(state, tension, length)
+        size = float(anomaly(error))
         distance = float('nan')
         share = error
         if self._statistics is not None and self._whiten is not None:
@@ -121,8 +118,8 @@ class AnomalyDetector:
         slack = tension < DEAD_SHARE * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
         if dead is not None:
-            return Verdict(anomaly, distance, dead, 'no tension where the command demands it')
-        return Verdict(anomaly, distance, suspect, self._beyond_threshold(anomaly, distance))
+            return Verdict(size, distance, dead, 'no tension where the command demands it')
+        return Verdict(size, distance, suspect, self._beyond_threshold(size, distance))
 
     def _beyond_threshold(self, anomaly: float, distance: float) -> str:
         limit, value, what = self.threshold, anomaly, 'A'

@@ -28,8 +28,8 @@ from musculoskeletal_ae.experiments.least_squares import mean_error, oracle
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, motion, record
 from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 #: seeds of the random streams: exploring, and the motion never used for learning

@@ -16,7 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.mae.samples import OVERLOAD_SHARE
+from musculoskeletal_ae.mae.training import OVERLOAD_SHARE
 from musculoskeletal_ae.mae.units import scale_vector
 
 #: share of dreams with most muscles near T_bias, as muscle stiffness control holds them

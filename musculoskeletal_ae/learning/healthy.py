@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.mae.anomaly_statistics import FLOOR, AnomalyStatistics
-from musculoskeletal_ae.mae.evaluation import residuals
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, residuals
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept
@@ -101,7 +100,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     if len(healthy.messages) < 2:
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
-    error = _without_glitches(residuals(mae, tension, length))
+    error = _without_glitches(residuals(mae.estimate(tension, length), tension, length))
     known = min(samples, healthy.rests)
     calibrated = healthy.time >= LEAST_TIME and known >= LEAST_SAMPLES
     part = AnomalyStatistics.of(error[::2], calibrated)

@@ -25,7 +25,7 @@ from musculoskeletal_ae.learning.update import (
 )
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae, to_mae
-from musculoskeletal_ae.mae.optimisers import Adam
+from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import loss, one_thread
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.presets import PAPER
@@ -47,7 +47,7 @@ class PaperUpdater:
         self._robot, self._origin, self._mae = robot, mae, mae
         self._network = from_mae(mae)
         self._settings = PAPER.training
-        self._optimiser = Adam(self._network, self._settings.step_size)
+        self._optimiser = Optimiser(self._network, self._settings.step_size, muon=False)
         self._rng = np.random.default_rng([seed, 0x9A])
         self._steps = 0
 

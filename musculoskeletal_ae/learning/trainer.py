@@ -17,8 +17,8 @@ from torch import Tensor
 
 from musculoskeletal_ae.learning.dream import Dream
 from musculoskeletal_ae.mae.network import Network
-from musculoskeletal_ae.mae.optimisers import Muon
-from musculoskeletal_ae.mae.training import MUON_MATRIX_RATIO, TINY, one_thread
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.training import TINY, one_thread
 
 STEP_SIZE = 2e-3
 BATCH = 128
@@ -41,7 +41,7 @@ class Trainer:
         """Go on from a network's weights, as calmly as after so many `steps`."""
         self.network = network
         self._restless = copy.deepcopy(network)
-        self._optimiser = Muon(self._restless, MUON_MATRIX_RATIO * STEP_SIZE, STEP_SIZE)
+        self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
         self._rng = np.random.default_rng([seed, 0x7A])
         self.steps = steps
 

@@ -7,46 +7,128 @@ Nothing of a checkpoint is used before all of it has been checked, and every fau
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.mae import metadata
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
-from musculoskeletal_ae.mae.layers import Layer
-from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.metadata import Metadata
+from musculoskeletal_ae.files import read_bytes
+from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.mae.units import UNITS
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
+FORMAT_VERSION = 1
 # A hundred times the shipped arms' networks.
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
+# A weight or spread beyond these is no trained network, and could overflow where they are folded.
+LARGEST = 1e9
+SMALLEST_STD = 1e-9
 SMALLEST_EIGENVALUE = 1e-12  # of the largest one
 #: beyond what a trained network restores of a posture at rest: rad, N, m
 ABSURD = (100.0, 1e5, 100.0)
 REMEDY = 'use another checkpoint, or make one with `train`'
 
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
+Units = Annotated[int, Meta(ge=1, le=4096)]
+Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+
+
+class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a checkpoint says of its network; safetensors holds each entry as JSON text.
+
+    Without anomaly statistics `anomaly_calibrated` is None.
+    """
+
+    format_version: int
+    joints: Names
+    muscles: Names
+    layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21)]
+    activation: str
+    units: str
+    preset: str
+    version: Count
+    training: Annotated[str, Meta(max_length=10_000)]
+    anomaly_calibrated: bool | None
+    anomaly_samples: Count
+    anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
+
+    def __post_init__(self) -> None:
+        """Check what types cannot say."""
+        for what, names in (('joints', self.joints), ('muscles', self.muscles)):
+            if len(set(names)) < len(names) or not all(n and n.isprintable() for n in names):
+                raise ValueError(f'{what} {names}; legal: different names, printable')
+        for what, word, legal in (
+            ('units', self.units, (UNITS,)),
+            ('activation', self.activation, ACTIVATIONS),
+            ('preset', self.preset, PRESETS),
+        ):
+            if word not in legal:
+                raise ValueError(f'{what} {word!r}; legal: {" or ".join(map(repr, legal))}')
+        sizes, joints, muscles = self.layer_sizes, len(self.joints), len(self.muscles)
+        ends = joints + 2 * muscles + 3, joints + muscles, joints + 2 * muscles
+        # Encoder and decoder have the same hidden layers, so the latent one stands in the middle.
+        if len(sizes) % 2 == 0 or (sizes[0], sizes[len(sizes) // 2], sizes[-1]) != ends:
+            legal_sizes = '{}, …, {}, …, {}'.format(*ends)
+            raise ValueError(f'layer_sizes {sizes}; legal: {legal_sizes}')
+
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return name and shape of every tensor of such a network."""
+        values = len(self.joints) + 2 * len(self.muscles)
+        shapes: dict[str, tuple[int, ...]] = {'mean': (values,), 'std': (values,)}
+        depth = len(self.layer_sizes) // 2
+        for i, (into, out) in enumerate(zip(self.layer_sizes, self.layer_sizes[1:], strict=False)):
+            name = f'encoder.{i}' if i < depth else f'decoder.{i - depth}'
+            shapes[f'{name}.weight'] = (out, into)
+            shapes[f'{name}.bias'] = (out,)
+        if self.anomaly_calibrated is not None:
+            muscles = 2 * len(self.muscles)
+            shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
+        return shapes
+
 
 def to_bytes(mae: Mae) -> bytes:
     """Return a network as safetensors bytes; `from_bytes` gives back the same bits."""
+    anomaly = mae.anomaly
     tensors: dict[str, Array] = {'mean': mae.mean, 'std': mae.std}
     for name, stack in (('encoder', mae.encoder), ('decoder', mae.decoder)):
         for i, (weight, bias) in enumerate(stack):
-            tensors[f'{name}.{i}.weight'] = weight
-            tensors[f'{name}.{i}.bias'] = bias
-    if mae.anomaly is not None:
-        tensors['anomaly.mean'] = mae.anomaly.mean
-        tensors['anomaly.covariance'] = mae.anomaly.covariance
-    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    return save_tensors(contiguous, metadata.to_text(mae))
+            tensors |= {f'{name}.{i}.weight': weight, f'{name}.{i}.bias': bias}
+    if anomaly is not None:
+        tensors |= {'anomaly.mean': anomaly.mean, 'anomaly.covariance': anomaly.covariance}
+    entries = {
+        'format_version': FORMAT_VERSION,
+        'joints': mae.joints,
+        'muscles': mae.muscles,
+        'layer_sizes': mae.layer_sizes,
+        'activation': mae.activation,
+        'units': UNITS,
+        'preset': mae.preset,
+        'version': mae.version,
+        'training': mae.training,
+        'anomaly_calibrated': None if anomaly is None else anomaly.calibrated,
+        'anomaly_samples': 0 if anomaly is None else anomaly.samples,
+        'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
+    }
+    return save_tensors(
+        {name: np.ascontiguousarray(value) for name, value in tensors.items()},
+        {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
+    )
 
 
 def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoint') -> Mae:
@@ -61,43 +143,147 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
         CheckpointError: If anything is wrong; the message says what.
     """
     try:
-        if len(data) > MAX_BYTES:
-            raise CheckpointError(f'{len(data)} bytes; at most {MAX_BYTES} are legal')
-        header = _header(data)
-        meta = metadata.from_text(header.get('__metadata__'))
-        _check_robot(meta, robot)
-        tensors = _tensors(data, header, meta)
+        mae = _mae(data, robot)
     except CheckpointError as error:
-        # What a hostile header says may hold halves of characters, which no message can carry.
-        said = f'{error}'.encode('utf-8', 'backslashreplace').decode()
-        raise CheckpointError(f'{source}: {said}; {REMEDY}') from error.__cause__
-    depth = len(meta.layer_sizes) // 2
-    mae = Mae(
-        joints=meta.joints,
-        muscles=meta.muscles,
-        preset=meta.preset,
-        activation=meta.activation,
-        encoder=_stack(tensors, 'encoder', depth),
-        decoder=_stack(tensors, 'decoder', depth),
-        mean=tensors['mean'],
-        std=tensors['std'],
-        version=meta.version,
-        training=meta.training,
-        anomaly=None
-        if meta.anomaly_calibrated is None
-        else AnomalyStatistics(
+        raise CheckpointError(f'{source}: {error}; {REMEDY}') from error.__cause__
+    return mae
+
+
+def _mae(data: bytes, robot: Robot | None) -> Mae:
+    header = _header(data)
+    meta = _metadata(header.pop('__metadata__', None))
+    for what, ours, theirs in (
+        ('joints', meta.joints, meta.joints if robot is None else robot.joints),
+        ('muscles', meta.muscles, meta.muscles if robot is None else robot.muscles),
+    ):
+        if ours != theirs:
+            raise CheckpointError(
+                f'made for {what} {", ".join(ours)}; '
+                f'this robot has {", ".join(theirs)}, in this order'
+            )
+    tensors = _tensors(data, header, meta)
+
+    def stack(name: str) -> tuple[Layer, ...]:
+        depth = range(len(meta.layer_sizes) // 2)
+        return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in depth)
+
+    anomaly = None
+    if meta.anomaly_calibrated is not None:
+        anomaly = AnomalyStatistics(
             tensors['anomaly.mean'],
             tensors['anomaly.covariance'],
             meta.anomaly_calibrated,
             meta.anomaly_samples,
             meta.anomaly_thresholds,
-        ),
+        )
+    mae = Mae(
+        joints=meta.joints,
+        muscles=meta.muscles,
+        preset=meta.preset,
+        activation=meta.activation,
+        encoder=stack('encoder'),
+        decoder=stack('decoder'),
+        mean=tensors['mean'],
+        std=tensors['std'],
+        version=meta.version,
+        training=meta.training,
+        anomaly=anomaly,
     )
     if robot is not None and not _restores_something(mae, robot):
-        raise CheckpointError(
-            f'{source}: does not restore a posture at rest to finite, sensible values; {REMEDY}'
-        )
+        raise CheckpointError('does not restore a posture at rest to finite, sensible values')
     return mae
+
+
+def _header(data: bytes) -> dict[str, Any]:
+    if len(data) > MAX_BYTES:
+        raise CheckpointError(f'{len(data)} bytes; at most {MAX_BYTES} are legal')
+    size = int.from_bytes(data[:8], 'little')
+    if len(data) < 8 or not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
+        raise CheckpointError(
+            f'{len(data)} bytes with a header of {size} bytes are not safetensors '
+            f'(a header has 2 to {MAX_HEADER_BYTES} bytes and lies inside the file)'
+        )
+    header = _json(data[8 : 8 + size], 'header')
+    if not isinstance(header, dict):
+        raise CheckpointError('header is not a JSON object')
+    return header
+
+
+def _metadata(entries: Any) -> Metadata:
+    if not isinstance(entries, dict):
+        raise CheckpointError('no metadata; this is not a checkpoint of musculoskeletal_ae')
+    # Before all else: a newer format may differ in everything that is checked below.
+    version = _json(entries.get('format_version'), 'format_version')
+    if version is True or version != FORMAT_VERSION:
+        raise CheckpointError(
+            f'format_version {_short(version)}; this program reads {FORMAT_VERSION}'
+        )
+    values = {key: _json(text, key) for key, text in entries.items()}
+    try:
+        return msgspec.convert(values, Metadata)
+    except msgspec.ValidationError as error:
+        place = re.search(r'`\$\.(\w+)', str(error))
+        value = f': {_short(values[place[1]])}' if place else ''
+        raise CheckpointError(f'metadata: {error}{value}') from error
+
+
+def _json(text: Any, what: str) -> Any:
+    if not isinstance(text, str | bytes):
+        raise CheckpointError(f'{what} is missing or not text')
+    try:
+        return msgspec.json.decode(text)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise CheckpointError(f'{what} is not valid JSON ({error}): {_short(text)}') from error
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 100 else f'{text[:100]}…'
+
+
+def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, Array]:
+    legal = meta.tensor_shapes()
+    if odd := header.keys() ^ legal.keys():
+        raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
+    for name, shape in legal.items():
+        entry = header[name] if isinstance(header[name], dict) else {}
+        for what, given, right in (
+            ('type', entry.get('dtype'), 'F64'),
+            ('shape', entry.get('shape'), list(shape)),
+        ):
+            if given != right:
+                raise CheckpointError(f'tensor {name} has {what} {given!r}; legal: {right!r}')
+    try:
+        tensors: dict[str, Array] = load_tensors(data)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f'not valid safetensors ({error})') from error
+    for name, value in tensors.items():
+        if not np.isfinite(value).all() or np.abs(value).max(initial=0.0) > LARGEST:
+            raise CheckpointError(
+                f'tensor {name} holds a value that is not finite or beyond ±{LARGEST:g}'
+            )
+    if tensors['std'].min() < SMALLEST_STD:
+        raise CheckpointError(
+            f'tensor std holds {tensors["std"].min():g}; at least {SMALLEST_STD:g} is legal'
+        )
+    if 'anomaly.covariance' in tensors:
+        _check_covariance(tensors['anomaly.covariance'])
+    return tensors
+
+
+def _check_covariance(covariance: Array) -> None:
+    if not np.array_equal(covariance, covariance.T):
+        raise CheckpointError('tensor anomaly.covariance is not symmetric')
+    try:
+        least, *_, most = np.linalg.eigvalsh(covariance)
+    except np.linalg.LinAlgError as error:
+        raise CheckpointError('tensor anomaly.covariance has no eigenvalues') from error
+    # Nearer to singular it could not be inverted, as the detector does.
+    if not least > SMALLEST_EIGENVALUE * most:
+        raise CheckpointError(
+            f'tensor anomaly.covariance has eigenvalues from {least:g} to {most:g}; the least must '
+            f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
+        )
 
 
 def _restores_something(mae: Mae, robot: Robot) -> bool:
@@ -144,85 +330,9 @@ def load(path: str | Path, robot: Robot | None = None) -> Mae:
     Raises:
         CheckpointError: If it cannot be read, is damaged or does not fit the robot.
     """
-    try:
-        with Path(path).open('rb') as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f'{path}: cannot be read ({error}); {REMEDY}') from error
+
+    def refuse(file: Path, problem: str) -> CheckpointError:
+        return CheckpointError(f'{file}: {problem}; {REMEDY}')
+
+    data = read_bytes(Path(path), refuse, MAX_BYTES)
     return from_bytes(data, robot, str(path))
-
-
-def _header(data: bytes) -> dict[str, object]:
-    size = int.from_bytes(data[:8], 'little')
-    if len(data) < 8 or not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
-        raise CheckpointError(
-            f'{len(data)} bytes with a header of {size} bytes are not safetensors '
-            f'(a header has 2 to {MAX_HEADER_BYTES} bytes and lies inside the file)'
-        )
-    return metadata.parse_object(data[8 : 8 + size], 'header')
-
-
-def _check_robot(meta: Metadata, robot: Robot | None) -> None:
-    if robot is None:
-        return
-    for what, ours, theirs in (
-        ('joints', meta.joints, robot.joints),
-        ('muscles', meta.muscles, robot.muscles),
-    ):
-        if ours != theirs:
-            raise CheckpointError(
-                f'made for {what} {", ".join(ours)}; '
-                f'this robot has {", ".join(theirs)}, in this order'
-            )
-
-
-def _tensors(data: bytes, header: dict[str, object], meta: Metadata) -> dict[str, Array]:
-    legal = meta.tensor_shapes()
-    found = set(header) - {'__metadata__'}
-    if found != set(legal):
-        odd = ', '.join(sorted(found ^ set(legal)))
-        raise CheckpointError(f'tensors missing or unknown: {odd[:200]}')
-    for name, shape in legal.items():
-        entry = header[name]
-        kind = entry.get('dtype') if isinstance(entry, dict) else None
-        if kind != 'F64':
-            raise CheckpointError(f'tensor {name} is of type {kind!r}; only F64 is legal')
-        if not isinstance(entry, dict) or entry.get('shape') != list(shape):
-            given = entry.get('shape') if isinstance(entry, dict) else None
-            raise CheckpointError(f'tensor {name} has shape {given!r}; {list(shape)} is legal')
-    try:
-        tensors: dict[str, Array] = load_tensors(data)
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f'not valid safetensors ({error})') from error
-    for name, value in tensors.items():
-        if not np.isfinite(value).all() or np.abs(value).max(initial=0.0) > metadata.LARGEST:
-            raise CheckpointError(
-                f'tensor {name} holds a value that is not finite or beyond ±{metadata.LARGEST:g}'
-            )
-    if tensors['std'].min() < metadata.SMALLEST_STD:
-        raise CheckpointError(
-            f'tensor std holds {tensors["std"].min():g}; '
-            f'at least {metadata.SMALLEST_STD:g} is legal'
-        )
-    if 'anomaly.covariance' in tensors:
-        _check_covariance(tensors['anomaly.covariance'])
-    return tensors
-
-
-def _check_covariance(covariance: Array) -> None:
-    if not np.array_equal(covariance, covariance.T):
-        raise CheckpointError('tensor anomaly.covariance is not symmetric')
-    try:
-        least, *_, most = np.linalg.eigvalsh(covariance)
-    except np.linalg.LinAlgError as error:
-        raise CheckpointError('tensor anomaly.covariance has no eigenvalues') from error
-    # Nearer to singular it could not be inverted, as the detector does.
-    if not least > SMALLEST_EIGENVALUE * most:
-        raise CheckpointError(
-            f'tensor anomaly.covariance has eigenvalues from {least:g} to {most:g}; the least must '
-            f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
-        )
-
-
-def _stack(tensors: dict[str, Array], name: str, depth: int) -> tuple[Layer, ...]:
-    return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in range(depth))

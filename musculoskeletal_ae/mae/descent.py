@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
@@ -45,61 +44,44 @@ class StepSearch(NamedTuple):
     epochs: int
 
 
-class _Stacked(NamedTuple):
-    """All terms as one affine map, since many small products cost more than a large one."""
+class Loss:
+    """L of several terms as one affine map: many small products cost more than a large one."""
 
-    weights: Array
-    matrix: Array
-    target: Array
-    first_rows: NDArray[np.int_]
-    term_of_row: NDArray[np.int_]
-
-    @classmethod
-    def of(cls, terms: Sequence[Term]) -> _Stacked:
+    def __init__(self, terms: Sequence[Term]) -> None:
+        """Put the terms below each other."""
         rows = np.array([len(term.target) for term in terms])
-        return cls(
-            np.array([term.weight for term in terms]),
-            np.concatenate([term.matrix for term in terms]),
-            np.concatenate([term.target for term in terms]),
-            np.concatenate([[0], np.cumsum(rows)[:-1]]),
-            np.repeat(np.arange(len(terms)), rows),
-        )
+        self._weights = np.array([term.weight for term in terms])
+        self._matrix = np.concatenate([term.matrix for term in terms])
+        self._target = np.concatenate([term.target for term in terms])
+        self._first_rows = np.cumsum(rows) - rows
+        self._term_of_row = np.repeat(np.arange(len(terms)), rows)
 
-    def norms(self, y: Array) -> tuple[Array, Array]:
-        """Return all residuals (..., rows) and the norm of each term (..., K)."""
-        residual = y @ self.matrix.T
-        residual -= self.target
-        squares = np.add.reduceat(residual * residual, self.first_rows, axis=-1)
+    def _norms(self, y: Array) -> tuple[Array, Array]:
+        residual = y @ self._matrix.T
+        residual -= self._target
+        squares = np.add.reduceat(residual * residual, self._first_rows, axis=-1)
         return residual, np.sqrt(squares)
 
-    def loss(self, y: Array) -> Array:
-        total: Array = self.norms(y)[1] @ self.weights
+    def __call__(self, y: Array) -> Array:
+        """Return L for outputs y of shape (..., D+2M)."""
+        total: Array = self._norms(y)[1] @ self._weights
         return total
 
     def gradient(self, y: Array) -> Array:
-        residual, norms = self.norms(y)
-        slope: Array = (residual * (self.weights / (norms + TINY))[self.term_of_row]) @ self.matrix
-        return slope
-
-
-def loss(terms: Sequence[Term], y: Array) -> Array:
-    """Return L for outputs y of shape (..., D+2M)."""
-    return _Stacked.of(terms).loss(y)
-
-
-def loss_gradient(terms: Sequence[Term], y: Array) -> Array:
-    """Return dL/dy for one output y of shape (D+2M,)."""
-    return _Stacked.of(terms).gradient(y)
+        """Return dL/dy for one output y of shape (D+2M,)."""
+        residual, norms = self._norms(y)
+        slope: Array = residual * (self._weights / (norms + TINY))[self._term_of_row]
+        return slope @ self._matrix
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
     """Return z after the paper's descent, from z of shape (D+M,)."""
-    stacked = _Stacked.of(terms)
+    loss = Loss(terms)
     # γ = 0 is a candidate, so that the loss never rises.
     steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]
     for _ in range(search.epochs):
         y, pullback = mae.decode_pullback(z)
-        gradient = pullback(stacked.gradient(y))
+        gradient = pullback(loss.gradient(y))
         candidates = z - steps * (gradient / (np.sqrt(gradient @ gradient) + TINY))
-        z = candidates[np.argmin(stacked.loss(mae.decode_scaled(candidates)))]
+        z = candidates[np.argmin(loss(mae.decode_scaled(candidates)))]
     return z

@@ -17,18 +17,94 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae import layers
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
-from musculoskeletal_ae.mae.layers import Layer
-from musculoskeletal_ae.mae.units import Mask, scale_vector, visible
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
+
+#: (weight, bias) of one layer
+Layer = tuple[Array, Array]
 
 
-class State(NamedTuple):
-    """What the network says of a body: θ [rad] (..., D), T [N] (..., M), l [m] (..., M)."""
+class Activation(NamedTuple):
+    """An activation h(x), and (h, h') together; both may overwrite x."""
 
-    theta: Array
-    tension: Array
-    length: Array
+    value: Callable[[Array], Array]
+    with_slope: Callable[[Array], tuple[Array, Array]]
+
+
+def _tanh(x: Array) -> Array:
+    result: Array = np.tanh(x, out=x)
+    return result
+
+
+def _tanh_slope(x: Array) -> tuple[Array, Array]:
+    h = np.tanh(x, out=x)
+    slope = h * h
+    return h, np.subtract(1.0, slope, out=slope)
+
+
+def _silu(x: Array) -> Array:
+    # u (1 + tanh u) with u = x/2: does not overflow, and needs one temporary array.
+    x *= 0.5
+    result: Array = np.tanh(x)
+    result += 1.0
+    result *= x
+    return result
+
+
+def _silu_slope(x: Array) -> tuple[Array, Array]:
+    # h = x σ and h' = σ + h − h σ, in three arrays: a batch then stays in the cache.
+    sigmoid = 0.5 * x
+    np.tanh(sigmoid, out=sigmoid)
+    sigmoid *= 0.5
+    sigmoid += 0.5
+    h = x * sigmoid
+    np.multiply(h, sigmoid, out=x)
+    sigmoid += h
+    sigmoid -= x
+    return h, sigmoid
+
+
+ACTIVATIONS = {
+    'tanh': Activation(_tanh, _tanh_slope),
+    'silu': Activation(_silu, _silu_slope),
+}
+
+
+class Stack(NamedTuple):
+    """Layers x @ weight + bias, weight (in, out); the activation follows all but the last."""
+
+    layers: tuple[Layer, ...]
+    activation: Activation
+
+    def __call__(self, x: Array) -> Array:
+        """Return the output (..., out) for x (..., in)."""
+        for weight, bias in self.layers[:-1]:
+            x = x @ weight
+            x += bias
+            x = self.activation.value(x)
+        weight, bias = self.layers[-1]
+        x = x @ weight
+        x += bias
+        return x
+
+    def with_pullback(self, x: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Return the output and the function that maps a gradient by it to one by x."""
+        slopes = []
+        for weight, bias in self.layers[:-1]:
+            x = x @ weight
+            x += bias
+            x, slope = self.activation.with_slope(x)
+            slopes.append(slope)
+        last, last_bias = self.layers[-1]
+
+        def pullback(gradient: Array) -> Array:
+            gradient = gradient @ last.T
+            for (weight, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
+                gradient *= slope
+                gradient = gradient @ weight.T
+            return gradient
+
+        return x @ last + last_bias, pullback
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,48 +136,54 @@ class Mae:
     version: int = 0
     training: str = ''
     anomaly: AnomalyStatistics | None = None
-    _enter: dict[Mask, tuple[Layer, ...]] = field(init=False, repr=False)
-    _leave: tuple[Layer, ...] = field(init=False, repr=False)
-    _leave_scaled: tuple[Layer, ...] = field(init=False, repr=False)
-    _act: layers.Activation = field(init=False, repr=False)
+    _enter: dict[Mask, Stack] = field(init=False, repr=False)
+    _leave: Stack = field(init=False, repr=False)
+    _leave_scaled: Stack = field(init=False, repr=False)
+    _leave_length: Stack = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Freeze the arrays and fold units, standardisation and masks into the layers."""
-        for name in ('encoder', 'decoder'):
-            object.__setattr__(self, name, tuple(map(_frozen, getattr(self, name))))
-        for name, value in zip(('mean', 'std'), _frozen((self.mean, self.std)), strict=True):
-            object.__setattr__(self, name, value)
+        mean, std = map(_frozen, (self.mean, self.std))
+        encoder, decoder = (
+            tuple((_frozen(weight), _frozen(bias)) for weight, bias in stack)
+            for stack in (self.encoder, self.decoder)
+        )
         joints, muscles = len(self.joints), len(self.muscles)
         scale = scale_vector(joints, muscles)
-        (first, first_bias), (last, last_bias) = self.encoder[0], self.decoder[-1]
-        width = len(scale)
+        activation = ACTIVATIONS[self.activation]
+        (first, first_bias), *rest = encoder
+        after = tuple(_transposed(*layer) for layer in rest)
         enter = {}
         for mask in Mask:
             seen = visible(mask, joints, muscles)
-            columns = first[:, :width][:, seen] / self.std[seen]
-            constant = first[:, width:] @ np.array(mask.value, dtype=float)
-            bias = first_bias + constant - columns @ self.mean[seen]
-            enter[mask] = (layers.transposed(columns * scale[seen], bias),) + tuple(
-                layers.transposed(*layer) for layer in self.encoder[1:]
-            )
-        scaled = (last * self.std[:, None], last_bias * self.std + self.mean)
-        inner = tuple(layers.transposed(*layer) for layer in self.decoder[:-1])
-        object.__setattr__(self, '_enter', enter)
-        object.__setattr__(self, '_leave_scaled', (*inner, layers.transposed(*scaled)))
-        si = layers.transposed(scaled[0] / scale[:, None], scaled[1] / scale)
-        object.__setattr__(self, '_leave', (*inner, si))
-        object.__setattr__(self, '_act', layers.ACTIVATIONS[self.activation])
+            columns = first[:, : len(scale)][:, seen] / std[seen]
+            constant = first[:, len(scale) :] @ np.array(mask.value, dtype=float)
+            bias = first_bias + constant - columns @ mean[seen]
+            enter[mask] = Stack((_transposed(columns * scale[seen], bias), *after), activation)
+        *rest, (last, last_bias) = decoder
+        before = tuple(_transposed(*layer) for layer in rest)
+        weight, bias = last * std[:, None], last_bias * std + mean
+        si = weight / scale[:, None], bias / scale
+        values = {
+            'mean': mean,
+            'std': std,
+            'encoder': encoder,
+            'decoder': decoder,
+            '_enter': enter,
+            '_leave_scaled': Stack((*before, _transposed(weight, bias)), activation),
+            '_leave': Stack((*before, _transposed(*si)), activation),
+            '_leave_length': Stack(
+                (*before, _transposed(*(part[-muscles:] for part in si))), activation
+            ),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
-        """Units of all layers from input to output."""
+        """Units of all layers from input to output; the latent one in the middle has D+M."""
         stack = (*self.encoder, *self.decoder)
         return (stack[0][0].shape[1], *(len(bias) for _, bias in stack))
-
-    @property
-    def latent_size(self) -> int:
-        """D+M."""
-        return len(self.joints) + len(self.muscles)
 
     def encode(
         self,
@@ -125,16 +207,21 @@ class Mae:
         one, two = given
         if one is None or two is None:
             raise ValueError(f'mask {mask.name} needs both of its two quantities')
-        x = np.concatenate((one, two), axis=-1)
-        return layers.run(self._enter[mask], self._act, x)
+        return self._enter[mask](np.concatenate((one, two), axis=-1))
 
     def decode(self, z: Array) -> State:
         """Return (θ, T, l) in SI units from z of shape (..., D+M)."""
-        return self._split(layers.run(self._leave, self._act, z))
+        joints, muscles = len(self.joints), len(self.muscles)
+        values = self._leave(z)
+        return State(
+            values[..., :joints],
+            values[..., joints : joints + muscles],
+            values[..., joints + muscles :],
+        )
 
     def decode_scaled(self, z: Array) -> Array:
         """Return (θ, T, l) in the paper's scaled units, one array (..., D+2M)."""
-        return layers.run(self._leave_scaled, self._act, z)
+        return self._leave_scaled(z)
 
     def decode_pullback(self, z: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return y = decode_scaled(z) and the function that maps dL/dy to dL/dz.
@@ -142,22 +229,11 @@ class Mae:
         Args:
             z: Latent, shape (..., D+M). dL/dy has shape (..., D+2M), dL/dz that of z.
         """
-        return layers.run_with_pullback(self._leave_scaled, self._act, z)
-
-    def decode_jacobian_scaled(self, z: Array) -> tuple[Array, Array]:
-        """Return y = decode_scaled(z) and ∂y/∂z (..., D+2M, D+M), for Gauss–Newton."""
-        y, tangent = layers.run_with_jacobian(self._leave_scaled, self._act, z)
-        return y, tangent.swapaxes(-1, -2)
-
-    def decode_jacobian(self, z: Array) -> Array:
-        """Return ∂(θ, T, l)/∂z in SI units, shape (..., D+2M, D+M)."""
-        return layers.run_with_jacobian(self._leave, self._act, z)[1].swapaxes(-1, -2)
+        return self._leave_scaled.with_pullback(z)
 
     def estimate(self, tension: Array, length: Array) -> State:
         """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation")."""
-        x = np.concatenate((tension, length), axis=-1)
-        z = layers.run(self._enter[Mask.TENSION_LENGTH], self._act, x)
-        return self._split(layers.run(self._leave, self._act, z))
+        return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
 
     def lengths(self, theta: Array, tension: Array) -> Array:
         """Return l [m] of shape (..., M) at (θ, T): decode(encode ①)."""
@@ -170,25 +246,20 @@ class Mae:
 
         The pullback of T is Gᵀ T, at the price of one more evaluation instead of D.
         """
-        joints, muscles = len(self.joints), len(self.muscles)
         x = np.concatenate((theta, tension), axis=-1)
-        enter = self._enter[Mask.THETA_TENSION]
-        z, to_input = layers.run_with_pullback(enter, self._act, x)
-        weight, bias = self._leave[-1]
-        leave = (*self._leave[:-1], (weight[:, -muscles:], bias[-muscles:]))
-        length, to_latent = layers.run_with_pullback(leave, self._act, z)
+        z, to_input = self._enter[Mask.THETA_TENSION].with_pullback(x)
+        length, to_latent = self._leave_length.with_pullback(z)
+        joints = len(self.joints)
         return length, lambda gradient: to_input(to_latent(gradient))[..., :joints]
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
-        joints, muscles = len(self.joints), len(self.muscles)
-        x = np.concatenate((theta, tension), axis=-1)
-        enter = self._enter[Mask.THETA_TENSION]
-        z, tangent = layers.run_with_jacobian(enter, self._act, x, inputs=joints)
-        weight, bias = self._leave[-1]
-        leave = (*self._leave[:-1], (weight[:, -muscles:], bias[-muscles:]))
-        tangent = layers.run_with_jacobian(leave, self._act, z, tangent=tangent)[1]
-        return tangent.swapaxes(-1, -2)
+        _, pullback = self.lengths_with_pullback(theta, tension)
+        muscles = len(self.muscles)
+        # One gradient per muscle, along an axis in front.
+        each = np.eye(muscles).reshape(muscles, *(1,) * (theta.ndim - 1), muscles)
+        rows = pullback(np.broadcast_to(each, (muscles, *theta.shape[:-1], muscles)))
+        return np.moveaxis(rows, 0, -2)
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ①, shape (..., M, D).
@@ -207,17 +278,12 @@ class Mae:
         jacobian: Array = difference.swapaxes(-1, -2)
         return jacobian
 
-    def _split(self, values: Array) -> State:
-        joints, muscles = len(self.joints), len(self.muscles)
-        return State(
-            values[..., :joints],
-            values[..., joints : joints + muscles],
-            values[..., joints + muscles :],
-        )
+
+def _frozen(array: Array) -> Array:
+    copy = np.array(array, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
 
 
-def _frozen(arrays: Layer) -> Layer:
-    first, second = (np.array(value, dtype=np.float64) for value in arrays)
-    first.setflags(write=False)
-    second.setflags(write=False)
-    return first, second
+def _transposed(weight: Array, bias: Array) -> Layer:
+    return _frozen(np.ascontiguousarray(weight.T)), _frozen(bias)

@@ -9,21 +9,18 @@ enters the first layer.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.units import Mask, visible
 from musculoskeletal_ae.presets import PRESETS, NetworkSettings
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    'tanh': torch.tanh,
-    'silu': nn.functional.silu,
-}
+ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
 
 class Network(nn.Module):
@@ -50,9 +47,7 @@ class Network(nn.Module):
         values, latent = joints + 2 * muscles, joints + muscles
         encoder = (values + 3, *settings.hidden, latent)
         decoder = (latent, *reversed(settings.hidden), values)
-        self.encoder = nn.ModuleList(map(nn.Linear, encoder[:-1], encoder[1:]))
-        self.decoder = nn.ModuleList(map(nn.Linear, decoder[:-1], decoder[1:]))
-        self.activation = ACTIVATIONS[settings.activation]
+        self.encoder, self.decoder = self._stack(encoder), self._stack(decoder)
         self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
         self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
         entries = np.stack([visible(mask, joints, muscles) for mask in Mask])
@@ -67,11 +62,13 @@ class Network(nn.Module):
         rows = self.rows[mask]  # (N, D+2M+3)
         width = standard.shape[-1]
         x = torch.cat([standard * rows[:, :width], rows[:, width:]], dim=-1)  # (N, D+2M+3)
-        return self._run(self.encoder, x)  # (N, D+M)
+        z: Tensor = self.encoder(x)  # (N, D+M)
+        return z
 
     def decode_standard(self, z: Tensor) -> Tensor:
         """Return the output before mean and spread are put back, shape (N, D+2M)."""
-        return self._run(self.decoder, z)
+        values: Tensor = self.decoder(z)
+        return values
 
     def decode(self, z: Tensor) -> Tensor:
         """Return scaled (θ, T, l), shape (N, D+2M)."""
@@ -81,11 +78,12 @@ class Network(nn.Module):
         """Return what the network restores of scaled (θ, T, l) from two of the three."""
         return self.decode(self.encode(values, mask))
 
-    def _run(self, layers: nn.ModuleList, x: Tensor) -> Tensor:
-        for layer in layers[:-1]:
-            x = self.activation(layer(x))
-        result: Tensor = layers[-1](x)
-        return result
+    def _stack(self, sizes: tuple[int, ...]) -> nn.Sequential:
+        activation = ACTIVATIONS[self.settings.activation]
+        layers: list[nn.Module] = []
+        for into, out in pairwise(sizes):
+            layers += [nn.Linear(into, out), activation()]
+        return nn.Sequential(*layers[:-1])
 
 
 def to_mae(
@@ -101,7 +99,7 @@ def to_mae(
     def array(tensor: Tensor) -> Array:
         return tensor.detach().cpu().numpy().astype(np.float64)
 
-    def stack(layers: nn.ModuleList) -> tuple[tuple[Array, Array], ...]:
+    def stack(layers: nn.Sequential) -> tuple[Layer, ...]:
         return tuple((array(layer.weight), array(layer.bias)) for layer in _linear(layers))
 
     return Mae(
@@ -134,5 +132,5 @@ def from_mae(mae: Mae) -> Network:
     return network
 
 
-def _linear(layers: nn.ModuleList) -> list[nn.Linear]:
+def _linear(layers: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in layers if isinstance(layer, nn.Linear)]

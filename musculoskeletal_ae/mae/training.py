@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of the Musculoskeletal AutoEncoder.
+"""Initial training of the Musculoskeletal AutoEncoder on the geometric model of a robot.
 
+    (θ, T, l) = (θ_r, T_r, f_geo(θ_r) − L_e(f_geo,abs(θ_r), T_r))
     L_initial = w_θ ‖θ − θ_calc‖₂ + w_T ‖T − T_calc‖₂ + w_l ‖l − l_calc‖₂
 
-(paper, section "Initial Training"). `fit` knows nothing of where samples come from, so initial
-training and online learning share it.
+(paper, section "Initial Training"): random states of the geometric model, the loss, the descent,
+and how well the result restores states it has not seen. `fit` knows nothing of where samples come
+from.
 """
 
 from __future__ import annotations
@@ -13,36 +15,108 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae import samples
-from musculoskeletal_ae.mae.network import Network
-from musculoskeletal_ae.mae.optimisers import Adam, Muon
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import Network, to_mae
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask, State, scale_vector
 from musculoskeletal_ae.presets import TrainingSettings, preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
+# Share of samples, in preset default, with tensions beyond what is planned: a payload pulls muscles
+# there, and an estimator that has seen a few such states degrades gently.
+OVERLOAD_SHARE = 0.2
+# Reach of θ beyond each joint limit in preset default, as a share of the range: a network is least
+# accurate at the edge of what it saw, and arms do rest at their limits.
+POSTURE_MARGIN = 0.05
+# Between twins, in units of the spread of θ: small against the bends of a route, and large enough
+# that float32 resolves the difference.
+TWIN_DISTANCE = 0.1
 # Keeps the gradient of a norm finite at zero.
 TINY = 1e-12
 # A joint or muscle that hardly varies is not blown up beyond this, in scaled units.
 LEAST_SPREAD = 1e-4
-#: step size of Muon's matrices for a step size of 1 of the biases
-MUON_MATRIX_RATIO = 12.5
-
+HEALTHY_STATES = 5000  # of the geometric model, for the residuals a new network starts with
 
 #: told (step, loss) after every mini-batch
 Progress = Callable[[int, float], None]
 
+# -- samples -----------------------------------------------------------------------------------
+
+
+def random_states(
+    robot: Robot,
+    count: int,
+    rng: np.random.Generator,
+    highest: Array | float,
+    lowest: float = 0.0,
+    margin: float = 0.0,
+) -> State:
+    """Return random states of the geometric model.
+
+    Args:
+        robot: The nominal body.
+        count: How many.
+        rng: Source of randomness.
+        highest: T_r is uniform up to this [N]; a scalar or shape (count, 1).
+        lowest: And down to this [N].
+        margin: Reach of θ_r beyond each joint limit, as a share of the range.
+    """
+    theta = robot.random_postures(count, rng, margin)
+    tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
+    return State(theta, tension, robot.muscle_lengths(theta, tension))
+
+
+def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
+    """Return random states mostly within tension.limit, some beyond it, up to tension.max."""
+    limit, most = robot.tension.limit, robot.tension.max
+    overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
+    highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
+    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+
+
+def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
+    """Return each sample with a neighbour in posture: same T, θ off by TWIN_DISTANCE.
+
+    Args:
+        robot: The nominal body.
+        samples: Scaled (θ, T, l), shape (N, D+2M).
+        std: Their spread, shape (D+2M,); directions are uniform in units of it.
+        rng: Source of randomness.
+
+    Returns:
+        Samples and neighbours, shape (N, 2, D+2M).
+    """
+    joints, muscles = robot.joint_count, robot.muscle_count
+    direction = rng.normal(size=(len(samples), joints))
+    direction *= TWIN_DISTANCE / np.linalg.norm(direction, axis=1, keepdims=True)
+    twin = samples.copy()
+    twin[:, :joints] += direction * std[:joints]
+    theta, tension, _ = np.split(twin / scale_vector(joints, muscles), [joints, -muscles], axis=1)
+    twin[:, -muscles:] = LENGTH_SCALE * robot.muscle_lengths(theta, tension)
+    return np.stack([samples, twin], axis=1)
+
+
+def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield mini-batches of shuffled samples, epoch after epoch, without end."""
+    while True:
+        order = rng.permutation(len(samples))
+        for i in range(0, max(len(order) - batch, 0) + 1, batch):
+            yield samples[order[i : i + batch]]
+
+
+# -- descent -----------------------------------------------------------------------------------
+
 
 def loss(
-    network: Network,
-    values: Tensor,
-    mask: Tensor,
-    settings: TrainingSettings,
-    twins: int = 0,
+    network: Network, values: Tensor, mask: Tensor, settings: TrainingSettings, twins: int = 0
 ) -> Tensor:
     """Return the mean of L_initial over a mini-batch of scaled (θ, T, l) and mask indices.
 
@@ -59,7 +133,7 @@ def loss(
     result = error.new_zeros(())
     if twins:
         # The slope of the error between neighbours is the error of the slope.
-        between = (error[-twins:] - error[:twins])[:, -muscles:] / samples.TWIN_DISTANCE
+        between = (error[-twins:] - error[:twins])[:, -muscles:] / TWIN_DISTANCE
         result = settings.slope_weight * (between.square().sum(dim=1) + TINY).sqrt().mean()
         error = error[:-twins]
     if not settings.standard_norms:
@@ -80,8 +154,8 @@ def fit(
 
     Args:
         network: The network.
-        batches: Gives mini-batches of scaled (θ, T, l), shape (N, D+2M), at least
-            `settings.steps` of them.
+        batches: Gives mini-batches of scaled (θ, T, l), shape (N, D+2M), or (N, 2, D+2M) of samples
+            and their twins, at least `settings.steps` of them.
         settings: How to train.
         seed: Draws the masks where a sample is entered by one only.
         progress: Told (step, loss) after every mini-batch.
@@ -90,29 +164,20 @@ def fit(
         The loss of every mini-batch.
     """
     generator = torch.Generator().manual_seed(seed)
-    optimiser: Adam | Muon
-    if settings.optimiser == 'muon':
-        optimiser = Muon(network, MUON_MATRIX_RATIO * settings.step_size, settings.step_size)
-    else:
-        optimiser = Adam(network, settings.step_size)
+    optimiser = Optimiser(network, settings.step_size, muon=settings.optimiser == 'muon')
     losses = []
     with one_thread():
         for step in range(settings.steps):
-            values = torch.as_tensor(
-                next(batches), dtype=torch.float32
-            )  # (N, D+2M) or (N, 2, D+2M)
-            twins = len(values) if settings.slope_weight > 0.0 and values.ndim == 3 else 0
-            own = values[:, 0] if values.ndim == 3 else values  # (N, D+2M)
+            values = torch.as_tensor(next(batches), dtype=torch.float32)
+            twin = values[:, 1] if values.ndim == 3 else values[:0]  # (N or 0, D+2M)
+            rows = values[:, 0] if values.ndim == 3 else values  # (N, D+2M)
             if settings.every_mask:
-                mask = torch.arange(3).repeat_interleave(len(own))
-                rows = own.repeat(3, 1)  # (3N, D+2M)
+                mask = torch.arange(3).repeat_interleave(len(rows))
+                rows = rows.repeat(3, 1)  # (3N, D+2M)
             else:
-                mask = torch.randint(3, (len(own),), generator=generator)
-                rows = own
-            if twins:
-                mask = torch.cat([mask, mask.new_zeros(twins)])
-                rows = torch.cat([rows, values[:, 1]])  # (4N, D+2M)
-            value = loss(network, rows, mask, settings, twins)
+                mask = torch.randint(3, (len(rows),), generator=generator)
+            mask = torch.cat([mask, mask.new_zeros(len(twin))])
+            value = loss(network, torch.cat([rows, twin]), mask, settings, len(twin))
             value.backward()
             optimiser.step(annealing(step / settings.steps) if settings.annealed else 1.0)
             losses.append(value.item())
@@ -128,46 +193,6 @@ def annealing(progress: float, rise: float = 0.05) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (progress - rise) / (1.0 - rise)))
 
 
-def initial_training(
-    robot: Robot,
-    preset: str = 'default',
-    seed: int = 0,
-    progress: Progress | None = None,
-    steps: int | None = None,
-) -> tuple[Network, list[float]]:
-    """Train a new network on the geometric model of a robot.
-
-    Args:
-        robot: The nominal body.
-        preset: 'paper' or 'default'.
-        seed: Same seed, same network (on the same machine).
-        progress: Told (step, loss) after every mini-batch.
-        steps: Fewer or more mini-batches than the preset's.
-
-    Returns:
-        The network, and the loss of every mini-batch.
-    """
-    chosen = preset_named(preset)
-    settings = chosen.training
-    if steps is not None:
-        settings = replace(settings, steps=steps)
-    rng = np.random.default_rng(seed)
-    width = robot.joint_count + 2 * robot.muscle_count
-    mean, std = np.zeros(width), np.ones(width)
-    if chosen.network.standardise:
-        drawn = samples.overload_samples(robot, settings.samples, rng)
-        mean, std = drawn.mean(axis=0), np.maximum(drawn.std(axis=0), LEAST_SPREAD)
-        if settings.slope_weight > 0.0:
-            drawn = samples.with_twins(drawn, std, robot.joint_count, robot.muscle_lengths, rng)
-    else:
-        drawn = samples.geometric_samples(robot, settings.samples, rng, robot.tension.max)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = Network(robot.joint_count, robot.muscle_count, chosen.network, mean, std)
-    batches = samples.shuffled(drawn, settings.batch, rng)
-    return network, fit(network, batches, settings, seed, progress)
-
-
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Use one core: matrices this small gain little from two, and lose much if one is busy."""
@@ -177,3 +202,97 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+class Trained(NamedTuple):
+    """A network ready for a checkpoint, and the loss of every mini-batch on the way."""
+
+    mae: Mae
+    losses: list[float]
+
+
+def initial_mae(
+    robot: Robot,
+    preset: str = 'default',
+    seed: int = 0,
+    progress: Progress | None = None,
+    steps: int | None = None,
+) -> Trained:
+    """Train on the geometric model, with anomaly statistics of it that are not calibrated.
+
+    Args:
+        robot: The nominal body.
+        preset: 'paper' or 'default'.
+        seed: Same seed, same network (on the same machine).
+        progress: Told (step, loss) after every mini-batch.
+        steps: Fewer or more mini-batches than the preset's.
+    """
+    chosen = preset_named(preset)
+    settings = chosen.training
+    if steps is not None:
+        settings = replace(settings, steps=steps)
+    rng = np.random.default_rng(seed)
+    if chosen.network.standardise:
+        samples = overload_states(robot, settings.samples, rng).scaled()
+        mean, std = samples.mean(axis=0), np.maximum(samples.std(axis=0), LEAST_SPREAD)
+    else:
+        samples = random_states(robot, settings.samples, rng, robot.tension.max).scaled()
+        mean, std = np.zeros(samples.shape[1]), np.ones(samples.shape[1])
+    if settings.slope_weight > 0.0:
+        samples = with_twins(robot, samples, std, rng)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = Network(robot.joint_count, robot.muscle_count, chosen.network, mean, std)
+    losses = fit(network, shuffled(samples, settings.batch, rng), settings, seed, progress)
+    history = (
+        f'initial training on the geometric model of {robot.description.directory.name}: '
+        f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {settings.batch} '
+        f'by {settings.optimiser}'
+    )
+    mae = to_mae(network, robot.joints, robot.muscles, preset, history)
+    return Trained(replace(mae, anomaly=_geometric_anomaly(mae, robot, seed)), losses)
+
+
+def _geometric_anomaly(mae: Mae, robot: Robot, seed: int) -> AnomalyStatistics:
+    """Return the residuals' statistics on unseen data of the geometric model: not calibrated."""
+    rng = np.random.default_rng([seed, 1])
+    _, tension, length = random_states(robot, HEALTHY_STATES, rng, robot.tension.limit)
+    error = residuals(mae.estimate(tension, length), tension, length)
+    thresholds = {'norm': float(anomaly(error).max())}
+    return AnomalyStatistics.of(error, calibrated=False, thresholds=thresholds)
+
+
+# -- errors ------------------------------------------------------------------------------------
+
+#: outputs with the unit and the factor from SI that errors are shown in
+OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
+
+
+class PairError(NamedTuple):
+    """Error of one output entered by one mask.
+
+    Attributes:
+        mask: How the network was entered.
+        output: 'theta', 'tension' or 'length'.
+        unit: Unit of the numbers.
+        norm: Mean over samples of the L2 norm of the error.
+        elements: Mean absolute error of each joint or muscle, shape (D,) or (M,).
+    """
+
+    mask: Mask
+    output: str
+    unit: str
+    norm: float
+    elements: Array
+
+
+def pair_errors(mae: Mae, states: State) -> list[PairError]:
+    """Return the error of each of the nine (mask, output) pairs over given states."""
+    result = []
+    for mask in Mask:
+        restored = mae.decode(mae.encode(mask, *states))
+        for (output, unit, factor), got, true in zip(OUTPUTS, restored, states, strict=True):
+            error = factor * (got - true)
+            norm = float(np.linalg.norm(error, axis=1).mean())
+            result.append(PairError(mask, output, unit, norm, np.abs(error).mean(axis=0)))
+    return result

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scaled units inside the network, and the three ways to enter it.
+"""What enters and leaves the network: (θ, T, l), their scaled units, and the three masks.
 
 The paper (section "Network Structure") scales (θ, T, l) to [rad], [N/200], [mm/100] so that their
 sizes align, and enters the network with two of the three: the mask says which. SI outside.
@@ -8,17 +8,31 @@ sizes align, and enters the network with two of the three: the mask says which. 
 from __future__ import annotations
 
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 
 THETA_SCALE = 1.0  # scaled units per [rad] (or [m] of a prismatic joint)
 TENSION_SCALE = 1.0 / 200.0  # scaled units per [N]
 LENGTH_SCALE = 10.0  # scaled units per [m]; mm/100 = 10 · l[m]
 
 UNITS = 'theta rad, tension N/200, length mm/100'
+
+
+class State(NamedTuple):
+    """A body's state: θ [rad] (..., D), T [N] (..., M), l [m] (..., M)."""
+
+    theta: Array
+    tension: Array
+    length: Array
+
+    def scaled(self) -> Array:
+        """Return the state in scaled units as one array (..., D+2M)."""
+        scale = scale_vector(self.theta.shape[-1], self.tension.shape[-1])
+        values: Array = np.concatenate(self, axis=-1) * scale
+        return values
 
 
 class Mask(Enum):
@@ -35,6 +49,6 @@ def scale_vector(joints: int, muscles: int) -> Array:
     return np.repeat(np.array(scales), (joints, muscles, muscles))
 
 
-def visible(mask: Mask, joints: int, muscles: int) -> NDArray[np.bool_]:
+def visible(mask: Mask, joints: int, muscles: int) -> Bools:
     """Return which of the D+2M entries of (θ, T, l) a mask lets in, shape (D+2M,)."""
     return np.repeat(np.array(mask.value, dtype=bool), (joints, muscles, muscles))

@@ -17,9 +17,10 @@ from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
-from musculoskeletal_ae.messages import read_posture
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.validity import read_posture
 
 
 class BringupStatus(Shell):
@@ -29,19 +30,18 @@ class BringupStatus(Shell):
         """Listen; options are those of Node."""
         super().__init__('bringup_status', **options)
         self.duration: float = self.parameter('duration')
-        self.theta: np.ndarray | None = None
+        self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.detected = False
         self.checkpoints = 0
-        self.samples = ''
-        self.suspect = self.stopped = ''
+        self.samples = self.suspect = self.stopped = ''
         self.started: float | None = None
         self.listen(JointState, 'joint_states', self._measured, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
         self.listen(Bool, 'anomaly_detected', self._detected, LATCHED)
-        self.listen(UInt8MultiArray, 'mae_checkpoint', self._checkpoint, LATCHED)
+        self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
         self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
 
@@ -56,7 +56,7 @@ class BringupStatus(Shell):
     def _detected(self, message: Bool) -> None:
         self.detected = message.data
 
-    def _checkpoint(self, _: UInt8MultiArray) -> None:
+    def _count_checkpoint(self, _: UInt8MultiArray) -> None:
         self.checkpoints += 1
 
     def _diagnosed(self, message: DiagnosticArray) -> None:
@@ -72,20 +72,20 @@ class BringupStatus(Shell):
 
     def _print(self) -> None:
         now = time.monotonic()
-        if self.anomalies and self.started is None:
-            self.started = now
         if self.started is None:
-            return
-        elapsed = now - self.started
-        error = np.mean(self.errors) if self.errors else math.nan
-        anomaly = np.mean(self.anomalies) if self.anomalies else math.nan
+            if not self.anomalies:
+                return
+            self.started = now
+        error, anomaly = (
+            np.mean(values) if values else math.nan for values in (self.errors, self.anomalies)
+        )
         self.errors, self.anomalies = [], []
-        line = f'{elapsed:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
+        line = f'{now - self.started:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
         line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
         if self.detected:
             line += f'  ANOMALY: {self.suspect}'
         elif self.stopped:
-            line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset ends it)'
+            line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset resumes)'
         print(line, flush=True)
-        if 0.0 < self.duration <= elapsed:
+        if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

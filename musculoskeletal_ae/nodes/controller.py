@@ -20,19 +20,14 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.messages import (
-    QUANTITIES,
-    array_message,
-    read_array,
-    read_joints,
-    read_posture,
-)
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
-from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
 
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
-LEVELS = {'ok': OK, 'warn': WARN, 'error': ERROR}
 
 
 class Controller(Shell):
@@ -114,7 +109,7 @@ class Controller(Shell):
         if command is not None:
             self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
 
-    def state(self) -> tuple[bytes, str, dict[str, str]]:
+    def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
         report = control_report(self.robot, self.core, time.monotonic())
         stopped = [report.message] if self.core.safety.cause else []
@@ -124,4 +119,4 @@ class Controller(Shell):
                 log = self.get_logger().warning if line in stopped else self.get_logger().info
                 log(line)
         self.logged = stopped + stiffness
-        return LEVELS[report.level], report.message, report.values
+        return report

@@ -15,12 +15,14 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.collector import Collector
-from musculoskeletal_ae.learning.pairing import Pairing
 from musculoskeletal_ae.learning.session import Session
-from musculoskeletal_ae.messages import QUANTITIES, bytes_message, read_array, read_posture
 from musculoskeletal_ae.nodes.learner_settings import read_settings
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
-from musculoskeletal_ae.nodes.shell import ERROR, OK, STEADY, WARN, Shell
+from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.report import Level, Report
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 POLL = 0.05  # [s] between looks at the training process
 
@@ -129,21 +131,22 @@ class Learner(Shell):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
-    def state(self) -> tuple[bytes, str, dict[str, str]]:
+    def report(self) -> Report:
         """Return what /diagnostics shows."""
         values = self.session.values()
         values |= {f'not learned: {why}': str(n) for why, n in self.collector.rejected.items()}
-        level, message = OK, 'learning'
+        level: Level = 'ok'
+        message = 'learning'
         if self.session.trouble:
-            level, message = ERROR, self.session.trouble
+            level, message = 'error', self.session.trouble
         elif self.session.data is None:
-            level, message = WARN, 'waiting for a checkpoint: set the parameter `checkpoint`'
+            level, message = 'warn', 'waiting for a checkpoint: set the parameter `checkpoint`'
         elif not self.enabled:
-            level, message = WARN, 'stopped by learner/enable'
+            level, message = 'warn', 'stopped by learner/enable'
         elif self.anomaly:
-            level, message = WARN, 'stopped by an anomaly until estimator/reset'
+            level, message = 'warn', 'stopped by an anomaly until estimator/reset'
         values['state'] = message
-        return level, message, values
+        return Report(level, message, values)
 
     def destroy_node(self) -> None:
         """End the training process with the node."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three qualities of service of INTERFACE.md."""
+"""The three qualities of service (doc/interface.md)."""
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.validity import LATE, SourceOrder
 
-# A source time that lies further back than this is another publisher's clock, not a reordering.
-REORDERING = int(1e9)  # [ns]
 LONGEST_TEXT = 500
 
 
@@ -28,7 +27,6 @@ class Reception:
         self.last_rejected = ''
         self.rejected: Counter[str] = Counter()
         self._received: Counter[str] = Counter()
-        self._last: dict[str, tuple[int, int]] = {}
 
     def of(
         self, topic: str, callback: Callable[[Any], None], publishers: Callable[[], int]
@@ -41,15 +39,14 @@ class Reception:
             publishers: Counts who publishes there: a message does not say who sent it, and two
                 clocks or counters cannot be compared.
         """
+        order = SourceOrder()
 
         def receive(message: Any, info: dict[str, Any]) -> None:
-            time, number = info['source_timestamp'], info['publication_sequence_number']
-            last_time, last_number = self._last.get(topic, (0, 0))
-            late = 0 <= last_time - time < REORDERING and number <= last_number
-            if late and time > 0 and publishers() == 1:
-                self.rejected[f'{topic}: repeated or reordered'] += 1
+            sent = info['source_timestamp'], info['publication_sequence_number']
+            if order.is_late(*sent) and publishers() == 1:
+                self.rejected[f'{topic}: {LATE}'] += 1
                 return
-            self._last[topic] = time, number
+            order.take(*sent)
             try:
                 callback(message)
             except MusculoskeletalError as error:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -15,14 +15,13 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags.metadata import offered_qos
-from musculoskeletal_ae.bags.options import parse_record
+from musculoskeletal_ae.bags.metadata import Qos, offered_qos
 from musculoskeletal_ae.bags.recover import recover
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
-from musculoskeletal_ae.bags.writer import BagWriter
-from musculoskeletal_ae.nodes.tool import message_class, run_tool, start_ros
+from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter
+from musculoskeletal_ae.nodes.tool import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.options import Parser, names, positive
 
 # What the recorder may lose when it is killed is what is younger than this.
 FLUSH_PERIOD = 0.5  # [s]
@@ -103,6 +102,45 @@ def _record(options: Namespace, arguments: list[str]) -> None:
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
 
 
+def parse(arguments: list[str]) -> Namespace:
+    """Return the options of `record`."""
+    parser = Parser(
+        'record',
+        'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
+        + ROS_HELP,
+    )
+    parser.add_argument('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
+    parser.add_argument('-o', '--out', type=Path, metavar='DIR', help='the same')
+    parser.add_argument(
+        '--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)'
+    )
+    parser.add_argument('--duration', type=positive, metavar='S', help='stop after this time [s]')
+    parser.add_argument(
+        '--compression', choices=COMPRESSIONS, default='zstd', help='of the messages'
+    )
+    parser.add_argument(
+        '--recover',
+        type=Path,
+        metavar='BAG',
+        help='make a finished bag of one whose recorder was killed: in place, the original kept '
+        'as BAG.unfinished, or in DIR',
+    )
+    options = parser.parse_args(arguments)
+    if options.directory and options.out:
+        parser.error('DIR is given twice')
+    options.out = options.out or options.directory
+    options.topics = options.topics or list(TOPICS)
+    return options
+
+
+def _topics(text: str) -> list[str]:
+    listed = names(text)
+    for name in listed:
+        if name not in TOPICS:
+            raise ArgumentTypeError(f'{name!r} is none of {", ".join(TOPICS)}')
+    return listed
+
+
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
         bag, count, backup = recover(options.recover, options.out)
@@ -115,4 +153,4 @@ def _work(options: Namespace, arguments: list[str]) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the tool; exit status 0: recorded, also after Ctrl-C, 1: failed, 2: wrong options."""
-    return run_tool('record', parse_record, _work, argv)
+    return run_tool('record', parse, _work, argv)

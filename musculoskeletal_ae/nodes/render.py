@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `render`: one picture of the running arm as a PNG, no display needed.
-
-render [--out arm.png] [--topic hardware_emulator/markers] [--timeout 10] [--ros-args …]
-"""
+"""The tool `render`: one picture of a running arm as a PNG, no display needed."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
+from argparse import Namespace
+from pathlib import Path
 
 import numpy as np
 import rclpy
-from rclpy.utilities import remove_ros_args
 from visualization_msgs.msg import Marker, MarkerArray
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.picture import Line, save_picture
 from musculoskeletal_ae.nodes.qos import SENSOR
+from musculoskeletal_ae.nodes.tool import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.options import Parser, positive
 
 
 def _lines(message: MarkerArray) -> list[Line]:
@@ -32,39 +31,35 @@ def _lines(message: MarkerArray) -> list[Line]:
     ]
 
 
-def main() -> None:
-    """Wait for one marker array and draw it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--out', default='arm.png', help='PNG to write (default: %(default)s)')
-    parser.add_argument(
-        '--topic', default='hardware_emulator/markers', help='MarkerArray (default: %(default)s)'
-    )
-    parser.add_argument('--timeout', type=float, default=10.0, help='[s] (default: %(default)s)')
-    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    rclpy.init()
+def _render(options: Namespace, arguments: list[str]) -> int:
+    start_ros(arguments)
     node = rclpy.create_node('render')
     received: list[MarkerArray] = []
-    node.create_subscription(MarkerArray, arguments.topic, received.append, SENSOR)
-    deadline = time.monotonic() + arguments.timeout
-    try:
-        while not received and time.monotonic() < deadline:
-            rclpy.spin_once(node, timeout_sec=0.1)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    node.create_subscription(MarkerArray, options.topic, received.append, SENSOR)
+    deadline = time.monotonic() + options.timeout
+    while not received and time.monotonic() < deadline:
+        rclpy.spin_once(node, timeout_sec=0.1)
     lines = _lines(received[0]) if received else []
     if not lines:
-        print(
-            f'error: no markers on {arguments.topic} within {arguments.timeout:g} s; is the node '
-            'running, and in this namespace (--ros-args -r __ns:=/NAME)?',
-            file=sys.stderr,
+        raise MusculoskeletalError(
+            f'no markers on {options.topic} within {options.timeout:g} s; is the node running, '
+            'and in this namespace (--ros-args -r __ns:=/NAME)?'
         )
-        sys.exit(1)
-    try:
-        save_picture(lines, arguments.out)
-    except OSError as error:
-        print(f'error: {arguments.out}: {error}', file=sys.stderr)
-        sys.exit(1)
-    print(arguments.out)
+    save_picture(lines, options.out)
+    print(options.out)
+    return 0
+
+
+def _parse(arguments: list[str]) -> Namespace:
+    parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
+    parser.add_out('FILE.png', default=Path('arm.png'))
+    parser.add_argument('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
+    parser.add_argument(
+        '--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]'
+    )
+    return parser.parse_args(arguments)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Wait for one marker array and draw it."""
+    return run_tool('render', _parse, _render, argv)

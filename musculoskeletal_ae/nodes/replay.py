@@ -3,23 +3,27 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from argparse import Namespace
+from pathlib import Path
 
+from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from musculoskeletal_ae.bags.options import parse_replay
-from musculoskeletal_ae.bags.playback import Timeline, lap, latched_topics, window
+from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.selection import select
-from musculoskeletal_ae.nodes.clock import RecordedClock
-from musculoskeletal_ae.nodes.tool import message_class, run_tool, start_ros
+from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
+from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.tool import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -29,7 +33,30 @@ SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Recorded time between two messages on /clock, but not more often than nodes can bear.
+CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
+
+
+class RecordedClock:
+    """Publishes the recorded time on /clock at a steady rate.
+
+    Attributes:
+        publisher: Of /clock.
+        next_tick: When the steady clock [s] calls for the next message.
+    """
+
+    def __init__(self, node: Node, rate: float) -> None:
+        """Advertise /clock for a replay at a rate."""
+        self.publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
+        self._period = max(CLOCK_PERIOD / max(rate, 1.0), SHORTEST_CLOCK_PERIOD)
+        self.next_tick = -math.inf
+
+    def tick(self, recorded: int, now: float) -> None:
+        """Publish the recorded time [ns] if it is time to."""
+        if now >= self.next_tick:
+            self.next_tick = now + self._period
+            seconds, nanoseconds = divmod(recorded, 1_000_000_000)
+            self.publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
 
 
 class Replay(Node):
@@ -161,6 +188,58 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     return 0
 
 
+def parse(arguments: list[str]) -> Namespace:
+    """Return the options of `replay`."""
+    parser = Parser(
+        'replay',
+        'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,
+        'While it plays, the services replay/pause, replay/resume and replay/step '
+        '(std_srvs/Trigger) stop it, go on, and publish the messages of the next recorded time.',
+    )
+    add = parser.add_argument
+    add('bag', type=Path, metavar='BAG', help='a bag directory or an mcap file')
+    add('--check', action='store_true', help='play nothing; say what is in it (exit status 1: bad)')
+    add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
+    add(
+        '--topics',
+        type=names,
+        default=[DEFAULT],
+        metavar='LIST',
+        help=f'{DEFAULT}: what hardware, vision, user and controller sent; {ALL}: also what nodes '
+        'compute; or names separated by commas',
+    )
+    add('--keep-names', action='store_true', help='keep the recorded namespace')
+    add('--from-namespace', metavar='NS', help='which arm, of a bag that has several')
+    add('--rate', type=positive, default=1.0, help='multiple of the recorded speed; needs --clock')
+    add('--clock', action='store_true', help='publish the recorded time on /clock')
+    add('--loop', action='store_true', help='start again at the end')
+    add(
+        '--start',
+        type=not_negative,
+        default=0.0,
+        metavar='S',
+        help='start this far into the bag [s]',
+    )
+    add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
+    add('--paused', action='store_true', help='wait for replay/resume or replay/step')
+    add(
+        '--wait',
+        type=not_negative,
+        default=2.0,
+        metavar='S',
+        help='longest wait for subscribers [s]',
+    )
+    options = parser.parse_args(arguments)
+    if options.rate != 1 and not options.clock:
+        parser.error(
+            '--rate other than 1 needs --clock, and nodes with use_sim_time: '
+            'by their own clocks they would take the arm to be faster or slower than it was'
+        )
+    if options.robot and not options.check:
+        parser.error('--robot is for --check')
+    return options
+
+
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.check:
         # The robot's model takes a second to load, which playing does not need.
@@ -177,4 +256,4 @@ def _work(options: Namespace, arguments: list[str]) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; exit status 0: played or Ctrl-C, 1: the bag is bad, 2: wrong options."""
-    return run_tool('replay', parse_replay, _work, argv)
+    return run_tool('replay', parse, _work, argv)

@@ -6,9 +6,10 @@ from __future__ import annotations
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
@@ -17,6 +18,9 @@ from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.running import PARAMETER_ERRORS, reason
+from musculoskeletal_ae.options import exit_status
+
+ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
 
 
 def message_class(type_name: str) -> Any:
@@ -35,22 +39,8 @@ def start_ros(arguments: list[str]) -> None:
 
     ROS's own handlers take publishers and queues away before the tool has ended its work.
     """
-    try:
+    with _clear_ros_arguments(arguments):
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        _refuse(arguments, error)
-
-
-def _own_arguments(arguments: list[str]) -> list[str]:
-    try:
-        return remove_ros_args(arguments)[1:]
-    except RuntimeError as error:
-        _refuse(arguments, error)
-
-
-def _refuse(arguments: list[str], error: RuntimeError) -> NoReturn:
-    print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
-    sys.exit(2)
 
 
 def run_tool(
@@ -69,12 +59,20 @@ def run_tool(
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with _clear_ros_arguments(arguments):
+        options = parse(remove_ros_args(arguments)[1:])
     try:
-        return work(parse(_own_arguments(arguments)), arguments)
-    except (MusculoskeletalError, InvalidTopicNameException, *PARAMETER_ERRORS) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+        return exit_status(
+            lambda: work(options, arguments), InvalidTopicNameException, *PARAMETER_ERRORS
+        )
     finally:
         rclpy.try_shutdown()
+
+
+@contextmanager
+def _clear_ros_arguments(arguments: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
+        sys.exit(2)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One step of N simulated arms, preset `default`: the network's equilibrium, approached smoothly.
 
-    l = f_decode,l(①(θ, T))                                     the learnt body
+    l = f_decode,l(①(θ, T))                                     the learned body
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     MSC, part of the simulated arm
     B θ̇ = −(g(θ) − JᵀF + Gᵀ T),  G = ∂l/∂θ at (θ, T)            between the joint limits
 
@@ -17,6 +17,7 @@ comes to rest. A joint limit is a hard stop that gives whatever torque it takes.
 
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -25,13 +26,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
-from musculoskeletal_ae.simulation.slopes import Slopes
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias
 PAID_OUT = np.inf  # [m]
 VISCOSITY = 1.5  # [N·m·s/rad], B; motions then last as long as the emulated arm's (0.7 … 5 tried)
 JOINT_SPEED = 5.0  # [rad/s] or [m/s]; bounds a step, and with it every fault of a network
 MODULE_SPEED = 0.25  # [m/s] at which modules wind, chosen as in the emulator
+POSTURES_PER_COEFFICIENT = 10  # of the cubic that gives slopes
 
 
 class ArmState(NamedTuple):
@@ -83,16 +84,16 @@ class QuasiStatics:
         length, pullback = self._mae.lengths_with_pullback(theta, tension)
         span = (limits.max - limits.bias) / stiffness
         followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
-        # MSC and the elastic unit in series: at rest posture T moves to `wished`, and with the
+        # MSC and the elastic unit in series: at rest posture T moves to `desired`, and with the
         # posture by `soft` K G Δθ.
         absolute = robot.routes.length_at_zero + length
         compliance = robot.series_elastic.compliance(absolute, tension)
         soft = 1.0 / (1.0 + stiffness * compliance)
         command_tension = limits.bias + stiffness * (length - followed)
-        wished = tension + soft * (command_tension - tension)
+        desired = tension + soft * (command_tension - tension)
         # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth Newton).
-        settled = np.minimum(np.maximum(wished, limits.bias), limits.max)
-        spring = stiffness * soft * (wished == settled)
+        settled = np.minimum(np.maximum(desired, limits.bias), limits.max)
+        spring = stiffness * soft * (desired == settled)
         jacobian, curvature = self._slopes(theta, tension)
         load, load_slope = self._load(theta, wrench)
         pull = ((settled - tension)[:, None, :] @ jacobian)[:, 0]
@@ -102,7 +103,7 @@ class QuasiStatics:
         turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
         arrived = np.minimum(np.maximum(theta + turned, robot.lower), robot.upper)
         stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
-        after = wished + stiffness * soft * stretch
+        after = desired + stiffness * soft * stretch
         after = np.minimum(np.maximum(after, limits.bias), limits.max)
         held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
         if fixed is not None:
@@ -124,8 +125,8 @@ class QuasiStatics:
         forced = np.zeros_like(theta)
         if fixed is not None:
             given = np.isfinite(fixed)
-            wished = np.minimum(np.maximum(fixed, robot.lower), robot.upper) - theta
-            forced[given] = np.minimum(np.maximum(wished, -most), most)[given]
+            way = np.minimum(np.maximum(fixed, robot.lower), robot.upper) - theta
+            forced[given] = np.minimum(np.maximum(way, -most), most)[given]
             held |= given
             push = push - (matrix @ forced[..., None])[..., 0]
         free = ~held
@@ -150,3 +151,64 @@ def follow(command: Array, followed: Array, length: Array, span: float, most: fl
     # What lies beyond changes no tension; following it would take as long to come back from.
     within: Array = np.minimum(np.maximum(reached, length - span), length + most)
     return within
+
+
+class Slopes:
+    """How a network's lengths change with posture, nearly: a cubic through what it says.
+
+        l_i(θ) ≈ Σ_n c_ni θ^n,  |n| ≤ 3      G = ∂l/∂θ,   Σ_i T_i ∂²l_i/∂θ²
+
+    A Newton step needs these slopes in every step, but only roughly: they decide how the simulator
+    approaches an equilibrium, never where it lies, which is the network's own word. The network's
+    exact second derivatives would cost ten times the rest of the step.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        """Fit the cubic over the whole joint range, muscles in the middle of their tensions."""
+        joints, muscles = robot.joint_count, robot.muscle_count
+        basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
+        count = POSTURES_PER_COEFFICIENT * len(basis)
+        theta = robot.random_postures(count, np.random.default_rng(0))
+        middle = 0.5 * (robot.tension.bias + robot.tension.limit)
+        lengths = mae.lengths(theta, np.full((count, muscles), middle))
+        values = np.stack([theta[:, list(term)].prod(axis=1) for term in basis], axis=1)
+        cubic = np.linalg.lstsq(values, lengths, rcond=None)[0]  # (basis, M)
+        quadratic = [term for term in basis if len(term) <= 2]
+        linear = [term for term in basis if len(term) <= 1]
+        slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
+        bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
+        pairs = [term for term in quadratic if len(term) == 2]
+        self._left, self._right = np.array(pairs).T
+        first = np.einsum('dqb,bm->qmd', slope, cubic)
+        self._shape = (muscles, joints)
+        self._first = np.ascontiguousarray(first.reshape(len(quadratic), -1))
+        second = np.einsum('elq,qmd->mlde', bend, first)
+        self._second = np.ascontiguousarray(second.reshape(muscles * len(linear), -1))
+
+    def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
+        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D).
+
+        Args:
+            theta: θ [rad], shape (N, D).
+            tension: T [N], shape (N, M).
+        """
+        count, joints = theta.shape
+        linear = np.ones((count, 1 + joints))
+        linear[:, 1:] = theta
+        products = theta[:, self._left] * theta[:, self._right]
+        jacobian = np.concatenate((linear, products), axis=1) @ self._first
+        weighted = (tension[:, :, None] * linear[:, None, :]).reshape(count, -1)
+        curvature = weighted @ self._second
+        return jacobian.reshape(count, *self._shape), curvature.reshape(count, joints, joints)
+
+
+def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:
+    """Return the matrices that take coefficients of monomials to those of their ∂/∂θ_d."""
+    place = {term: i for i, term in enumerate(target)}
+    matrices = np.zeros((joints, len(target), len(basis)))
+    for column, term in enumerate(basis):
+        for d in set(term):
+            rest = list(term)
+            rest.remove(d)
+            matrices[d, place[tuple(rest)], column] = term.count(d)
+    return matrices

@@ -1,24 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learnt body as a simulator: joint angles and muscle tensions from commanded lengths.
+"""The learned body as a simulator: joint angles and muscle tensions from commanded lengths.
 
 (Paper, section "Simulation Using Musculoskeletal AutoEncoder".) The simulated arms follow the same
 muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
 l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
-command rests at T_bias. One arm or thousands are the same array operations; `sim_step` has the
-equations of preset `default`, `sim_paper` the printed descent.
+command rests at T_bias. One arm or thousands are the same array operations; `equilibrium` has the
+equations of preset `default`, `paper` the printed descent.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import TypeVar
+
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import preset_named
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState, QuasiStatics
 from musculoskeletal_ae.simulation.paper import PaperDescent
-from musculoskeletal_ae.simulation.threads import on_all_cores
 
 LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
 #: arms whose arrays fit into a core's cache together
@@ -29,11 +36,15 @@ SETTLED = 1e-6  # [rad] moved in a step
 # Below these a stop or a module at its end does not count as a limit reached.
 STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
 
+Piece = TypeVar('Piece')
+Result = TypeVar('Result')
+
 
 class Simulation:
     """N simulated arms of one robot.
 
     Attributes:
+        mae: The learned body.
         state: The arms now; assign it to go back to a state kept before.
         command: l_target [m], shape (N, M).
         wrench: On the end effectors, axes of the root link [N, N·m], shape (N, 6).
@@ -45,7 +56,7 @@ class Simulation:
 
         Args:
             robot: For masses, limits, K_stiff and T_bias.
-            mae: The learnt body.
+            mae: The learned body.
             preset: 'default' or 'paper'.
             arms: N.
         """
@@ -58,7 +69,7 @@ class Simulation:
 
     def use(self, mae: Mae) -> None:
         """Take a new network; the arms move on to its equilibrium from where they are."""
-        self._mae = mae
+        self.mae = mae
         kind = QuasiStatics if preset_named(self.preset).equilibrium else PaperDescent
         self._body: PaperDescent | QuasiStatics = kind(self.robot, mae)
 
@@ -68,7 +79,7 @@ class Simulation:
         theta = np.clip(theta, robot.lower, robot.upper)
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)
-        length = self._mae.lengths(theta, tension)
+        length = self.mae.lengths(theta, tension)
         self.state = ArmState(theta, tension, length, length, np.zeros_like(theta))
 
     def step(self, dt: float) -> ArmState:
@@ -93,15 +104,28 @@ class Simulation:
 
     def limits(self, arm: int = 0) -> list[str]:
         """Return the joints and muscles of one arm that are at the end of what they can do."""
-        robot, state = self.robot, self.state
-        stopped = np.abs(state.holding[arm]) > STOP_TORQUE
-        stopped &= np.isnan(self.fixed[arm])
-        forced = self.fixed[arm]
+        robot, state, forced = self.robot, self.state, self.fixed[arm]
+        stopped = np.isnan(forced) & (np.abs(state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
         full = state.tension[arm] > robot.tension.max - TENSION_MARGIN
-        return [robot.joints[i] for i in np.flatnonzero(stopped)] + [
-            robot.muscles[i] for i in np.flatnonzero(full)
+        return [
+            *(robot.joints[i] for i in np.flatnonzero(stopped)),
+            *(robot.muscles[i] for i in np.flatnonzero(full)),
         ]
+
+    def report(self, arm: int = 0) -> Report:
+        """Say what acts on one arm, and whether it is at a limit."""
+        values = {'checkpoint version': str(self.mae.version)}
+        forced = [self.robot.joints[i] for i in np.flatnonzero(np.isfinite(self.fixed[arm]))]
+        if forced:
+            values['forced joints'] = ', '.join(forced)
+        if self.wrench[arm].any():
+            values['external wrench'] = f'{np.round(self.wrench[arm], 3).tolist()} N, N·m'
+        limits = self.limits(arm)
+        if limits:
+            return Report('warn', f'at the limit: {", ".join(limits)}', values)
+        commanded = np.isfinite(self.command[arm]).all()
+        return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
     def _advance(self, h: float) -> None:
         count = len(self.command)
@@ -123,3 +147,19 @@ class Simulation:
 
         parts = on_all_cores(advance, range(0, count, CHUNK))
         self.state = ArmState(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def on_all_cores(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+    """Return function(piece) of each piece, in order; the function may not wait for others.
+
+    numpy lets go of Python's lock while it computes, so threads suffice. BLAS would also like to
+    use all cores for every product, and the two together are slower than either.
+    """
+    pool, libraries = _cores()
+    with libraries.limit(limits=1, user_api='blas'):
+        return list(pool.map(function, pieces))
+
+
+@cache
+def _cores() -> tuple[ThreadPoolExecutor, ThreadpoolController]:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix='batch'), ThreadpoolController()

@@ -15,8 +15,14 @@ from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.learning.online import OnlineLearner
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.evaluation import OUTPUTS, PairError, pair_errors, unseen_states
-from musculoskeletal_ae.mae.initial import Trained, initial_mae
+from musculoskeletal_ae.mae.training import (
+    OUTPUTS,
+    PairError,
+    Trained,
+    initial_mae,
+    pair_errors,
+    random_states,
+)
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
@@ -60,9 +66,9 @@ def main(argv: list[str] | None = None) -> int:
     tension = robot.tension
     # Not the stream of the training, so none of these states has been seen.
     rng = np.random.default_rng([args.seed, 2])
-    planned = pair_errors(trained.mae, unseen_states(robot, UNSEEN, rng, 0.0, tension.limit))
+    planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, tension.limit))
     overload = pair_errors(
-        trained.mae, unseen_states(robot, UNSEEN, rng, tension.limit, tension.max)
+        trained.mae, random_states(robot, UNSEEN, rng, tension.max, tension.limit)
     )
     print(f'{trained.mae.training}; {seconds:.1f} s')
     print(table(planned, f'{UNSEEN} unseen states, T in [0, {tension.limit:g}] N'))

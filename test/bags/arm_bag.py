@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench import bag_samples as samples
-from musculoskeletal_ae.bags.definitions import encode, message_class
+from bench.bag_samples import encode, message_class
 
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 JOINTS = 'sensor_msgs/msg/JointState'

@@ -68,7 +68,7 @@ def test_metadata_that_refers_to_itself_over_and_over_is_refused_at_once(bag):
     ]
     lines.append('rosbag2_bagfile_information: {version: *a39}')
     (bag / 'metadata.yaml').write_text('\n'.join(lines))
-    with pytest.raises(BagError, match='version is missing or not of type int'):
+    with pytest.raises(BagError, match='more than 100000 entries, aliases included'):
         Bag.open(bag)
 
 

@@ -5,9 +5,9 @@ import math
 
 import pytest
 
-from musculoskeletal_ae.bags import options, samples
-from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, latched_topics, window
+from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
 
 SECOND = 1_000_000_000
@@ -75,39 +75,3 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     # They are due at once, and do not turn back recorded time.
     assert {m.log_time for m in found[:3]} == {content[40].log_time - 1}
     assert [m.data for m in found[3:]] == [sample.data for sample in content[40:]]
-
-
-def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
-    samples.write_mcap(tmp_path / 'a.mcap', content)
-    assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))
-
-
-@pytest.mark.parametrize(
-    ('parse', 'arguments', 'problem'),
-    [
-        (options.parse_replay, [], 'BAG'),
-        (options.parse_replay, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
-        (options.parse_replay, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
-        (options.parse_replay, ['bag', '--rate', 'nan', '--clock'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--start', '-1'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--duration', 'inf'], 'not a number of at least 0'),
-        (options.parse_replay, ['bag', '--topics', ','], 'no topic is named'),
-        (options.parse_replay, ['bag', '--robot', 'arm26'], '--robot is for --check'),
-        (options.parse_replay, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
-        (
-            options.parse_record,
-            ['--topics', 'muscle_states,nothing'],
-            "'nothing' is none of joint_",
-        ),
-        (options.parse_record, ['--duration', '0'], 'not a number above 0'),
-        (options.parse_record, ['a', '-o', 'b'], 'DIR is given twice'),
-        (options.parse_record, ['--compression', 'rar'], 'invalid choice'),
-    ],
-)
-def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem, capsys):
-    with pytest.raises(SystemExit) as ended:
-        parse(arguments)
-    assert ended.value.code == 2
-    message = capsys.readouterr().err
-    assert problem in message
-    assert message.count('\n') == 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes on a real graph."""
+"""The tools `record` and `replay`: their options, and real processes on a real graph."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from std_srvs.srv import Trigger
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import UnfinishedBagError
+from musculoskeletal_ae.nodes import record as record_tool
+from musculoskeletal_ae.nodes import replay as replay_tool
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -167,3 +169,34 @@ def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
         assert one.process.returncode == status
         assert len(lines) == 1, lines
         assert problem in lines[0]
+
+
+@pytest.mark.parametrize(
+    ('parse', 'arguments', 'problem'),
+    [
+        (replay_tool.parse, [], 'BAG'),
+        (replay_tool.parse, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
+        (replay_tool.parse, ['bag', '--rate', '0', '--clock'], 'not a number above 0'),
+        (replay_tool.parse, ['bag', '--rate', 'nan', '--clock'], 'not a number above 0'),
+        (replay_tool.parse, ['bag', '--start', '-1'], 'not a number of at least 0'),
+        (replay_tool.parse, ['bag', '--duration', 'inf'], 'not a number above 0'),
+        (replay_tool.parse, ['bag', '--topics', ','], 'no name is given'),
+        (replay_tool.parse, ['bag', '--robot', 'arm26'], '--robot is for --check'),
+        (replay_tool.parse, ['bag', '--nonsense'], 'unrecognized arguments: --nonsense'),
+        (
+            record_tool.parse,
+            ['--topics', 'muscle_states,nothing'],
+            "'nothing' is none of joint_",
+        ),
+        (record_tool.parse, ['--duration', '0'], 'not a number above 0'),
+        (record_tool.parse, ['a', '-o', 'b'], 'DIR is given twice'),
+        (record_tool.parse, ['--compression', 'rar'], 'invalid choice'),
+    ],
+)
+def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(arguments)
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert problem in message
+    assert message.count('\n') == 1

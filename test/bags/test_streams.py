@@ -6,8 +6,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
-from musculoskeletal_ae.bags.check import check_bag
-from musculoskeletal_ae.bags.muscle_order import misplaced_muscles
+from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import read_streams
 from musculoskeletal_ae.exceptions import BagError

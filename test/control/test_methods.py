@@ -10,13 +10,13 @@ import pytest
 from exact_mae import ExactMae
 
 from bench.control_nominal import posture_table
-from bench.timings_control import eager_proposed, eager_proposed_paper
+from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.methods import first_command, msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.mae.descent import descend, loss
+from musculoskeletal_ae.mae.descent import Loss, descend
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
@@ -101,7 +101,7 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     terms = methods.paper_terms(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)
     end = descend(mae, start, terms, methods.SEARCH)
-    assert loss(terms, mae.decode_scaled(end)) < 0.5 * loss(terms, mae.decode_scaled(start))
+    assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
     solution = methods.proposed_paper(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
 

@@ -10,8 +10,7 @@ from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import Prior
 from musculoskeletal_ae.learning.sample import Sample
 from musculoskeletal_ae.learning.store import SampleStore
-from musculoskeletal_ae.mae.network import to_mae
-from musculoskeletal_ae.mae.training import initial_training
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -23,8 +22,7 @@ def arm26() -> Robot:
 @pytest.fixture(scope='session')
 def initial(arm26):
     """Return a network of the geometric model, trained for a moment."""
-    network, _ = initial_training(arm26, 'default', steps=300)
-    return to_mae(network, arm26.joints, arm26.muscles, 'default', 'briefly, for a test')
+    return initial_mae(arm26, 'default', steps=300).mae
 
 
 @pytest.fixture(scope='session')

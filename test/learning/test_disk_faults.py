@@ -16,7 +16,7 @@ from musculoskeletal_ae.learning.journal import Journal
 from musculoskeletal_ae.learning.session import Session
 from musculoskeletal_ae.learning.store import SampleStore
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 
 STEPS = ('mkdir', 'link', 'replace', 'rename', 'unlink', 'rmdir', 'fsync')
 

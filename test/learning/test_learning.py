@@ -23,7 +23,7 @@ from musculoskeletal_ae.learning.healthy import (
 from musculoskeletal_ae.learning.online import OnlineLearner, make_updater
 from musculoskeletal_ae.learning.paper_updater import PaperUpdater
 from musculoskeletal_ae.learning.update import Job, learned_steps
-from musculoskeletal_ae.mae.evaluation import residuals
+from musculoskeletal_ae.mae.residuals import residuals
 
 
 def error(mae, theta, tension, length):
@@ -138,7 +138,7 @@ def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(lea
     statistics = mae.anomaly
 
     def distance(tension, length):
-        centred = residuals(mae, tension, length) - statistics.mean
+        centred = residuals(mae.estimate(tension, length), tension, length) - statistics.mean
         whitened = np.linalg.solve(np.linalg.cholesky(statistics.covariance), centred.T)
         return np.linalg.norm(whitened, axis=0)
 

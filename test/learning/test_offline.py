@@ -10,7 +10,7 @@ import pytest
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.learning.offline import error, learn
 from musculoskeletal_ae.learning.online import OnlineLearner
-from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train import main
 from musculoskeletal_ae.tools.train_from_bag import read

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One briefly trained network of each preset, shared by all tests of the MAE."""
+"""The shared networks, one preset at a time."""
 
 from __future__ import annotations
 
 import pytest
 
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -13,14 +12,6 @@ from musculoskeletal_ae.robot.robot import Robot
 @pytest.fixture(scope='session')
 def robot() -> Robot:
     return Robot.load('arm26')
-
-
-@pytest.fixture(scope='session')
-def trained(robot: Robot) -> dict[str, Mae]:
-    return {
-        'default': initial_mae(robot, 'default', seed=3, steps=300).mae,
-        'paper': initial_mae(robot, 'paper', seed=3, steps=300).mae,
-    }
 
 
 @pytest.fixture(params=['default', 'paper'])

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.mae.anomaly_statistics import AnomalyStatistics
 from musculoskeletal_ae.mae.checkpoint import from_bytes, load, save, to_bytes
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -133,7 +133,7 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'joints': ['knee', 'ankle']}, 'layer_sizes'),
         ({'joints': []}, 'joints'),
         ({'joints': [1]}, 'joints'),
-        ({'joints': ['\ud800']}, 'printable'),
+        ({'joints': ['\ud800']}, 'joints is not valid JSON'),
         ({'joints': ['kn\nee']}, 'printable'),
         ({'muscles': ['quad', 'quad']}, 'different names'),
         ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
@@ -141,7 +141,7 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, 'layer_sizes'),
         ({'layer_sizes': 'x'}, 'layer_sizes'),
         ({'activation': 'relu'}, "'tanh' or 'silu'"),
-        ({'preset': 'other'}, "'paper' or 'default'"),
+        ({'preset': 'other'}, "'default' or 'paper'"),
         ({'units': 'degree'}, 'units'),
         ({'version': -1}, 'version'),
         ({'training': 5}, 'training'),

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.mae.descent import Term, loss, loss_gradient
+from musculoskeletal_ae.mae.descent import Loss, Term
 
 RNG = np.random.default_rng(0)
 TERMS = (
@@ -11,20 +11,21 @@ TERMS = (
     Term(0.3, RNG.normal(size=(1, 7)), RNG.normal(size=1)),
     Term(2.0, RNG.normal(size=(5, 7)), RNG.normal(size=5)),
 )
+LOSS = Loss(TERMS)
 
 
 def test_the_loss_is_the_weighted_sum_of_plain_norms():
     y = RNG.normal(size=(4, 7))
     expected = sum(w * np.linalg.norm(y @ a.T - b, axis=1) for w, a, b in TERMS)
-    np.testing.assert_allclose(loss(TERMS, y), expected)
+    np.testing.assert_allclose(LOSS(y), expected)
 
 
 def test_the_gradient_is_the_difference_quotient():
     y, step = RNG.normal(size=7), 1e-6
-    quotient = [(loss(TERMS, y + d) - loss(TERMS, y - d)) / (2 * step) for d in step * np.eye(7)]
-    np.testing.assert_allclose(loss_gradient(TERMS, y), quotient, rtol=1e-6)
+    quotient = [(LOSS(y + d) - LOSS(y - d)) / (2 * step) for d in step * np.eye(7)]
+    np.testing.assert_allclose(LOSS.gradient(y), quotient, rtol=1e-6)
 
 
 def test_a_norm_that_is_zero_has_no_gradient_and_no_nan():
     term = Term(1.0, np.eye(3), np.ones(3))
-    np.testing.assert_array_equal(loss_gradient([term], np.ones(3)), np.zeros(3))
+    np.testing.assert_array_equal(Loss([term]).gradient(np.ones(3)), np.zeros(3))

@@ -9,18 +9,20 @@ import pytest
 import torch
 from robots import read_muscles, write_muscles, write_robot
 
-from musculoskeletal_ae.mae.evaluation import jacobian_error, pair_errors, unseen_states
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
-from musculoskeletal_ae.mae.optimisers import orthogonal
-from musculoskeletal_ae.mae.samples import (
+from musculoskeletal_ae.mae.optimiser import orthogonal
+from musculoskeletal_ae.mae.training import (
     POSTURE_MARGIN,
-    geometric_samples,
-    overload_samples,
+    annealing,
+    fit,
+    initial_mae,
+    loss,
+    overload_states,
+    pair_errors,
+    random_states,
     shuffled,
 )
-from musculoskeletal_ae.mae.training import annealing, fit, initial_training, loss
-from musculoskeletal_ae.mae.units import Mask, scale_vector
+from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets import PAPER, PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -45,7 +47,7 @@ def test_paper_preset_enters_scaled_units_as_they_are(trained):
 
 
 def test_loss_is_the_weighted_sum_of_plain_norms(robot):
-    values = geometric_samples(robot, 5, np.random.default_rng(0), 500.0)
+    values = random_states(robot, 5, np.random.default_rng(0), 500.0).scaled()
     network = Network(2, 6, PAPER.network, np.zeros(14), np.ones(14))
     tensor, mask = torch.tensor(values, dtype=torch.float32), torch.tensor([0, 1, 2, 0, 1])
     error = network(tensor, mask).detach().numpy() - values
@@ -65,8 +67,7 @@ def test_loss_has_a_finite_gradient_where_nothing_is_wrong():
 
 
 def test_samples_are_the_geometric_model_to_a_little_beyond_its_limits(robot):
-    values = overload_samples(robot, 2000, np.random.default_rng(0)) / scale_vector(2, 6)
-    theta, tension, length = values[:, :2], values[:, 2:8], values[:, 8:]
+    theta, tension, length = overload_states(robot, 2000, np.random.default_rng(0))
     margin = POSTURE_MARGIN * (robot.upper - robot.lower)
     assert (theta >= robot.lower - margin).all() and (theta <= robot.upper + margin).all()
     assert (theta.min(axis=0) < robot.lower).all() and (theta.max(axis=0) > robot.upper).all()
@@ -89,19 +90,22 @@ def test_fewer_samples_than_a_batch_are_one_batch():
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])
 def test_a_tenth_of_the_training_beats_the_mean_posture(robot, trained, preset):
-    states = unseen_states(robot, 500, np.random.default_rng(5), 0.0, robot.tension.limit)
+    states = random_states(robot, 500, np.random.default_rng(5), robot.tension.limit)
     trivial = np.linalg.norm(states.theta - states.theta.mean(axis=0), axis=1).mean()
     errors = pair_errors(trained[preset], states)
     assert len(errors) == 9
     theta = [e for e in errors if e.mask is Mask.TENSION_LENGTH and e.output == 'theta']
-    assert theta[0].norm < 0.5 * trivial
+    assert theta[0].norm < 0.3 * trivial
     assert theta[0].elements.shape == (2,)
 
 
 def test_muscle_jacobian_approaches_the_geometric_one(robot, trained):
-    states = unseen_states(robot, 100, np.random.default_rng(6), 0.0, robot.tension.limit)
-    error, size = jacobian_error(trained['default'], robot, states)
-    assert error < 0.2 * size
+    theta, tension, _ = random_states(robot, 100, np.random.default_rng(6), robot.tension.limit)
+    # l = f_geo − L_e(l_abs, T), and L_e grows with l_abs.
+    slope = robot.series_elastic.length_slope(tension)[..., None]
+    true = robot.routes.muscle_jacobian(theta) * (1.0 - slope)
+    error = trained['default'].muscle_jacobian(theta, tension) - true
+    assert np.abs(error).mean() < 0.05 * np.abs(true).mean()
 
 
 def test_same_seed_gives_the_same_network_and_another_seed_another(robot):
@@ -117,25 +121,27 @@ def test_training_leaves_the_callers_random_state_and_threads_alone(robot):
     expected = torch.rand(3)
     torch.manual_seed(1)
     threads = torch.get_num_threads()
-    initial_training(robot, 'default', seed=9, steps=2)
+    initial_mae(robot, 'default', seed=9, steps=2)
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.rand(3), expected)
 
 
 def test_training_goes_on_from_given_weights(robot, trained):
     rng = np.random.default_rng(2)
-    batches = shuffled(geometric_samples(robot, 2000, rng, 200.0), 64, rng)
+    batches = shuffled(random_states(robot, 2000, rng, 200.0).scaled(), 64, rng)
     settings = replace(PAPER.training, steps=200, step_size=3e-4)
     before = trained['paper']
     network = from_mae(before)
     seen: list[int] = []
     losses = fit(network, batches, settings, progress=lambda step, _: seen.append(step))
     after = to_mae(network, robot.joints, robot.muscles, 'paper', 'more', version=1)
-    states = unseen_states(robot, 500, rng, 0.0, 200.0)
+    states = random_states(robot, 500, rng, 200.0)
     assert seen == list(range(200)) and len(losses) == 200
-    assert sum(e.norm for e in pair_errors(after, states) if e.output == 'theta') < sum(
-        e.norm for e in pair_errors(before, states) if e.output == 'theta'
-    )
+
+    def error(mae):
+        return sum(e.norm for e in pair_errors(mae, states) if e.output == 'theta')
+
+    assert error(after) < 0.85 * error(before)  # 0.60 to 0.67 over six seeds
 
 
 def test_annealing_rises_and_then_falls_to_nothing():
@@ -155,7 +161,7 @@ def test_orthogonalised_matrix_has_singular_values_near_one(shape):
 def check_trains(arm: Robot) -> None:
     for preset in PRESETS:
         mae = initial_mae(arm, preset, steps=100).mae
-        states = unseen_states(arm, 50, np.random.default_rng(0), 0.0, arm.tension.max)
+        states = random_states(arm, 50, np.random.default_rng(0), arm.tension.max)
         assert all(np.isfinite(e.norm) for e in pair_errors(mae, states))
         shape = (arm.muscle_count, arm.joint_count)
         assert mae.muscle_jacobian(states.theta[0], states.tension[0]).shape == shape

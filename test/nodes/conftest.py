@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph per test, and one quickly trained network for all of them."""
+"""A graph per test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import os
 import pytest
 from graph import Graph
 
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 
 _counter = itertools.count(1)
@@ -21,11 +20,8 @@ def arm26() -> Robot:
 
 
 @pytest.fixture(scope='session')
-def trained(trained, tmp_path_factory) -> str:
-    """Return a checkpoint file of arm26."""
-    path = tmp_path_factory.mktemp('checkpoint') / 'arm26.safetensors'
-    checkpoint.save(trained['default'], path)
-    return str(path)
+def trained(trained_file) -> str:
+    return trained_file
 
 
 @pytest.fixture

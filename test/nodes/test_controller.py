@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
-from musculoskeletal_ae.messages import bytes_message
+from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
@@ -136,5 +136,4 @@ def test_parameters_set_together_are_taken_all_or_none(arm):
     arm.goes_to(HERE)
     assert len(arm.sent('tension')) == 0
     arm.says('method')
-    said = {pair.key: pair.value for pair in arm.state().values}
-    assert said['method'] == 'proposed'
+    assert arm.state().values['method'] == 'proposed'

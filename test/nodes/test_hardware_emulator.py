@@ -12,8 +12,11 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from musculoskeletal_ae.messages import array_message, read_array
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.validity import read_array
 
 
 @pytest.fixture
@@ -23,7 +26,7 @@ def arm(graph):
     graph.listen(String, 'robot_description', LATCHED)
     graph.listen(MarkerArray, 'hardware_emulator/markers')
     graph.listen(PoseStamped, 'marker_pose')
-    graph.node_under_test = graph.start('hardware_emulator', robot='arm26', seed=1)
+    graph.emulator = graph.host(HardwareEmulator, robot='arm26', seed=1)
     graph.next('muscle_states')
     return graph
 
@@ -129,7 +132,7 @@ def test_bad_commands_do_not_move_it(arm, arm26):
         publisher.publish(Float64MultiArray(data=data))
     arm.next('muscle_states', 30)
     np.testing.assert_allclose(rows(arm, arm26)[0], before, atol=2e-3)
-    assert arm.node_under_test.alive()
+    assert sum(arm.emulator.rejected.values()) == 4
 
 
 def test_reset_brings_it_back(arm, arm26):
@@ -142,6 +145,11 @@ def test_reset_brings_it_back(arm, arm26):
 
 def test_without_joint_sensors_there_are_no_joint_states(graph):
     graph.listen(Float64MultiArray, 'muscle_states')
-    graph.start('hardware_emulator', robot='arm26', joint_sensors=False)
+    graph.host(HardwareEmulator, robot='arm26', joint_sensors=False)
     graph.next('muscle_states', 10)
     assert graph.node.count_publishers('joint_states') == 0
+
+
+def test_every_parameter_that_is_settable_is_followed(arm):
+    settable = {name for name, p in PARAMETERS['hardware_emulator'].items() if p.settable}
+    assert settable == set(arm.emulator._setters)

@@ -16,7 +16,7 @@ from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import array_message
+from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 # Faster than on a robot, so that a test takes seconds.

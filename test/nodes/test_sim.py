@@ -14,10 +14,13 @@ from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.control.methods import first_command
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.messages import array_message, bytes_message, read_array
+from musculoskeletal_ae.nodes.messages import array_message, bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.validity import read_array
 
 
 @pytest.fixture
@@ -25,7 +28,7 @@ def arm(graph, trained):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(Float64MultiArray, 'sim/muscle_states')
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.simulator = graph.start('sim', robot='arm26', checkpoint=trained)
+    graph.simulator = graph.host(Sim, robot='arm26', checkpoint=trained)
     graph.next('sim/muscle_states')
     return graph
 
@@ -133,6 +136,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
         commands.publish(Float64MultiArray(data=data))
     arm.next('sim/joint_states', 30)
     np.testing.assert_allclose(posture(arm), before, atol=1e-3)
+    assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in state(arm).message, 'the report')
     _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
@@ -144,7 +148,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
 def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, mae, trained):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.start('sim', robot='arm26')
+    graph.host(Sim, robot='arm26')
     graph.wait(lambda: 'waiting for a checkpoint' in state(graph).message, 'the report')
     assert not graph.received['sim/joint_states']
     sender = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
@@ -180,12 +184,8 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
 
 def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained):
     graph.listen(JointState, 'sim/joint_states')
-    graph.start('sim', robot='arm26', checkpoint=trained, preset='paper')
+    graph.host(Sim, robot='arm26', checkpoint=trained, preset='paper')
     theta = np.array(graph.next('sim/joint_states', 20).position)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
-    refused = graph.start('sim', robot='arm26', checkpoint=trained, preset='magic')
-    graph.processes.remove(refused)
-    refused.process.wait(timeout=60.0)
-    status, output = refused.end()
-    assert status == 1
-    assert 'default' in output and 'paper' in output
+    with pytest.raises(MusculoskeletalError, match=r'parameter preset: .*default, paper'):
+        graph.host(Sim, robot='arm26', preset='magic')

@@ -11,7 +11,7 @@ import pytest
 from bench import sim_pictures
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.simulation import compare, random_commands, rest_errors
-from musculoskeletal_ae.mae.initial import initial_mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -45,15 +45,6 @@ def test_one_arm_and_a_batch_agree_to_a_millionth(robot, mae):
         single.command, single.wrench = commands[[i]], batch.wrench[[i]]
         for ours, theirs in zip(single.step(0.3), batch.state, strict=True):
             np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
-
-
-def test_the_lengths_pullback_of_a_tension_is_its_torque(robot, mae):
-    theta = robot.random_postures(5, np.random.default_rng(0))
-    tension = np.random.default_rng(1).uniform(30.0, 200.0, (5, robot.muscle_count))
-    length, pullback = mae.lengths_with_pullback(theta, tension)
-    np.testing.assert_allclose(length, mae.lengths(theta, tension), atol=1e-12)
-    torque = np.einsum('nmd,nm->nd', mae.muscle_jacobian(theta, tension), tension)
-    np.testing.assert_allclose(pullback(tension), torque, atol=1e-10)
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])

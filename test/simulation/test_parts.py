@@ -9,9 +9,9 @@ import pytest
 
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.equilibrium import Slopes
 from musculoskeletal_ae.simulation.load import Load
-from musculoskeletal_ae.simulation.slopes import Slopes
-from musculoskeletal_ae.simulation.threads import on_all_cores
+from musculoskeletal_ae.simulation.simulation import on_all_cores
 
 
 def sliding_tree():

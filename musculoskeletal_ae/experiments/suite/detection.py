@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording
-from musculoskeletal_ae.mae.evaluation import residuals
-from musculoskeletal_ae.mae.mae import Mae, State
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import residuals
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -53,7 +54,7 @@ def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
 
 def anomaly(mae: Mae, tension: Array, length: Array) -> Array:
     """Return A of messages (N, M), scaled units, shape (N,)."""
-    halves = np.split(residuals(mae, tension, length), 2, axis=1)
+    halves = np.split(residuals(mae.estimate(tension, length), tension, length), 2, axis=1)
     total: Array = sum((np.linalg.norm(half, axis=1) for half in halves), np.zeros(len(tension)))
     return total
 

@@ -15,8 +15,8 @@ from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
 from musculoskeletal_ae.experiments.suite.limits import body_error, oracle_errors
 from musculoskeletal_ae.experiments.suite.study import Measured, Progress, Study
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of validity, on messages without a graph."""
+"""The rules of validity and of order, on messages without a graph."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.messages import (
-    array_message,
+from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.validity import (
+    SourceOrder,
     read_array,
     read_joints,
     read_posture,
@@ -23,6 +24,7 @@ from musculoskeletal_ae.messages import (
 )
 
 JOINTS = ('a', 'b')
+SECOND = 1_000_000_000  # [ns]
 
 
 def muscle_array(data, sizes=None, strides=None, offset=0):
@@ -140,3 +142,38 @@ def test_a_wrench_that_no_arm_outlives_is_refused():
     message.wrench.force.x = 1e6
     with pytest.raises(MessageError, match='oversized'):
         read_wrench(message, 'torso')
+
+
+def test_messages_are_told_by_their_fields_whatever_library_made_them():
+    from bags.arm_bag import ARRAY
+    from bags.arm_bag import JOINTS as JOINT_STATE
+    from bags.arm_bag import array as bag_array
+    from bags.arm_bag import joints as bag_joints
+
+    from musculoskeletal_ae.bags.message_types import decode
+
+    values = np.arange(6.0).reshape(3, 2)
+    recorded = decode(bag_array(values), ARRAY)
+    np.testing.assert_array_equal(read_array(recorded, 3, 2), values)
+    with pytest.raises(MessageError, match='wrong length'):
+        read_array(recorded, 2, 2)
+    recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
+    assert read_posture(recorded, JOINTS).tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ('time', 'number', 'late'),
+    [
+        (100 * SECOND, 7, True),  # twice
+        (100 * SECOND - 1, 6, True),  # reordered
+        (100 * SECOND + 1, 8, False),
+        (100 * SECOND - 1, 8, False),  # the publisher's clock stepped back
+        (99 * SECOND, 6, False),  # another publisher's clock
+        (0, 0, False),  # not known
+    ],
+)
+def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number, late):
+    order = SourceOrder()
+    assert not order.is_late(100 * SECOND, 7)
+    order.take(100 * SECOND, 7)
+    assert order.is_late(time, number) == late

@@ -1,25 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between ROS messages and arrays, with the rules of validity (INTERFACE.md).
+"""Which messages are used: the rules of validity and of order (doc/interface.md), without ROS.
 
-Reading raises `MessageError` with a short reason; the node counts it and lives on. JointState is
-matched by name in any order, Float64MultiArray by length and, where given, layout.
+Messages are told by their fields, so that the rules hold for a live message and for one of a bag
+alike. Reading raises `MessageError` with a short reason; who reads counts it and lives on. A
+JointState is matched by name in any order, a Float64MultiArray by length and, where given, layout.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from sensor_msgs.msg import JointState
-from std_msgs.msg import (
-    Float64MultiArray,
-    MultiArrayDimension,
-    MultiArrayLayout,
-    UInt8MultiArray,
-)
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
@@ -33,9 +26,36 @@ UNIT_TOLERANCE = 0.01  # of a quaternion's length
 
 QUANTITIES = ('length', 'tension', 'temperature')
 
+# A source time that lies further back than this is another publisher's clock, not a reordering.
+REORDERING = 1_000_000_000  # [ns]
+LATE = 'repeated or reordered'
 
-def read_array(message: Float64MultiArray, rows: int, columns: int) -> Array:
-    """Return the data of a multi-array as shape (rows, columns); rows = 1 gives (columns,).
+
+class SourceOrder:
+    """Of the messages of one publisher, those that come twice or late are not used."""
+
+    def __init__(self) -> None:
+        """Nothing has come yet."""
+        self._last = 0, 0
+
+    def is_late(self, time: int, number: int = 0) -> bool:
+        """Say whether a message was sent no later than the last one that was taken.
+
+        Args:
+            time: When it was sent [ns]; 0 where that is not known.
+            number: Which of the publisher's messages it is, where that is known: it goes on when
+                the publisher's clock steps back.
+        """
+        last_time, last_number = self._last
+        return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
+
+    def take(self, time: int, number: int = 0) -> None:
+        """Compare with this message from now on."""
+        self._last = time, number
+
+
+def read_array(message: Any, rows: int, columns: int) -> Array:
+    """Return the data of a Float64MultiArray as shape (rows, columns); rows = 1 gives (columns,).
 
     Raises:
         MessageError: If the length, layout or a value breaks a rule.
@@ -68,30 +88,13 @@ def read_array(message: Float64MultiArray, rows: int, columns: int) -> Array:
     return values.reshape(rows, columns) if rows > 1 else values
 
 
-def array_message(values: Array, *labels: str) -> Float64MultiArray:
-    """Return a multi-array of values (…) with one label per dimension."""
-    sizes = values.shape
-    layout = MultiArrayLayout(
-        dim=[
-            MultiArrayDimension(label=label, size=size, stride=int(np.prod(sizes[i:])))
-            for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
-        ]
-    )
-    return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
-
-
-def bytes_message(data: bytes) -> UInt8MultiArray:
-    """Return a byte array message."""
-    return UInt8MultiArray(data=array('B', data))
-
-
 def read_joints(
-    message: JointState, joints: Sequence[str], foreign_allowed: bool
+    message: Any, joints: Sequence[str], foreign_allowed: bool
 ) -> dict[str, tuple[float, float]]:
     """Return name → (position, effort) of the listed joints; effort is 0 where none is given.
 
     Args:
-        message: The message.
+        message: A JointState.
         joints: Joints the robot lists.
         foreign_allowed: Ignore joints the robot does not list (`joint_states`) and ask for all
             that it does; else refuse unknown ones and accept a subset (targets).
@@ -114,33 +117,35 @@ def read_joints(
         for name in names:
             if name not in listed:
                 raise MessageError('unknown joint', f'{name!r}; legal: {", ".join(joints)}')
-    found: dict[str, tuple[float, float]] = {}
+    values: dict[str, tuple[float, float]] = {}
     for i, name in enumerate(names):
         if name not in listed:
             continue
-        if name in found:
+        if name in values:
             raise MessageError('duplicate joint', repr(name))
         # Drivers say NaN for a velocity or effort they do not measure; only a target's counts.
         effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
-        found[name] = (message.position[i], effort)
-    if foreign_allowed and len(found) < len(joints):
-        missing = [name for name in joints if name not in found]
+        values[name] = (message.position[i], effort)
+    if foreign_allowed and len(values) < len(joints):
+        missing = [name for name in joints if name not in values]
         raise MessageError('missing joint', ', '.join(missing))
-    if not np.isfinite(list(found.values())).all() or not (
+    if not np.isfinite(list(values.values())).all() or not (
         foreign_allowed or np.isfinite(np.asarray(speeds, dtype=float)).all()
     ):
         raise MessageError('not finite', 'a position, effort or velocity')
-    return found
+    return values
 
 
-def read_posture(message: JointState, joints: Sequence[str]) -> Array:
-    """Return θ [rad] (D,) of a message that has all listed joints, others ignored."""
-    found = read_joints(message, joints, foreign_allowed=True)
-    return np.array([found[name][0] for name in joints])
+def read_posture(message: Any, joints: Sequence[str]) -> Array:
+    """Return θ [rad] (D,) of a JointState that has all listed joints, others ignored."""
+    values = read_joints(message, joints, foreign_allowed=True)
+    return np.array([values[name][0] for name in joints])
 
 
-def read_wrench(message: WrenchStamped, root_link: str) -> Array:
-    """Return force [N] and torque [N·m] (6,), in axes of the root link; an empty frame is that.
+def read_wrench(message: Any, root_link: str) -> Array:
+    """Return force [N] and torque [N·m] (6,) of a WrenchStamped in axes of the root link.
+
+    An empty frame means the root link.
 
     Raises:
         MessageError: If it is given in another frame, not finite, or absurd.
@@ -156,8 +161,8 @@ def read_wrench(message: WrenchStamped, root_link: str) -> Array:
     return wrench
 
 
-def read_pose(message: PoseStamped, frame: str) -> pin.SE3:
-    """Return the pose of a message that is given in `frame`.
+def read_pose(message: Any, frame: str) -> pin.SE3:
+    """Return the pose of a PoseStamped that is given in `frame`.
 
     Raises:
         MessageError: If it is given in another frame, not finite, or without an orientation.

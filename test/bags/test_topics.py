@@ -5,13 +5,19 @@ import random
 
 import pytest
 
-from musculoskeletal_ae.bags import definitions, samples
+from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.selection import interface_topics, select
-from musculoskeletal_ae.bags.topics import SENT, TOPICS, recorded_namespace, relative_name
-from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.bags.topics import (
+    SENT,
+    TOPICS,
+    interface_topics,
+    latched_topics,
+    namespaces,
+    select,
+)
+from musculoskeletal_ae.exceptions import BagError
 
-# INTERFACE.md, Bags.
+# doc/interface.md, Bags.
 DEFAULT = {
     'joint_states',
     'muscle_states',
@@ -29,7 +35,7 @@ STRING = 'std_msgs/msg/String'
 def make(path, *topics):
     rng = random.Random(0)
     content = [
-        samples.Sample(name, kind, i, i, definitions.encode(samples.filled(kind, rng), kind))
+        samples.Sample(name, kind, i, i, samples.encode(samples.filled(kind, rng), kind))
         for i, (name, kind) in enumerate(topics)
     ]
     samples.write_mcap(path / 'a.mcap', content)
@@ -57,22 +63,12 @@ def ours(*names):
     ],
 )
 def test_the_namespace_is_the_one_that_explains_all_topics(names, namespace):
-    assert recorded_namespace(names) == namespace
+    assert namespaces(names) == [namespace]
 
 
 def test_of_several_namespaces_none_is_guessed():
     names = ['/left/muscle_states', '/right/muscle_states', '/joint_states']
-    with pytest.raises(
-        MusculoskeletalError, match=r'several namespaces: /, /left, /right; .*--from'
-    ):
-        recorded_namespace(names)
-    assert recorded_namespace(names, '/left') == recorded_namespace(names, 'left/') == '/left'
-
-
-def test_names_outside_the_namespace_stay_absolute():
-    assert relative_name('/left/sim/markers', '/left') == 'sim/markers'
-    assert relative_name('/left_foot/x', '/left') == '/left_foot/x'
-    assert relative_name('/diagnostics', '') == '/diagnostics'
+    assert namespaces(names) == ['', '/left', '/right']
 
 
 def test_what_hardware_vision_user_and_controller_sent_is_played_by_default(bag):
@@ -102,12 +98,23 @@ def test_topics_are_chosen_by_relative_or_recorded_name(tmp_path):
         select(bag, ['nothing'], None, False)
 
 
+def test_names_outside_the_namespace_stay_absolute(tmp_path):
+    names = ('/left/sim/markers', 'sim/markers'), ('/diagnostics', '/diagnostics')
+    bag = make(tmp_path, *ours(*names), ('/left_foot/x', STRING))
+    assert select(bag, ['/left/sim/markers', '/diagnostics', '/left_foot/x'], None, False) == {
+        '/left/sim/markers': 'sim/markers',
+        '/diagnostics': '/diagnostics',
+        '/left_foot/x': '/left_foot/x',
+    }
+
+
 def test_one_of_two_arms_can_be_chosen_or_both_kept(tmp_path):
     names = [('/l/muscle_states', 'muscle_states'), ('/r/muscle_states', 'muscle_states')]
     bag = make(tmp_path, *ours(*names))
-    with pytest.raises(BagError, match='several namespaces: /l, /r'):
+    with pytest.raises(BagError, match='several namespaces: /l, /r; choose one with --from-name'):
         select(bag, ['all'], None, False)
-    assert select(bag, ['all'], '/r', False) == {'/r/muscle_states': 'muscle_states'}
+    for name in ('/r', 'r/', 'r'):
+        assert select(bag, ['all'], name, False) == {'/r/muscle_states': 'muscle_states'}
     assert len(select(bag, ['all'], None, True)) == 2
 
 
@@ -122,3 +129,8 @@ def test_a_topic_of_the_wrong_type_is_refused(tmp_path):
     for use in (interface_topics, lambda bag: select(bag, ['all'], None, False)):
         with pytest.raises(BagError, match=r"/muscle_states has the type .*String', not 'std_msgs"):
             use(bag)
+
+
+def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
+    samples.write_mcap(tmp_path / 'a.mcap', content)
+    assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m bench` lists the benches; `python -m bench NAME [options]` runs one.
+
+A bench is a module of this folder with a `main(argv)` that returns an exit status, or None for 0.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+
+def benches() -> dict[str, str]:
+    """Return the first line of every bench's docstring, by name."""
+    found = {}
+    for file in sorted(Path(__file__).parent.glob('[!_]*.py')):
+        tree = ast.parse(file.read_text(encoding='utf-8'))
+        if any(isinstance(part, ast.FunctionDef) and part.name == 'main' for part in tree.body):
+            found[file.stem] = (ast.get_docstring(tree) or '').partition('\n')[0]
+    return found
+
+
+def main(argv: list[str]) -> int:
+    """List or run; exit status 2 for a bench that there is not."""
+    listed = benches()
+    if not argv or argv[0] in ('-h', '--help'):
+        print(
+            'python -m bench NAME [options]; each has --help. README.md says what passing means.\n'
+        )
+        print('\n'.join(f'{name:<20}{line}' for name, line in listed.items()))
+        return 0
+    if argv[0] not in listed:
+        print(f'error: no bench {argv[0]!r}; there are: {", ".join(listed)}', file=sys.stderr)
+        return 2
+    return importlib.import_module(f'bench.{argv[0]}').main(argv[1:]) or 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint angles from muscle length and tension, message by message; is the body still healthy.
+
+    (T, l) ─② of the MAE→ θ, T, l ─→ detector ─→ anomaly, latched until `reset`
+    pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
+
+What was detected first names the suspect for as long as the latch holds.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
+from musculoskeletal_ae.robot.robot import Robot
+
+# Commands older than this no longer say what the modules do.
+COMMAND_AGE = 0.5  # [s]
+# A pause in the messages counts as at most this much of a muscle's time without tension.
+LONGEST_PERIOD = 0.1  # [s]
+# Without a message for this long there is nothing to estimate from.
+SILENCE = 1.0  # [s]
+# A marker that the arm cannot reach to within these is another one, or its calibration is off.
+MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
+
+
+class Estimate(NamedTuple):
+    """What one message gives.
+
+    Attributes:
+        state: (θ, T, l) as the network restores them.
+        anomaly: A, scaled units.
+        detected: Whether this message completes a detection that was not there before.
+    """
+
+    state: State
+    anomaly: float
+    detected: bool
+
+
+class Estimator:
+    """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s].
+
+    Attributes:
+        mae: The network in use, or None.
+        detector: Judges every message.
+        cause: Why an anomaly is latched, or ''.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Wait for a network."""
+        self._robot = robot
+        self.mae: Mae | None = None
+        self.detector = AnomalyDetector(robot)
+        self.cause = self._suspect = ''
+        self._theta: Array = 0.5 * (robot.lower + robot.upper)
+        self._verdict: Verdict | None = None
+        self._time: float | None = None
+        self._stepped_at = self._commanded_at = -math.inf
+
+    def use(self, mae: Mae) -> None:
+        """Take a network and the healthy statistics it brings."""
+        self.detector.use(mae)
+        self.mae = mae
+
+    def commanded_length(self, length: Array, now: float) -> None:
+        """Note the target lengths [m] (M,) sent to the modules."""
+        self.detector.commanded_length(length)
+        self._commanded_at = now
+
+    def commanded_tension(self, tension: Array, now: float) -> None:
+        """Note the target tensions [N] (M,) sent to the modules."""
+        self.detector.commanded_tension(tension)
+        self._commanded_at = now
+
+    def step(self, tension: Array, length: Array, time: float, now: float) -> Estimate | None:
+        """Return the estimate from measured T [N] (M,) and l [m] (M,); None without a network."""
+        if self.mae is None:
+            return None
+        dt = 0.0 if self._time is None else min(max(time - self._time, 0.0), LONGEST_PERIOD)
+        self._time, self._stepped_at = time, now
+        if now - self._commanded_at > COMMAND_AGE:
+            self.detector.commanded_length(None)
+        state = self.mae.estimate(tension, length)
+        self._theta = state.theta
+        self._verdict = verdict = self.detector.step(state, tension, length, dt)
+        detected = bool(verdict.cause) and not self.cause
+        if detected:
+            self._suspect = self._robot.muscles[verdict.suspect]
+            self.cause = f'{self._suspect}: {verdict.cause}'
+        return Estimate(state, verdict.anomaly, detected)
+
+    def see(self, pose: pin.SE3) -> Array:
+        """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame.
+
+        Raises:
+            MessageError: If the arm cannot reach it.
+        """
+        found = inverse_kinematics(self._robot, pose, self._theta)
+        if found.distance > MARKER_DISTANCE or found.angle > MARKER_ANGLE:
+            raise MessageError(
+                'out of reach', f'{found.distance:.3f} m and {found.angle:.2f} rad are left'
+            )
+        return found.theta
+
+    def reset(self) -> None:
+        """Clear the anomaly."""
+        self.cause = self._suspect = ''
+        self.detector.reset()
+
+    def clock_jumped_back(self) -> None:
+        """Start the detector's counts anew; what was detected stays."""
+        self._time = None
+        self.detector.reset()
+
+    def report(self, now: float) -> Report:
+        """Say what is estimated, and how the body is."""
+        if self.mae is None:
+            return Report('warn', 'waiting for a checkpoint', {})
+        values = {
+            'checkpoint version': str(self.mae.version),
+            'anomaly calibrated': str(self.detector.calibrated),
+        }
+        if self._verdict is not None:
+            values |= {
+                'A': f'{self._verdict.anomaly:.4f}',
+                'd': f'{self._verdict.distance:.1f}',
+                'suspect muscle': self._suspect or self._robot.muscles[self._verdict.suspect],
+            }
+        if self.cause:
+            return Report('error', f'anomaly detected: {self.cause}', values)
+        if now - self._stepped_at > SILENCE:
+            return Report('warn', 'no muscle_states', values)
+        calibrated = '' if self.detector.calibrated else ', uncalibrated'
+        return Report('ok', f'estimating{calibrated}', values)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ② leaves of a message, and what that looks like on a healthy body.
+
+    e = (T_est − T, l_est − l)                        scaled units, shape (2M,)
+    A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, section "State Estimation")
+
+A checkpoint carries mean and covariance of e over healthy data; the detector that decides by them
+is `estimation/anomaly.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
+
+# Below any sensor's resolution (0.02 N, 0.01 mm); keeps the covariance invertible when a network
+# restores some combination of its inputs perfectly.
+FLOOR = 1e-4
+
+
+def residuals(restored: State, tension: Array, length: Array) -> Array:
+    """Return e (..., 2M) of states restored from measured T [N] (..., M) and l [m] (..., M)."""
+    tension_error = TENSION_SCALE * (restored.tension - tension)
+    length_error = LENGTH_SCALE * (restored.length - length)
+    return np.concatenate([tension_error, length_error], axis=-1)
+
+
+def anomaly(error: Array) -> Array:
+    """Return A (...) of residuals e (..., 2M)."""
+    halves = error.reshape(*error.shape[:-1], 2, -1)
+    size: Array = np.sqrt((halves * halves).sum(axis=-1)).sum(axis=-1)
+    return size
+
+
+@dataclass(frozen=True, eq=False)
+class AnomalyStatistics:
+    """Mean and covariance of e over healthy data.
+
+    Attributes:
+        mean: Shape (2M,).
+        covariance: Symmetric positive definite, shape (2M, 2M).
+        calibrated: Whether the data came from the real arm, not from geometry.
+        samples: How many samples they rest on.
+        thresholds: What a detector found worth keeping, by name; finite numbers.
+    """
+
+    mean: Array
+    covariance: Array
+    calibrated: bool
+    samples: int
+    thresholds: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, error: Array, calibrated: bool, thresholds: Mapping[str, float] | None = None
+    ) -> AnomalyStatistics:
+        """Return the statistics of residuals of shape (N, 2M), N ≥ 2."""
+        mean = error.mean(axis=0)
+        centred = error - mean
+        covariance = centred.T @ centred / max(len(error) - 1, 1)
+        covariance = 0.5 * (covariance + covariance.T) + FLOOR**2 * np.eye(error.shape[1])
+        return cls(mean, covariance, calibrated, len(error), dict(thresholds or {}))

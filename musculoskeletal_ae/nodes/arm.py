@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm on the graph, simulated or emulated: its states, its description, and how it is drawn.
+
+RViz and Foxglove draw bones and muscles from markers in the root link's frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
+from sensor_msgs.msg import JointState
+from std_msgs.msg import ColorRGBA, Float64MultiArray, String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.nodes.messages import array_message, joint_message
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.robot.drawing import Drawing
+
+MARKER_RATE = 10.0  # [Hz]
+BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
+BONE_COLOUR = (0.85, 0.85, 0.8)
+
+
+class Arm(Shell):
+    """A node that stands for an arm."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        """Advertise NAME/markers; options are those of Node."""
+        super().__init__(name, **options)
+        self._markers = self.create_publisher(MarkerArray, f'{name}/markers', RELIABLE)
+        self.create_timer(1.0 / MARKER_RATE, self._publish_markers)
+
+    def advertise(self, prefix: str, joints: bool, description: bool) -> None:
+        """Advertise the states below a prefix.
+
+        Args:
+            prefix: '' for the robot's own topics.
+            joints: Whether there are joint sensors.
+            description: Whether this is the robot, which describes itself.
+        """
+        self._joints = None
+        if joints:
+            self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
+        self._muscles = self.create_publisher(Float64MultiArray, f'{prefix}muscle_states', RELIABLE)
+        if description:
+            publisher = self.create_publisher(String, 'robot_description', LATCHED)
+            publisher.publish(String(data=self.robot.description.urdf))
+
+    def publish_state(
+        self, theta: Array, length: Array, tension: Array, temperature: Array
+    ) -> None:
+        """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,), as of now."""
+        if self._joints is not None:
+            stamp = self.get_clock().now().to_msg()
+            self._joints.publish(joint_message(self.robot.joints, theta, stamp))
+        rows = np.stack([length, tension, temperature])
+        self._muscles.publish(array_message(rows, 'quantity', 'muscle'))
+
+    def drawing(self) -> Drawing | None:
+        """Return the arm as lines, or None where there is nothing to draw yet."""
+        raise NotImplementedError
+
+    def _publish_markers(self) -> None:
+        if self._markers.get_subscription_count() == 0:
+            return
+        drawing = self.drawing()
+        if drawing is not None:
+            stamp = self.get_clock().now().to_msg()
+            self._markers.publish(arm_markers(drawing, self.robot.root_link, stamp))
+
+
+def arm_markers(drawing: Drawing, frame: str, stamp: Time) -> MarkerArray:
+    """Return one line strip per bone and per muscle."""
+
+    def strip(space: str, index: int, points: Array, width: float, colour: Any) -> Marker:
+        red, green, blue = map(float, colour)
+        marker = Marker(ns=space, id=index, type=Marker.LINE_STRIP, action=Marker.ADD)
+        marker.header.frame_id, marker.header.stamp = frame, stamp
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = width
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]
+        return marker
+
+    bones = [
+        strip('bones', i, line, BONE_WIDTH, BONE_COLOUR) for i, line in enumerate(drawing.bones)
+    ]
+    muscles = [
+        strip('muscles', i, line, MUSCLE_WIDTH, colour)
+        for i, (line, colour) in enumerate(zip(drawing.muscles, drawing.colours, strict=True))
+    ]
+    return MarkerArray(markers=bones + muscles)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which θ belongs to which (T, l): the nearest in time, within half a period.
+
+A θ between two messages of the muscle modules belongs to the nearer one, the earlier one if it lies
+in the middle, so none is used twice. The rule is the same on a live arm and on a recording.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from musculoskeletal_ae.arrays import Array
+
+
+class Paired(NamedTuple):
+    """One message of the muscle modules, with the θ of the same time if there is one.
+
+    Attributes:
+        time: When it came [s].
+        tension: T [N], shape (M,).
+        length: l [m], shape (M,).
+        dt: Time since the message before [s], 0 for the first.
+        theta: θ [rad], shape (D,), or None.
+    """
+
+    time: float
+    tension: Array
+    length: Array
+    dt: float
+    theta: Array | None
+
+
+class Pairing:
+    """Joins two streams; gives out a muscle message when the next one has come."""
+
+    def __init__(self, period: float) -> None:
+        """Pair within half a `period` [s] of the muscle messages."""
+        self._half = 0.5 * period + 1e-9
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget, as after a backward jump of the clock."""
+        # The last θ before the muscle message that waits, the first one after it, the latest one.
+        self._angles: list[tuple[float, Array]] = []
+        self._pending: tuple[float, Array, Array] | None = None
+        self._before: float | None = None
+
+    def joints(self, time: float, theta: Array) -> None:
+        """Take a θ [rad] (D,) that came at `time` [s]."""
+        if self._angles and time < self._angles[-1][0]:
+            self.reset()
+        del self._angles[2:]
+        self._angles.append((time, theta))
+
+    def muscles(self, time: float, tension: Array, length: Array) -> Paired | None:
+        """Take T [N] and l [m] that came at `time` [s]; return the message before, paired.
+
+        At the end of a recording, a message at time ∞ gives out the last one.
+        """
+        # The clock went back, or became another one.
+        if self._pending is not None and time < self._pending[0]:
+            self.reset()
+        pending, self._pending = self._pending, (time, tension, length)
+        paired = None
+        if pending is not None:
+            came, before = pending[0], self._before
+            paired = Paired(
+                *pending, 0.0 if before is None else came - before, self._nearest(came, time)
+            )
+            self._before = came
+        del self._angles[:-1]
+        return paired
+
+    def _nearest(self, came: float, following: float) -> Array | None:
+        """Return the θ nearest to the message that waits, unless it is nearer to a neighbour."""
+        before = -math.inf if self._before is None else self._before
+        mine = [
+            (distance, theta)
+            for time, theta in self._angles
+            if (distance := abs(time - came)) <= min(self._half, abs(time - following))
+            and distance < abs(time - before)
+        ]
+        return min(mine, key=lambda entry: entry[0])[1] if mine else None

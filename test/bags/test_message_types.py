@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a bag says of its types is compared with those of ROS 2 Jazzy, and never used."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from bags.bare_file import FLOAT, write
+from musculoskeletal_ae.bags import message_types
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.exceptions import BagError
+
+LINE = '=' * 80 + '\n'
+
+
+@pytest.mark.parametrize('end', ['\n', '\r\n'])
+def test_our_types_are_those_of_the_installed_ros_messages(end):
+    share = Path(sys.prefix) / 'share'
+    compared = 0
+    for type_name in sorted(message_types.TYPESTORE.fielddefs):
+        package, _, name = type_name.split('/')
+        file = share / package / 'msg' / f'{name}.msg'
+        if not file.exists():
+            continue
+        # As rosbag2 writes it: with comments, constants, defaults and unqualified names.
+        text = file.read_text()
+        for line in message_types.definition(type_name).splitlines():
+            if line.startswith('MSG: '):
+                package, name = line[5:].split('/')
+                contained = (share / package / 'msg' / f'{name}.msg').read_text()
+                text += f'\n{LINE}{line}\n{contained}'
+        text = end.join(text.splitlines())
+        assert message_types.contradiction(type_name, 'ros2msg', text.encode(), '') == ''
+        compared += 1
+    if not compared:
+        pytest.skip('the message packages are not in this environment')
+    assert compared > 100
+
+
+@pytest.mark.parametrize(
+    ('options', 'problem'),
+    [
+        ({'text': 'float32 data\n'}, 'has other fields for std_msgs/msg/Float64'),
+        ({'text': 'float64 data\nstring more\n'}, 'has other fields'),
+        ({'text': ''}, 'has other fields'),
+        ({'text': 'float64 data[__import__("os")]\n'}, 'cannot be read'),
+        ({'text': 'float64 data\n' + ' ' * (1 << 18)}, 'is longer than 262144 bytes'),
+        ({'schema': 'std_msgs/msg/String'}, 'has other fields for std_msgs/msg/String'),
+        ({'encoding': 'ros2idl'}, "is written in 'ros2idl'"),
+        ({'metadata': {'topic_type_hash': 'RIHS01_0'}}, "has the hash 'RIHS01_0'"),
+    ],
+)
+def test_definitions_that_lie_are_refused(options, problem, tmp_path):
+    file = write(tmp_path / 'a.mcap', **options)
+    with pytest.raises(BagError, match=rf'a.mcap, byte \d+: .*{re.escape(problem)}'):
+        Bag.open(file)
+
+
+def test_no_code_is_made_of_a_definition(tmp_path, monkeypatch):
+    evil = 'string x "__import__(\'os\').abort()"\nint32 X=1\n'
+    text = f'float64 data 1.0\n{LINE}MSG: std_msgs/Evil\n{evil}'
+    for library in ('codegen.gen_code', 'store.Typestore.register'):
+        name = f'rosbags.typesys.{library}'
+        monkeypatch.setattr(name, lambda *_, **__: pytest.fail('compiled'), raising=False)
+    bag = Bag.open(write(tmp_path / 'a.mcap', text=text))
+    assert [bag.decode(message).data for message in bag.messages()] == [1.0]
+    assert 'rosbags.usertypes' not in sys.modules
+
+
+@pytest.mark.parametrize('data', [b'', b'\x00\x01\x00\x00', b'\xff' * 20])
+def test_bytes_that_are_no_message_are_a_value_error(data):
+    for type_name in ('std_msgs/msg/String', FLOAT, 'sensor_msgs/msg/JointState', 'no/msg/Type'):
+        if type_name != FLOAT or len(data) < 12:
+            with pytest.raises(ValueError, match=f'not a {type_name}: '):
+                message_types.decode(data, type_name)

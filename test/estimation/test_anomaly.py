@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, IN_A_ROW, AnomalyDetector
+
+DT = 0.01
+
+
+@pytest.fixture
+def judge(robot):
+    """Return a function that shows a detector with a network a message so many times."""
+
+    def make(mae, threshold=0.0):
+        detector = AnomalyDetector(robot, threshold)
+        detector.use(mae)
+
+        def verdicts(message, times=1):
+            state = mae.estimate(*message)
+            return [detector.step(state, *message, DT) for _ in range(times)]
+
+        return detector, verdicts
+
+    return make
+
+
+def test_a_is_the_papers_sum_of_two_norms_in_scaled_units(mae, judge, wound):
+    state = mae.estimate(*wound)
+    tension = np.linalg.norm((state.tension - wound.tension) / 200.0)
+    length = np.linalg.norm((state.length - wound.length) * 10.0)
+    _, verdicts = judge(mae)
+    assert verdicts(wound)[0].anomaly == pytest.approx(tension + length, rel=1e-12)
+
+
+def test_d_is_the_distance_in_healthy_standard_deviations(mae, judge, wound):
+    state, statistics = mae.estimate(*wound), mae.anomaly
+    error = np.concatenate(
+        [(state.tension - wound.tension) / 200.0, (state.length - wound.length) * 10.0]
+    )
+    centred = error - statistics.mean
+    expected = np.sqrt(centred @ np.linalg.solve(statistics.covariance, centred))
+    _, verdicts = judge(mae)
+    assert verdicts(wound)[0].distance == pytest.approx(expected, rel=1e-6)
+
+
+def test_without_statistics_there_is_no_distance(mae, judge, wound):
+    _, verdicts = judge(replace(mae, anomaly=None))
+    (verdict,) = verdicts(wound)
+    assert np.isnan(verdict.distance) and np.isfinite(verdict.anomaly) and not verdict.cause
+
+
+def test_statistics_of_the_geometric_model_decide_nothing(mae, judge, wound):
+    detector, verdicts = judge(mae)
+    assert not detector.calibrated
+    assert not any(verdict.cause for verdict in verdicts(wound, 3 * IN_A_ROW))
+
+
+@pytest.mark.parametrize(('threshold', 'named'), [(0.0, 'd = '), (0.2, 'A = ')])
+def test_a_decision_takes_five_messages_running(
+    calibrated, judge, healthy, wound, threshold, named
+):
+    _, verdicts = judge(calibrated, threshold)
+    assert not any(verdict.cause for verdict in verdicts(healthy, IN_A_ROW))
+    assert not any(verdict.cause for verdict in verdicts(wound, IN_A_ROW - 1))
+    assert not verdicts(healthy)[0].cause
+    found = verdicts(wound, IN_A_ROW)
+    assert not any(verdict.cause for verdict in found[:-1])
+    assert found[-1].cause.startswith(named)
+    assert found[-1].suspect == 1
+
+
+def test_a_reset_starts_the_count_anew(calibrated, judge, wound):
+    detector, verdicts = judge(calibrated)
+    verdicts(wound, IN_A_ROW - 1)
+    detector.reset()
+    assert not verdicts(wound)[0].cause
+
+
+@pytest.mark.parametrize('by_length', [True, False])
+def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack, by_length):
+    detector, verdicts = judge(mae)
+    messages = round(DEAD_TIME / DT) + 1
+    assert not any(verdict.cause for verdict in verdicts(slack, messages))  # no command: no demand
+    if by_length:
+        detector.commanded_length(slack.length - 0.003)
+    else:
+        detector.commanded_tension(np.full(6, 60.0))
+    found = verdicts(slack, messages)
+    assert not found[0].cause
+    assert 'no tension' in found[-1].cause and found[-1].suspect == 2
+
+
+def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):
+    detector, verdicts = judge(mae)
+    detector.commanded_tension(np.full(6, 0.5 * robot.tension.bias))
+    assert not any(verdict.cause for verdict in verdicts(slack, 100))

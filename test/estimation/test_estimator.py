@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from musculoskeletal_ae.estimation.anomaly import DEAD_TIME
+from musculoskeletal_ae.estimation.estimator import COMMAND_AGE, LONGEST_PERIOD, SILENCE, Estimator
+from musculoskeletal_ae.exceptions import MessageError
+
+DT = 0.01
+
+
+class Stepped:
+    """An estimator and both of its clocks."""
+
+    def __init__(self, robot, mae) -> None:
+        self.core, self.now = Estimator(robot), 100.0
+        self.core.use(mae)
+
+    def step(self, message, times=1, dt=DT):
+        """Return the estimates of a message that comes so many times."""
+        estimates = []
+        for _ in range(times):
+            self.now += dt
+            estimates.append(self.core.step(*message, self.now, self.now))
+        return estimates
+
+    def report(self):
+        return self.core.report(self.now)
+
+
+@pytest.fixture
+def stepped(robot, calibrated):
+    return Stepped(robot, calibrated)
+
+
+def test_without_a_network_it_waits(robot, healthy):
+    core = Estimator(robot)
+    assert core.step(*healthy, 0.0, 0.0) is None
+    assert core.report(0.0) == ('warn', 'waiting for a checkpoint', {})
+
+
+def test_the_estimate_is_the_networks(stepped, calibrated, healthy):
+    (estimate,) = stepped.step(healthy)
+    expected = calibrated.estimate(*healthy)
+    for got, want in zip(estimate.state, expected, strict=True):
+        np.testing.assert_array_equal(got, want)
+
+
+def test_it_says_whether_it_estimates_and_how_sure_the_detector_is(stepped, mae, healthy):
+    stepped.step(healthy)
+    assert stepped.report()[:2] == ('ok', 'estimating')
+    stepped.core.use(replace(mae, version=7))
+    report = stepped.report()
+    assert report[:2] == ('ok', 'estimating, uncalibrated')
+    assert report.values['checkpoint version'] == '7'
+    stepped.now += SILENCE + DT
+    assert stepped.report()[:2] == ('warn', 'no muscle_states')
+
+
+def test_statistics_that_cannot_be_used_leave_the_network_in_use(stepped, calibrated, healthy):
+    singular = replace(calibrated.anomaly, covariance=np.zeros((12, 12)))
+    with pytest.raises(np.linalg.LinAlgError):
+        stepped.core.use(replace(calibrated, version=9, anomaly=singular))
+    assert stepped.core.mae is calibrated
+    assert np.isfinite(stepped.step(healthy)[0].anomaly)
+
+
+def test_an_anomaly_is_told_once_and_latched_with_its_first_suspect(stepped, robot, healthy, wound):
+    told = [estimate.detected for estimate in stepped.step(wound, 10)]
+    assert told.index(True) == 4 and sum(told) == 1
+    suspect = robot.muscles[1]
+    assert stepped.core.cause.startswith(f'{suspect}: ')
+    stepped.step(healthy, 10)
+    report = stepped.report()
+    assert report.level == 'error' and suspect in report.message
+    assert report.values['suspect muscle'] == suspect
+    stepped.core.reset()
+    assert stepped.report().level == 'ok'
+    assert any(estimate.detected for estimate in stepped.step(wound, 5))
+
+
+def test_a_jump_of_the_clock_forgets_counts_but_not_the_latch(stepped, wound):
+    stepped.step(wound, 4)
+    stepped.core.clock_jumped_back()
+    assert not any(estimate.detected for estimate in stepped.step(wound, 4))
+    assert stepped.step(wound)[0].detected
+    stepped.core.clock_jumped_back()
+    assert stepped.core.cause
+
+
+def test_an_old_command_accuses_nobody(robot, mae, slack):
+    stepped = Stepped(robot, mae)
+    stepped.core.commanded_length(slack.length - 0.003, stepped.now)
+    stepped.now += COMMAND_AGE
+    assert not any(estimate.detected for estimate in stepped.step(slack, 100))
+    stepped.core.commanded_tension(np.full(6, 60.0), stepped.now)
+    assert not stepped.step(slack, round(DEAD_TIME / DT) - 1)[-1].detected
+    stepped.core.commanded_tension(np.full(6, 60.0), stepped.now)
+    assert any(estimate.detected for estimate in stepped.step(slack, 2))
+
+
+def test_a_pause_of_the_messages_is_no_time_without_tension(robot, mae, slack):
+    stepped = Stepped(robot, mae)
+    for _ in range(round(DEAD_TIME / LONGEST_PERIOD)):
+        stepped.core.commanded_length(slack.length - 0.003, stepped.now + 10.0)
+        assert not stepped.step(slack, dt=10.0)[0].detected
+    stepped.core.commanded_length(slack.length - 0.003, stepped.now + 10.0)
+    assert any(estimate.detected for estimate in stepped.step(slack, 2, dt=10.0))
+
+
+def test_a_marker_gives_the_joint_angles_that_put_it_there(stepped, robot, healthy):
+    stepped.step(healthy)
+    theta = robot.lower + 0.4 * (robot.upper - robot.lower)
+    seen = stepped.core.see(robot.kinematics.end_effector_pose(theta))
+    np.testing.assert_allclose(seen, theta, atol=1e-3)
+
+
+def test_a_marker_that_the_arm_cannot_reach_is_refused(stepped):
+    with pytest.raises(MessageError, match='out of reach'):
+        stepped.core.see(pin.SE3(np.eye(3), np.array([3.0, 0.0, 0.0])))

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rules that hold for the whole repository, and the linters of a sourced Jazzy where it has them."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / 'musculoskeletal_ae'
+ROS = re.compile(r'(rclpy|rcl_interfaces|\w+_msgs|\w+_srvs|builtin_interfaces)(\.|$)')
+DOCUMENT = re.compile(r'\b(?:doc|config|bags|bench)/[\w./-]+\.\w+')
+
+
+def sources(*folders: Path) -> list[Path]:
+    return sorted(file for folder in folders for file in folder.rglob('*.py'))
+
+
+def imported(file: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
+
+
+def test_only_nodes_speaks_ros() -> None:
+    outside = [file for file in sources(PACKAGE) if PACKAGE / 'nodes' not in file.parents]
+    assert len(outside) > 40
+    speaking = {str(file): sorted(filter(ROS.match, imported(file))) for file in outside}
+    assert not {file: names for file, names in speaking.items() if names}
+
+
+def test_the_rule_would_see_an_import(tmp_path: Path) -> None:
+    for line in ('import rclpy.node', 'from std_msgs.msg import Bool', 'def f():\n  import rclpy'):
+        (tmp_path / 'core.py').write_text(line)
+        assert any(map(ROS.match, imported(tmp_path / 'core.py'))), line
+
+
+def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
+    for file in sources(PACKAGE):
+        if file.parent.name not in ('nodes', 'tools'):
+            upward = [
+                n for n in imported(file) if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
+            ]
+            assert not upward, file
+
+
+def test_every_source_file_names_its_licence() -> None:
+    for file in sources(PACKAGE, ROOT / 'test', ROOT / 'bench', ROOT / 'bags'):
+        assert '# SPDX-License-Identifier: Apache-2.0' in file.read_text(encoding='utf-8')[:120], (
+            file
+        )
+
+
+def test_every_document_that_code_cites_is_in_the_repository() -> None:
+    tracked = subprocess.run(
+        ['git', 'ls-files'], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    cited = {
+        (match, file.name)
+        for file in [*sources(PACKAGE, ROOT / 'bench'), *ROOT.glob('*.md'), *ROOT.glob('doc/*.md')]
+        for match in DOCUMENT.findall(file.read_text(encoding='utf-8'))
+    }
+    assert cited
+    missing = {(name, by) for name, by in cited if name not in tracked}
+    assert not missing
+
+
+# -- the linters of ROS 2, which the wheels lack -----------------------------------------------------
+
+
+def test_ament_flake8() -> None:
+    main = pytest.importorskip('ament_flake8.main', reason='only a sourced Jazzy has it')
+    config = str(ROOT / 'test' / 'ament_flake8.ini')
+    status, errors = main.main_with_errors(
+        argv=['--config', config, *map(str, (PACKAGE, ROOT / 'test', ROOT / 'bench'))]
+    )
+    assert status == 0, '\n'.join(errors)
+
+
+def test_ament_pep257() -> None:
+    main = pytest.importorskip('ament_pep257.main', reason='only a sourced Jazzy has it')
+    options = ['--convention', 'google', '--add-ignore', 'D105', 'D107']
+    assert main.main([str(PACKAGE), *options]) == 0
+
+
+def test_ament_copyright() -> None:
+    # It knows long headers only; ours are the SPDX lines above. What it can judge is the licence
+    # and the terms of contributions.
+    parser = pytest.importorskip('ament_copyright.parser', reason='only a sourced Jazzy has it')
+    for kind, name in (
+        ('LicenseDescriptor', 'LICENSE'),
+        ('ContributingDescriptor', 'CONTRIBUTING.md'),
+    ):
+        file = getattr(parser, kind)(str(ROOT / name))
+        file.parse()
+        assert file.license_identifier == 'apache2', name
+
+
+def test_ament_xmllint() -> None:
+    main = pytest.importorskip('ament_xmllint.main', reason='only a sourced Jazzy has it')
+    assert main.main([str(ROOT / 'package.xml')]) == 0

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.pairing import Pairing
+
+
+def test_the_nearest_angle_within_half_a_period_is_paired():
+    pairing = Pairing(0.01)
+    pairing.joints(0.0, np.array([0.0]))
+    assert pairing.muscles(0.001, np.ones(1), np.ones(1)) is None
+    pairing.joints(0.0115, np.array([1.0]))
+    first = pairing.muscles(0.012, np.ones(1), np.ones(1))
+    second = pairing.muscles(0.022, np.ones(1), np.ones(1))
+    third = pairing.muscles(0.032, np.ones(1), np.ones(1))
+    assert first.theta == [0.0]
+    assert second.theta == [1.0]
+    assert second.dt == pytest.approx(0.011)
+    assert third.theta is None
+
+
+def test_a_clock_that_goes_back_starts_pairing_anew():
+    pairing = Pairing(0.01)
+    pairing.muscles(1.7e9, np.ones(1), np.ones(1))
+    assert pairing.muscles(0.0, np.ones(1), np.ones(1)) is None
+    pairing.joints(0.0, np.array([2.0]))
+    after = pairing.muscles(0.01, np.ones(1), np.ones(1))
+    assert after.dt == 0.0
+    assert after.theta == [2.0]
+
+
+def paired_live(joints, muscles, period):
+    """Return for each muscle message the number of its θ, or None, in the order of arrival."""
+    pairing = Pairing(period)
+    given_out = []
+    for time, kind, number in sorted(
+        [(time, 0, n) for n, time in enumerate(joints)]
+        + [(time, 1, n) for n, time in enumerate([*muscles, math.inf])]
+    ):
+        if kind == 0:
+            pairing.joints(time, np.array([number]))
+        elif paired := pairing.muscles(time, np.ones(1), np.ones(1)):
+            given_out.append(None if paired.theta is None else int(paired.theta[0]))
+    return given_out
+
+
+def paired_by_definition(joints, muscles, period):
+    """The same from all times at once: who is nearest to whom."""
+    owners = [min(muscles, key=lambda m: abs(m - time), default=None) for time in joints]
+    return [
+        min(
+            (n for n, time in enumerate(joints) if owners[n] == m and abs(time - m) <= period / 2),
+            key=lambda n: abs(joints[n] - m),
+            default=None,
+        )
+        for m in muscles
+    ]
+
+
+times = st.lists(st.integers(0, 200), unique=True, max_size=30).map(sorted)
+
+
+@given(times, times, st.integers(2, 40))
+def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, muscles, period):
+    assert paired_live(joints, muscles, period) == paired_by_definition(joints, muscles, period)
+
+
+def test_what_is_kept_does_not_grow_while_one_stream_is_silent():
+    pairing = Pairing(0.01)
+    for n in range(1000):
+        pairing.joints(n * 0.001, np.zeros(1))
+        assert len(pairing._angles) <= 3
