@@ -45,19 +45,13 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         points = routes.points(theta[None])[0]
     origins = kin.joint_poses(theta[None]).translation[0]
     tip = kin.end_effector_pose(theta).translation
-    lines = [np.stack([origins[kin.parent[i]], origins[i]]) for i in range(1, len(origins))]
     last = int(kin.model.frames[kin.end_effector_frame].parentJoint)
-    lines.append(np.stack([origins[last], tip]))
-    bones = [line for line in lines if np.linalg.norm(line[1] - line[0]) > SHORTEST_BONE]
+    ends = [*zip(origins[kin.parent[1:]], origins[1:]), (origins[last], tip)]
+    bones = [np.stack(pair) for pair in ends if np.linalg.norm(pair[1] - pair[0]) > SHORTEST_BONE]
     muscles = []
     for m in range(robot.muscle_count):
         own = np.flatnonzero(routes.muscle == m)
         muscles.append(points[np.append(routes.first[own], routes.second[own[-1]])])
-    return Drawing(bones, muscles, tension_colour(robot, tension))
-
-
-def tension_colour(robot: Robot, tension: Array) -> Array:
-    """Return (red, green, blue) in [0, 1] of tensions [N] (M,): green at bias, red at limit."""
     low, high = robot.tension.bias, robot.tension.limit
     share = np.clip((tension - low) / (high - low), 0.0, 1.0)
-    return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=1)
+    return Drawing(bones, muscles, np.stack([share, 1.0 - share, np.zeros_like(share)], axis=1))
