@@ -218,7 +218,7 @@ train_once() {
     {
       (cd "$robot_directory" && find . -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum)
       cd "$repository/musculoskeletal_ae" &&
-        find robot mae tools/train.py -name '*.py' -print0 | LC_ALL=C sort -z |
+        find robot mae presets.py tools/train.py -name '*.py' -print0 | LC_ALL=C sort -z |
         xargs -0 sha256sum
     } | sha256sum | cut -c 1-16
   )
@@ -265,7 +265,7 @@ common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
 start estimator estimator "${common[@]}"
 start sim sim "${common[@]}"
-# What is learnt here stays with the logs: the next run may be another arm.
+# What is learned here stays with the logs: the next run may be another arm.
 [ $learner = false ] ||
   start learner learner "${common[@]}" -p "state_directory:=$(quoted "$logs/learner")"
 [ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"

@@ -14,12 +14,12 @@ from pathlib import Path
 
 def benches() -> dict[str, str]:
     """Return the first line of every bench's docstring, by name."""
-    found = {}
+    lines = {}
     for file in sorted(Path(__file__).parent.glob('[!_]*.py')):
         tree = ast.parse(file.read_text(encoding='utf-8'))
         if any(isinstance(part, ast.FunctionDef) and part.name == 'main' for part in tree.body):
-            found[file.stem] = (ast.get_docstring(tree) or '').partition('\n')[0]
-    return found
+            lines[file.stem] = (ast.get_docstring(tree) or '').partition('\n')[0]
+    return lines
 
 
 def main(argv: list[str]) -> int:

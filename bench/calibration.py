@@ -15,17 +15,17 @@ It makes this table (least squares on the geometric model, without a network, an
 before any learning, in rad):
 
     seed  lengths off [mm]  oracle [rad]  least squares  default  paper
-       0               4.3         0.045          0.183    0.262  0.408
-       1               4.6         0.048          0.205    0.202  0.323
-       2               3.5         0.041          0.230    0.231  0.300
-       3               5.3         0.044          0.152    0.152  0.411
-       4               5.2         0.042          0.481    0.474  0.658
-       5               5.4         0.037          0.226    0.182  0.343
-       6               3.9         0.031          0.167    0.140  0.352
-       7               4.8         0.051          0.278    0.250  0.336
-       8               3.4         0.040          0.226    0.181  0.472
-       9               5.0         0.055          0.298    0.255  0.416
-    mean               4.5         0.043          0.245    0.233  0.402
+       0               4.3         0.045          0.183    0.314  0.408
+       1               4.6         0.048          0.205    0.218  0.323
+       2               3.5         0.041          0.231    0.249  0.300
+       3               5.3         0.044          0.152    0.190  0.411
+       4               5.2         0.042          0.481    0.527  0.658
+       5               5.4         0.037          0.226    0.181  0.343
+       6               3.9         0.031          0.167    0.135  0.352
+       7               4.8         0.051          0.278    0.232  0.335
+       8               3.4         0.040          0.226    0.257  0.471
+       9               5.0         0.055          0.298    0.266  0.415
+    mean               4.5         0.043          0.245    0.257  0.402
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from musculoskeletal_ae.mae.initial import initial_mae
 from tqdm import tqdm
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -43,6 +42,7 @@ from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import nominal, oracle
 from musculoskeletal_ae.experiments.recording import estimation_error, record
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 

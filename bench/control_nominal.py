@@ -7,7 +7,7 @@
    reported reachable range, and the ratio of both beside the predicted one.
 3. torque: joint torque that the commanded tensions make, beside the commanded torque.
 
-    python -m bench.control_nominal --checkpoint FILE --paper-checkpoint FILE [--robot …] [--quick]
+    python -m bench control_nominal --checkpoint FILE --paper-checkpoint FILE [--robot …] [--quick]
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.holdable import holdable_postures
+from musculoskeletal_ae.experiments.control import holdable_postures
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, exit_status
@@ -182,7 +182,7 @@ def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> s
 
 def main(argv: list[str] | None = None) -> int:
     """Print the tables."""
-    parser = Parser('bench.control_nominal', 'What control does on the nominal body.')
+    parser = Parser('control_nominal', 'What control does on the nominal body.')
     parser.add_robot()
     parser.add_checkpoint('network of preset default', required=True)
     parser.add_checkpoint('network of preset paper', '--paper-checkpoint', required=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damages bags at random and says how the reader takes it.
 
-    python -m bench.fuzz --count 10000 --seed 0
+    python -m bench fuzz --count 10000 --seed 0
 
 Each damaged bag must be read in full, or refused with a BagError; of one that is reported as
 unfinished the messages must be the first ones. Where the recorder wrote no checksums, and that is

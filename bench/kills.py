@@ -3,7 +3,7 @@
 
 python -m bench.kills [--kills 50] [--seed 0]
 
-A child process runs the `Session` that the node runs, with its training process, on samples that a
+A child process runs the `Learner` that the node runs, with its training process, on samples that a
 seed draws, and says when it has accepted a sample and published a network. After each kill the next
 child must have every sample that was accepted and a network no older than the last one published.
 Exit status 1 if something was lost.
@@ -25,10 +25,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from musculoskeletal_ae.learning.collector import Collector
-from musculoskeletal_ae.learning.sample import Sample
-from musculoskeletal_ae.learning.session import Session
-from musculoskeletal_ae.learning.store import SampleStore
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -59,23 +58,20 @@ def digest(store: SampleStore) -> int:
 
 def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
     """Learn until killed."""
-    collector = Collector(robot)
 
     def say(*words: object) -> None:
         print(*words, flush=True)
 
-    def publish(data: bytes) -> None:
-        say('published', checkpoint.from_bytes(data, robot).version)
-
-    session = Session(robot, collector, 'default', 0, STEPS, directory, publish)
-    if session.data is None:
-        session.begin(initial)
-    say('found', digest(collector.store))
+    learner = Learner(robot, steps=STEPS, training=TrainingProcess, directory=directory)
+    if learner.checkpoint is None:
+        learner.begin(checkpoint.load(initial, robot))
+    say('published', learner.mae.version)
+    say('found', digest(learner.samples))
     for sample in samples(robot, life):
-        collector.store.add(sample)
-        session.accept(sample)
+        learner.accept(sample)
         say('accepted')
-        session.poll(True)
+        if learner.poll(time.monotonic()) is not None:
+            say('published', learner.mae.version)
         time.sleep(SPACING)
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import copy
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,17 +25,15 @@ import torch
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm, seen_by_camera
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.experiments.online_learning import (
+from musculoskeletal_ae.experiments.online_learning import See, follow
+from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
-    HELD_OUT_TIME,
-    See,
-    Streams,
-    follow,
-    held_out_error,
+    Recording,
+    estimation_error,
+    record,
 )
-from musculoskeletal_ae.experiments.recording import Recording, motion, record
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
@@ -46,6 +45,7 @@ EVERY = 3  # messages between two pictures of the camera: 33 Hz
 OFFSET = 0.010  # [m]
 #: of motion after the change, after which the error is read [minutes]
 READ_AT = (1.0, 2.0, 5.0)
+HELD_OUT_TIME = 300.0  # [s]
 AFTER_STREAM = 500  # of random postures after the change
 
 
@@ -83,20 +83,27 @@ def replaced(robot: Robot, individual: Individual, muscle: int, donor: Individua
     return changed
 
 
+class Streams(NamedTuple):
+    """What one arm's sensors said, exploring and in the held-out motion."""
+
+    exploring: Recording
+    held_out: Recording
+
+
 def streams(arm: EmulatedArm, mae: Mae, stream: int, minutes: float, held_out: float) -> Streams:
     """Record an arm in random motion, and in the held-out one."""
-    exploring = record(arm, motion(arm.robot, mae, stream, 60.0 * minutes))
-    return Streams(exploring, record(arm, motion(arm.robot, mae, HELD_OUT_STREAM, held_out)))
+    exploring = record(arm, mae, stream, 60.0 * minutes)
+    return Streams(exploring, record(arm, mae, HELD_OUT_STREAM, held_out))
 
 
-def going_on(learner: OnlineLearner, after: Streams, read_at: tuple[float, ...]) -> list[float]:
+def going_on(learner: Learner, after: Streams, read_at: tuple[float, ...]) -> list[float]:
     """Return the held-out error at once, and after so many minutes of learning on."""
-    errors, begun = [held_out_error(learner.mae, after.held_out)], 0
+    errors, begun = [estimation_error(learner.mae, after.held_out)], 0
     for minutes in read_at:
         end = round(6000.0 * minutes)
         part = Recording(*(column[begun:end] for column in after.exploring))
-        follow(learner, Streams(part, after.held_out))
-        errors.append(held_out_error(learner.mae, after.held_out))
+        follow(learner, part, after.held_out)
+        errors.append(estimation_error(learner.mae, after.held_out))
         begun = end
     return errors
 
@@ -114,13 +121,13 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     before = streams(
         EmulatedArm(robot, seed, individual), mae, EXPLORATION_STREAM + seed, minutes, held_out
     )
-    learner = OnlineLearner(robot, mae, seed=seed)
-    follow(learner, before)
-    by_sensor = held_out_error(learner.mae, before.held_out)
-    watcher = OnlineLearner(robot, mae, seed=seed)
-    follow(watcher, before, camera(robot, before.exploring, seed))
-    by_camera = held_out_error(watcher.mae, before.held_out)
-    initial = held_out_error(mae, before.held_out)
+    learner = Learner(robot, mae, seed=seed)
+    follow(learner, *before)
+    by_sensor = estimation_error(learner.mae, before.held_out)
+    watcher = Learner(robot, mae, seed=seed)
+    follow(watcher, *before, camera(robot, before.exploring, seed))
+    by_camera = estimation_error(watcher.mae, before.held_out)
+    initial = estimation_error(mae, before.held_out)
     head = f'individual {seed}, {minutes:g} min: error before {initial:.4f} rad, after: '
     ratio = by_camera / by_sensor
     lines = [f'{head}sensor {by_sensor:.4f}, marker {by_camera:.4f} rad, × {ratio:.2f}']
@@ -136,9 +143,9 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
         lines.append(f'  {title:28s}{head}')
         lines.append(row('untold', going_on(copy.deepcopy(learner), after, read_at)))
         told = copy.deepcopy(learner)
-        told.relearn(muscle)
+        told.relearn([muscle])
         lines.append(row('told by relearn_muscles', going_on(told, after, read_at)))
-        anew = OnlineLearner(robot, mae, seed=seed)
+        anew = Learner(robot, mae, seed=seed)
         lines.append(row('starting over', going_on(anew, after, read_at)))
     return '\n'.join(lines)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of the simulated arm: at rest, and with a weight in the hand.
 
-    python -m bench.sim_pictures --checkpoint FILE [--out doc]
+    python -m bench sim_pictures --checkpoint FILE [--out doc]
 
 writes sim_at_rest.png and sim_loaded.png. Of a running simulator, `render --topic sim/markers`
 makes the same picture.
@@ -9,16 +9,17 @@ makes the same picture.
 
 from __future__ import annotations
 
-import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from musculoskeletal_ae.control.methods import first_command
-from musculoskeletal_ae.experiments.picture import Line, save_picture
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
+from musculoskeletal_ae.robot.picture import Line, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -66,17 +67,20 @@ def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
     return files
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> int:
     """Write both pictures."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='sim_pictures')
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--checkpoint', required=True)
-    parser.add_argument('--out', default='doc', type=Path)
+    parser = Parser('sim_pictures', 'Pictures of the simulated arm: at rest, and loaded.')
+    parser.add_robot()
+    parser.add_checkpoint(required=True)
+    parser.add_out('DIR', default=Path('doc'))
     args = parser.parse_args(argv)
-    robot = Robot.load(args.robot)
-    for file in save_both(robot, checkpoint.load(args.checkpoint, robot), args.out):
-        print(file)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        print(*save_both(robot, checkpoint.load(args.checkpoint, robot), args.out), sep='\n')
+
+    return exit_status(work)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

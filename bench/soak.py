@@ -3,10 +3,10 @@
 
 python -m bench.soak [--hours 24] [--quick]
 
-The emulated arm explores on and on; every message goes through the learner's collector. To fit a
-day into an hour or two it updates after every `--every`-th sample only (the first ones after each),
-where the node updates twice for each: so many fewer updates are judged than a day would bring. One
-line per report: robot time, samples, held-out error, d's threshold, memory, time of an update.
+The emulated arm explores on and on; every message goes through the learner. To fit a day into an
+hour or two it updates after every `--every`-th sample only (the first ones after each), where the
+node updates after each: so many fewer updates are judged than a day would bring. One line per
+report: robot time, samples, held-out error, d's threshold, memory, time of an update.
 
 Exit status 1 if the error ever rose by more than a fifth over its least, memory by more than a
 fifth over what it was after two hours, or the median time of an update in the last quarter to more
@@ -25,10 +25,16 @@ import torch
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.experiments.online_learning import HELD_OUT_STREAM, held_out_error
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
-from musculoskeletal_ae.learning.online import STEPS, OnlineLearner
+from musculoskeletal_ae.experiments.recording import (
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.learning.learner import STEPS, Learner
+from musculoskeletal_ae.learning.training import Job, Training
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -40,6 +46,34 @@ TOLERATED = 1.2
 #: memory is compared with what it was then [s]: imports, the store and the reservoir fill it before
 FILLED = 7200.0
 SLOWER = 1.5  # the last quarter's updates against the first's
+
+
+class RareTraining(Training):
+    """Takes a job after every so many samples only; the first ones after fewer.
+
+    Attributes:
+        every: So many.
+        samples: That have come since the last job.
+        seconds: CPU time of every update [s].
+    """
+
+    every, samples = 1, 0
+
+    def begin(self, mae: Mae) -> None:
+        """Go on from a network."""
+        super().begin(mae)
+        self.seconds: list[float] = []
+
+    def submit(self, job: Job) -> None:
+        """Learn."""
+        begun, self.samples = time.process_time(), 0
+        super().submit(job)
+        self.seconds.append(time.process_time() - begun)
+
+    @property
+    def ready(self) -> bool:
+        """Whether so many samples have come."""
+        return self.samples >= min(self.every, 1 + len(self.seconds) // 4)
 
 
 def memory() -> float:
@@ -84,26 +118,26 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
     mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
-    held_out = record(EmulatedArm(robot, args.seed), motion(robot, mae, HELD_OUT_STREAM, PART))
-    learner = OnlineLearner(robot, mae, seed=args.seed, steps=args.steps)
+    held_out = record(EmulatedArm(robot, args.seed), mae, HELD_OUT_STREAM, PART)
+    learner = Learner(robot, mae, seed=args.seed, steps=args.steps, training=RareTraining)
+    training = learner.training
+    assert isinstance(training, RareTraining)
+    training.every = args.every
     arm = EmulatedArm(robot, args.seed)
-    least, worst, waiting, changed = np.inf, 0.0, 0, 0
-    times: list[float] = []
-    reported: list[float] = []
+    least, worst, reopened = np.inf, 0.0, 0
+    messages = reported = 0
     filled = most = 0.0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        stream = record(arm, motion(robot, mae, part, PART))
+        stream = record(arm, mae, part, PART)
         for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
-            sample = learner.collector.step(tension, length, SAMPLE_TIME, theta)
-            waiting += sample is not None
-            # The first samples are learned as they come.
-            if sample is not None and waiting >= min(args.every, 1 + learner.updates // 4):
-                begun, waiting = time.process_time(), 0
-                update = learner.update()
-                times.append(time.process_time() - begun)
-                changed += bool(update and update.changed)
+            accepted, update = learner.samples.accepted, learner.update
+            messages += 1
+            learner.step(messages * SAMPLE_TIME, theta, tension, length)
+            training.samples += learner.samples.accepted - accepted
+            if learner.update is not None and learner.update is not update:
+                reopened += bool(learner.update.changed)
         now = PART * (part + 1)
-        error = held_out_error(learner.mae, held_out, 10)
+        error = estimation_error(learner.mae, held_out, 10)
         if now >= SETTLED:
             least, worst = min(least, error), max(worst, error / least)
         if now == FILLED:
@@ -114,15 +148,15 @@ def main(argv: list[str] | None = None) -> int:
             anomaly = learner.mae.anomaly
             threshold = anomaly.thresholds.get(DISTANCE, np.nan) if anomaly else np.nan
             print(
-                f'{now / 3600.0:5.1f} h  samples {len(learner.collector.store)} '
-                f'({learner.collector.store.accepted} accepted)  error {error:.4f} rad  '
-                f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {changed}  '
-                f'{memory():.0f} MB  update {np.median(times):.2f} s',
+                f'{now / 3600.0:5.1f} h  samples {len(learner.samples)} '
+                f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
+                f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {reopened}  '
+                f'{memory():.0f} MB  '
+                f'update {np.median(training.seconds[reported:]):.2f} s',
                 flush=True,
             )
-            reported += times
-            times.clear()
-    problems = judged(worst, filled, most, reported + times)
+            reported = len(training.seconds)
+    problems = judged(worst, filled, most, training.seconds)
     print('; '.join(problems) or 'all within what is tolerated')
     return int(bool(problems))
 

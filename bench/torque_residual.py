@@ -4,9 +4,9 @@
 python -m bench.torque_residual [--robot …] [--seeds 0,1] [--minutes 10]
 
 (PIMBS learns a body image from this residual at rest.) For the samples of an exploration it prints
-the residual with the true G, with that of the learnt body and with the geometric model's, and how
+the residual with the true G, with that of the learned body and with the geometric model's, and how
 far the last two are from the truth. What the true body leaves is friction, and joints that lean on
-their limits. Where the learnt body leaves as little, the residual is met and has no more to say:
+their limits. Where the learned body leaves as little, the residual is met and has no more to say:
 the lengths have told G already, and far more exactly than the torques could.
 """
 
@@ -21,17 +21,17 @@ import torch
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.experiments.online_learning import EXPLORATION_STREAM
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, motion, record
-from musculoskeletal_ae.experiments.suite.limits import LearntLeastSquares
-from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.experiments.least_squares import learned
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body_fit import Prior, fit_body
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-UPDATES = 3  # each goes on fitting from where the last one ended
+FITS = 3  # each goes on fitting from where the last one ended
 
 
 def rms(values: Array) -> float:
@@ -41,22 +41,19 @@ def rms(values: Array) -> float:
 
 def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
     """Return the lines of one individual."""
-    stream = record(
-        EmulatedArm(robot, seed), motion(robot, mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
-    )
-    learner = OnlineLearner(robot, mae, seed=seed)
-    for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
-        learner.collector.step(tension, length, SAMPLE_TIME, theta)
-    for _ in range(UPDATES):
-        learner.update()
-    assert isinstance(learner.updater, BodyUpdater)  # preset default
-    seen = learner.collector.store.observations()
+    stream = record(EmulatedArm(robot, seed), mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
+    learner = Learner(robot, seed=seed)
+    for n, values in enumerate(zip(stream.theta_sensor, stream.tension, stream.length)):
+        learner.step(n * SAMPLE_TIME, *values)
+    seen, body = learner.samples.observations(), CorrectedBody(robot, seed=seed)
+    for _ in range(FITS):
+        fit_body(body, seen, Prior())
     holding = np.array([robot.kinematics.holding_torque(theta) for theta in seen.theta])
     true = Individual(robot, seed).muscle_jacobian(seen.theta)
-    learnt = LearntLeastSquares(robot, learner.updater.body).muscle_jacobian(seen.theta)
+    fitted = learned(robot, body).muscle_jacobian(seen.theta)
     nominal = np.array([robot.routes.muscle_jacobian(theta) for theta in seen.theta])
     lines = [f'individual {seed}, {len(seen)} samples, holding torque {rms(holding):.2f} N·m']
-    for name, jacobian in (('true', true), ('learnt', learnt), ('geometric', nominal)):
+    for name, jacobian in (('true', true), ('learned', fitted), ('geometric', nominal)):
         residual = holding + np.einsum('nmd,nm->nd', jacobian, seen.tension)
         lines.append(
             f'  {name:10s} residual {rms(residual):.3f} N·m, '

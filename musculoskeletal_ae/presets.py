@@ -66,6 +66,7 @@ class Preset:
         network: Shape of the network.
         training: Initial training.
         corrected_body: Learn online by fitting the corrected body; else on the samples alone.
+        least_samples: From how many samples on it learns online.
         equilibrium: Control and simulate by the balance of torques, solved; else by the printed
             descent in the latent space.
     """
@@ -74,6 +75,7 @@ class Preset:
     network: NetworkSettings
     training: TrainingSettings
     corrected_body: bool
+    least_samples: int
     equilibrium: bool
 
 
@@ -93,6 +95,7 @@ DEFAULT = Preset(
         slope_weight=1.0,
     ),
     corrected_body=True,
+    least_samples=2,
     equilibrium=True,
 )
 
@@ -115,6 +118,7 @@ PAPER = Preset(
         standard_norms=False,
     ),
     corrected_body=False,
+    least_samples=21,  # "from C_thre samples on" is read as: when the count exceeds C_thre = 20
     equilibrium=False,
 )
 

@@ -22,7 +22,7 @@ THICKEST_BONE = 0.04  # [m] radius of a bone's head
 
 @dataclass(frozen=True)
 class Spread:
-    """How much individuals differ, calibrated once by `calibrate_emulator` (its docstring).
+    """How much individuals differ, calibrated once (`bench/calibration.py`).
 
     Attributes:
         attachment: Standard deviation of each coordinate of each route point [m].

@@ -153,13 +153,13 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 def module_reference(kind: int, command: float, length: float, before: float, body: Body) -> float:
     """Return T_ref [N] of one module that reads `length` [m] and had T_ref `before`."""
     if kind == FOLLOW_LENGTH:
-        wished = body.tension_bias + max(0.0, body.stiffness * (length - command))
+        desired = body.tension_bias + max(0.0, body.stiffness * (length - command))
     elif kind == FOLLOW_TENSION:
-        wished = max(0.0, command)
+        desired = max(0.0, command)
     else:
         change = STEP * RELEASE_RATE
-        wished = before + min(change, max(-change, body.tension_bias - before))
-    return min(body.tension_max, wished)
+        desired = before + min(change, max(-change, body.tension_bias - before))
+    return min(body.tension_max, desired)
 
 
 @njit(cache=True)

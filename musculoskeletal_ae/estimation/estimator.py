@@ -105,12 +105,12 @@ class Estimator:
         Raises:
             MessageError: If the arm cannot reach it.
         """
-        found = inverse_kinematics(self._robot, pose, self._theta)
-        if found.distance > MARKER_DISTANCE or found.angle > MARKER_ANGLE:
+        posture = inverse_kinematics(self._robot, pose, self._theta)
+        if posture.distance > MARKER_DISTANCE or posture.angle > MARKER_ANGLE:
             raise MessageError(
-                'out of reach', f'{found.distance:.3f} m and {found.angle:.2f} rad are left'
+                'out of reach', f'{posture.distance:.3f} m and {posture.angle:.2f} rad are left'
             )
-        return found.theta
+        return posture.theta
 
     def reset(self) -> None:
         """Clear the anomaly."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Driving an emulated arm through a list of commands and keeping what its sensors said."""
+"""Emulated arms driven through a list of commands, and what their sensors said."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +12,16 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
+#: random streams of the exploration (plus the individual's seed), and of the held-out motion
+EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
+
+#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles
+Script = Callable[[EmulatedArm, float], None]
 
 
 class Recording(NamedTuple):
@@ -36,52 +42,74 @@ class Recording(NamedTuple):
     command: Array
 
 
-class LengthGoal(NamedTuple):
-    """A command to reach: l_target [m], shape (M,), and how long the step takes [s]."""
-
-    length: Array
-    duration: float
-
-
-def motion(robot: Robot, mae: Mae, seed: int, duration: float) -> list[LengthGoal]:
-    """Return one fixed list of length commands that follows the exploration's three steps.
+def motion(robot: Robot, mae: Mae, stream: int, duration: float) -> Iterator[tuple[Array, float]]:
+    """Yield the exploration's three steps as one fixed list: l_target [m] (M,) and how long [s].
 
     `second` needs the tension of the moment, which a fixed list cannot know: the least tension
     that holds the posture on the geometric model stands in for it, so that every command is
     `first`'s.
     """
-    exploration, goals, planned = Exploration(robot, seed), [], 0.0
+    exploration, planned = Exploration(robot, stream), 0.0
     while planned < duration - 1e-9:
         step = exploration.next_step()
-        goals.append(LengthGoal(first_command(robot, mae, step.theta, step.tension), step.duration))
+        yield first_command(robot, mae, step.theta, step.tension), step.duration
         planned += step.duration
-    return goals
 
 
 def record(
-    arm: EmulatedArm,
-    goals: Sequence[LengthGoal],
-    progress: Callable[[float], None] | None = None,
+    arm: EmulatedArm, mae: Mae, stream: int, duration: float, script: Script | None = None
 ) -> Recording:
-    """Drive the arm through the goals, ramping to each and resting there.
+    """Drive an arm through random postures, ramping to each and resting there.
 
     Args:
         arm: Is moved on from the state it is in.
-        goals: Commands in order.
-        progress: Called with the robot seconds that have passed since the last call.
+        mae: Computes the commands; see `motion`.
+        stream: Seed of the random postures.
+        duration: How long [s], rounded up to whole steps of the exploration.
+        script: What happens to the arm on the way.
     """
     rows: list[tuple[Array, ...]] = []
     # The first ramp starts where the arm is, so that it does not jump.
     command = arm.sense().length
-    for goal in goals:
+    for goal, step_time in motion(arm.robot, mae, stream, duration):
         start = command
-        for tick in range(round(goal.duration / SAMPLE_TIME)):
-            share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * goal.duration))
-            command = start + share * (goal.length - start)
+        for tick in range(round(step_time / SAMPLE_TIME)):
+            if script:
+                script(arm, SAMPLE_TIME * len(rows))
+            share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step_time))
+            command = start + share * (goal - start)
             arm.command_length(command)
             arm.step(SAMPLE_TIME)
             read = arm.sense()
             rows.append((arm.theta, read.theta, read.length, read.tension, command))
-        if progress:
-            progress(goal.duration)
     return Recording(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def times(count: int) -> Array:
+    """Return the times of so many rows of a recording [s]."""
+    return np.asarray(SAMPLE_TIME * np.arange(count), dtype=np.float64)
+
+
+def rows_between(start: float, end: float) -> slice:
+    """Return the rows of a recording between two times [s]."""
+    return slice(round(start / SAMPLE_TIME), round(end / SAMPLE_TIME))
+
+
+def mean_error(estimate: Array, truth: Array) -> float:
+    """Return the mean over samples of ‖θ_est − θ_true‖₂ [rad]."""
+    return float(np.linalg.norm(estimate - truth, axis=1).mean())
+
+
+def estimation_error(mae: Mae, recording: Recording, stride: int = 1) -> float:
+    """Return the mean error of a network's estimate on every so many messages [rad]."""
+    part = slice(None, None, stride)
+    estimate = mae.estimate(recording.tension[part], recording.length[part]).theta
+    return mean_error(estimate, recording.theta[part])
+
+
+def frictionless(robot: Robot, seed: int) -> EmulatedArm:
+    """Return an individual as it would be without friction in wires and joints."""
+    individual = Individual(robot, seed)
+    individual.cable_friction[:] = 0.0
+    individual.joint_friction[:] = 0.0
+    return EmulatedArm(robot, seed, individual)

@@ -1,153 +1,154 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near the simulated arm is to the real one (paper, section "Simulation", and its experiment).
+"""Simulation.
 
-    python -m musculoskeletal_ae.experiments.simulation --checkpoint FILE [--quick]
-        [--robot NAME|DIR] [--preset default|paper]
-
-On a network trained on the geometric model, against that model as a body (the emulated arm without
-individual differences and friction): does it hold still, does it rest where the body rests, does it
-give way to pushes as the body does. `compare` puts simulator and any emulated arm under the same
-commands.
+Arm and simulator follow the commands of the held-out motion, and all messages are compared; the
+simulator starts in the arm’s first posture and sees nothing else of it. θ beside the true angles, T
+beside the measured tensions. The bound is the emulated individual itself without any friction: what
+a perfect simulator without hysteresis would be left with.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from bench.sim_responses import FLEXED, FORCED, print_responses
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import msc_compensation
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, frictionless, times
+from musculoskeletal_ae.experiments.study import Experiment, Individuals, Measured, Progress, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.01  # [s]
-STILL = 1e-4  # [rad/s]
-LONGEST_WAIT = 20.0  # [s]
+PRINTED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
+CYCLE = 10.0  # [s] of the exploration's three steps
+MOMENTS = 5
 
 
-class Distance(NamedTuple):
-    """Mean over samples of ‖θ_sim − θ‖₂ [rad] and ‖T_sim − T‖₂ [N]."""
-
-    theta: float
-    tension: float
-
-
-def random_commands(robot: Robot, count: int, seed: int) -> Array:
-    """Return l_target [m] (count, M) of random postures that can be held, at random tensions."""
-    rng = np.random.default_rng(seed)
-    low, high = robot.tension.bias, robot.tension.limit
-    commands: list[Array] = []
-    while len(commands) < count:
-        theta = robot.random_postures(1, rng)[0]
-        jacobian = robot.routes.muscle_jacobian(theta)
-        torque = robot.kinematics.holding_torque(theta)
-        wish = rng.uniform(low, 0.6 * high)
-        try:
-            tension = holding_tension(jacobian, torque, low, high, wish)
-        except InfeasibleError:
-            continue
-        commands.append(robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension))
-    return np.array(commands)
-
-
-def settle_arm(arm: EmulatedArm, command: Array) -> tuple[Array, Array]:
-    """Hold a command until the emulated arm is still; return true θ [rad] and T [N]."""
-    for _ in range(round(LONGEST_WAIT / 0.1)):
-        arm.command_length(command)
-        arm.step(0.1)
-        if np.abs(arm.velocity).max() < STILL:
-            break
-    return arm.theta.copy(), arm.tension
+def measure(study: Study, seed: int, progress: Progress) -> Measured:
+    """Return the numbers and traces of one individual."""
+    robot = study.body()
+    arm = study.stream(seed, 'held_out')
+    numbers: dict[str, Any] = {}
+    traces: dict[str, Any] = {'arm': {'theta': arm.theta, 'tension': arm.tension}}
+    presets = dict.fromkeys([study.preset, 'paper'])
+    for preset in presets:
+        for when, mae in (
+            ('before', study.initial(robot, preset)),
+            ('after', study.learned(robot, seed, preset)),
+        ):
+            trace = _beside(arm, *simulate(robot, mae, preset, arm.theta[0], arm.command))
+            for prefix, named in (('', study.preset), ('paper_', 'paper')):
+                if preset == named:
+                    numbers[f'{prefix}{when}_rad'] = float(trace['rad'].mean())
+                    numbers[f'{prefix}{when}_n'] = float(trace['n'].mean())
+            if preset == study.preset:
+                traces[when] = trace
+            progress(0.5 / len(presets))
+    body = frictionless(robot, seed)
+    theta, tension = np.empty_like(arm.theta), np.empty_like(arm.tension)
+    for n, command in enumerate(arm.command):
+        body.command_length(command)
+        body.step(SAMPLE_TIME)
+        theta[n], tension[n] = body.theta, body.tension
+    bound = _beside(arm, theta, tension)
+    numbers['frictionless_rad'] = float(bound['rad'].mean())
+    numbers['frictionless_n'] = float(bound['n'].mean())
+    return Measured(numbers, traces)
 
 
-def rest_errors(
-    robot: Robot, mae: Mae, preset: str, commands: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return how far the simulator rests from the nominal body and drifts in 1000 steps.
-
-    Returns:
-        |Δθ| of the rest [rad] (N, D), |ΔT| of the rest [N] (N, M), and the largest departure of θ
-        [rad] and T [N] from the simulator's own rest, each (N,).
-    """
-    body = Individual(robot, 0, NOMINAL)
-    simulated = Simulation(robot, mae, preset, len(commands))
-    true = []
-    for command in commands:
-        arm = EmulatedArm(robot, 0, body)
-        true.append(settle_arm(arm, command))
-    theta, tension = (np.stack(part) for part in zip(*true, strict=True))
-    # As the emulated arms: from hanging, under the command of the posture.
-    simulated.command = commands
-    rest = simulated.settle()
-    drift, tension_drift = np.zeros((2, len(commands)))
-    for _ in range(1000):
-        state = simulated.step(STEP)
-        drift = np.maximum(drift, np.abs(state.theta - rest.theta).max(axis=1))
-        moved = np.abs(state.tension - rest.tension).max(axis=1)
-        tension_drift = np.maximum(tension_drift, moved)
-    return np.abs(rest.theta - theta), np.abs(rest.tension - tension), drift, tension_drift
-
-
-def compare(
-    arm: EmulatedArm, simulated: Simulation, commands: Sequence[Array], duration: float
-) -> Distance:
-    """Return how far the simulator is from an arm under the same commands, moving and resting.
+def simulate(
+    robot: Robot, mae: Mae, preset: str, start: Array, commands: Array
+) -> tuple[Array, Array]:
+    """Return θ [rad] (N, D) and T [N] (N, M) of a simulator given an arm's commands.
 
     Args:
-        arm: Any individual.
-        simulated: One simulated arm.
-        commands: l_target [m], each shape (M,).
-        duration: How long each is held [s].
+        robot: The geometric model.
+        mae: The body that is simulated.
+        preset: Of the simulator.
+        start: Posture of the arm [rad], shape (D,).
+        commands: l_target at 100 Hz [m], shape (N, M).
     """
-    theta, tension = [], []
-    for command in commands:
+    simulated = Simulation(robot, mae, preset)
+    simulated.start_from(start[None])
+    theta, tension = np.empty((len(commands), len(start))), np.empty_like(commands)
+    for n, command in enumerate(commands):
         simulated.command = command[None]
-        for _ in range(round(duration / STEP)):
-            arm.command_length(command)
-            arm.step(STEP)
-            state = simulated.step(STEP)
-            theta.append(np.linalg.norm(state.theta[0] - arm.theta))
-            tension.append(np.linalg.norm(state.tension[0] - arm.tension))
-    return Distance(float(np.mean(theta)), float(np.mean(tension)))
+        state = simulated.step(SAMPLE_TIME)
+        theta[n], tension[n] = state.theta[0], state.tension[0]
+    return theta, tension
 
 
-def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:
-    """Print the measurements."""
-    commands = random_commands(robot, 8 if quick else 50, seed=0)
-    theta, tension, drift, tension_drift = rest_errors(robot, mae, preset, commands)
-    worst = theta.max(axis=1)
-    print(f'{len(commands)} commands over the range, preset {preset}:')
-    print(
-        f'  rest, from the nominal body: largest joint error {worst.mean():.4f} rad mean, '
-        f'{worst.max():.4f} rad max, within 0.05 rad {np.mean(worst <= 0.05):.0%}; '
-        f'tension {tension.mean():.2f} N mean, {tension.max():.1f} N max'
+def _beside(arm: Recording, theta: Array, tension: Array) -> dict[str, Array]:
+    """Return a simulated motion and how far it is from the arm's, message by message."""
+    return {
+        'theta': theta,
+        'tension': tension,
+        'rad': np.linalg.norm(theta - arm.theta, axis=1),
+        'n': np.linalg.norm(tension - arm.tension, axis=1),
+    }
+
+
+def plot(individuals: Individuals) -> list[plots.Plot]:
+    """Draw pictures of arm and simulator, and the errors over time."""
+    return [_pictures(individuals), _errors(individuals)]
+
+
+def _pictures(individuals: Individuals) -> plots.Plot:
+    seed, row = individuals.first
+    count = len(row.traces['arm']['theta'])
+    # The ends of as many cycles: at rest, with the random tensions of the third step.
+    ends = (np.arange(count * SAMPLE_TIME // CYCLE) * CYCLE + 9.9) / SAMPLE_TIME
+    chosen = np.linspace(0, len(ends) - 1, min(MOMENTS, len(ends))).round().astype(int)
+    moments = [int(at) for at in ends[chosen]]
+    rows = []
+    for name, source in (
+        ('arm', 'arm'),
+        ('simulator before learning', 'before'),
+        ('simulator after learning', 'after'),
+    ):
+        trace = row.traces[source]
+        rows.append((name, trace['theta'][moments], trace['tension'][moments]))
+    columns = [f'{SAMPLE_TIME * n:.0f} s' for n in moments]
+    caption = (
+        'The emulated arm (true posture, measured tensions, drawn with the model’s routes) and '
+        'the simulator before and after learning, at the same moments of the same commands.'
     )
-    print(f'  held for 1000 steps: {drift.max():.2e} rad, {tension_drift.max():.2e} N at most')
-    if {FLEXED, FORCED} <= set(robot.joints):
-        print_responses(robot, mae, preset)
+    title = f'individual {seed}, the same commands'
+    return plots.Plot(
+        'simulation_pictures', plots.picture_rows(individuals.robot, rows, columns, title), caption
+    )
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Print the measurements for a checkpoint."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='simulation')
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--checkpoint', required=True)
-    parser.add_argument('--preset', default='default', choices=('default', 'paper'))
-    parser.add_argument('--quick', action='store_true', help='fewer commands')
-    args = parser.parse_args(argv)
-    robot = Robot.load(args.robot)
-    report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)
+def _errors(individuals: Individuals) -> plots.Plot:
+    seed, row = individuals.first
+    figure, axes = plots.new_figure(12.0, 5.6, 2, 1, sharex=True)
+    for panel, key, unit in ((axes[0, 0], 'rad', 'rad'), (axes[1, 0], 'n', 'N')):
+        for when, colour in plots.WHEN.items():
+            values = row.traces[when][key]
+            label = f'{when} learning: mean {row.numbers[f"{when}_{key}"]:.3g} {unit}'
+            plots.line(panel, times(len(values)), values, 25, color=colour, lw=0.9, label=label)
+        before, after = PRINTED[key]
+        panel.plot([], [], ' ', label=f'paper: {before:g} → {after:g} {unit}')
+        panel.axhline(after, color=plots.MARK, ls=':', lw=1)
+        panel.set_ylim(bottom=0.0)
+        panel.legend(fontsize=9, loc='upper right', ncols=3)
+    plots.tidy(axes[0, 0], '', '‖θ_sim − θ‖ [rad]', f'individual {seed}')
+    plots.tidy(axes[1, 0], 'time [s]', '‖T_sim − T‖ [N]')
+    caption = (
+        'Distance of the simulator from the arm under the same commands (0.25 s running mean). '
+        'Dotted: the paper’s mean after learning.'
+    )
+    return plots.Plot('simulation_errors', figure, caption)
 
 
-if __name__ == '__main__':
-    main()
+EXPERIMENT = Experiment(
+    description=__doc__,
+    paper=(
+        'Arm and simulator under the same commands: 0.335 → 0.162 rad and 105 → 92.2 N by learning.'
+    ),
+    weight=3.0,
+    measure=measure,
+    plot=plot,
+)

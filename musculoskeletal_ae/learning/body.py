@@ -12,12 +12,9 @@ sliding, +1 wound in, −1 paid out). All parameters zero is the geometric model
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -29,43 +26,27 @@ LARGEST_FRICTION = 0.5
 LARGEST_LOG = 1.5
 
 
-@dataclass(frozen=True)
 class Layout:
-    """Where the parameters of one muscle are: points, elastic, friction, offset, smooth rest."""
+    """Where the parameters of one muscle are.
 
-    points: NDArray[np.int_]
-    smooth: int
+    Attributes:
+        points: Its route points.
+        attachment: δ, three per route point [m].
+        elastic: κ: logarithms of force, rate, wire_stretch over the nominal ones.
+        friction: μ.
+        offset: o [m].
+        rest: v [m].
+        size: Number of parameters.
+    """
 
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return 3 * len(self.points) + 5 + self.smooth
-
-    @property
-    def attachment(self) -> slice:
-        """δ, three per route point [m]."""
-        return slice(0, 3 * len(self.points))
-
-    @property
-    def elastic(self) -> slice:
-        """κ: logarithms of force, rate, wire_stretch over the nominal ones."""
-        start = 3 * len(self.points)
-        return slice(start, start + 3)
-
-    @property
-    def friction(self) -> int:
-        """μ."""
-        return 3 * len(self.points) + 3
-
-    @property
-    def offset(self) -> int:
-        """O [m]."""
-        return 3 * len(self.points) + 4
-
-    @property
-    def rest(self) -> slice:
-        """V [m]."""
-        return slice(3 * len(self.points) + 5, self.size)
+    def __init__(self, points: Ints, features: int) -> None:
+        """Lay out δ, κ, μ, o, v in this order."""
+        end = 3 * len(points)
+        self.points = points
+        self.attachment, self.elastic = slice(0, end), slice(end, end + 3)
+        self.friction, self.offset = end + 3, end + 4
+        self.size = end + 5 + features
+        self.rest = slice(end + 5, self.size)
 
 
 class CorrectedBody:
@@ -97,10 +78,11 @@ class CorrectedBody:
             points = np.append(routes.first[segments], routes.second[segments[-1]])
             moved = kin.moved_by[routes.joint[points]]
             crossed = moved.any(axis=0) & ~moved.all(axis=0)
-            self.layouts.append(Layout(points, FEATURES if crossed.any() else 0))
-            frequency = rng.normal(0.0, 1.0, (self.layouts[m].smooth, robot.joint_count))
+            features = FEATURES if crossed.any() else 0
+            self.layouts.append(Layout(points, features))
+            frequency = rng.normal(0.0, 1.0, (features, robot.joint_count))
             self._frequency.append(frequency * crossed / (WIDTH * span))
-            self._phase.append(rng.uniform(0.0, 2.0 * np.pi, self.layouts[m].smooth))
+            self._phase.append(rng.uniform(0.0, 2.0 * np.pi, features))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
 
     # -- parts ----------------------------------------------------------------------------------
@@ -140,15 +122,15 @@ class CorrectedBody:
 
     # -- lengths --------------------------------------------------------------------------------
 
-    def lengths(self, theta: Array, tension: Array, *sliding: Array) -> tuple[Array, ...]:
+    def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
         """Return l [m] (N, M) at θ [rad] (N, D) and the motors' T [N] (N, M).
 
         Args:
             theta: θ.
             tension: T where the modules measure it.
-            sliding: For each result s in [−1, 1], shape (N, M); 0 is the mean of both directions.
+            direction: For each result s in [−1, 1], shape (N, M); 0 is the mean of both directions.
         """
-        result = tuple(np.empty_like(tension) for _ in sliding)
+        result = tuple(np.empty_like(tension) for _ in direction)
         poses = self.poses(theta)
         for m, layout in enumerate(self.layouts):
             world, _ = self._world(poses, m)
@@ -157,13 +139,13 @@ class CorrectedBody:
             fixed = absolute - at_zero + self.parameters[m][layout.offset]
             fixed += self._smooth(theta, m) @ self.parameters[m][layout.rest]
             elastic, friction = self.elastic(m), self.friction(m)
-            for lengths, slid in zip(result, sliding, strict=True):
-                end = tension[:, m] * np.exp(-friction * slid[:, m])
+            for lengths, s in zip(result, direction, strict=True):
+                end = tension[:, m] * np.exp(-friction * s[:, m])
                 lengths[:, m] = fixed - elastic.elongation(absolute, end)
         return result
 
     def linearised(
-        self, poses: JointPoses, theta: Array, tension: Array, sliding: Array, m: int
+        self, poses: JointPoses, theta: Array, tension: Array, direction: Array, m: int
     ) -> tuple[Array, Array]:
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
@@ -171,21 +153,21 @@ class CorrectedBody:
             poses: Of θ, from `poses`.
             theta: θ [rad], shape (N, D).
             tension: T_i at the motor [N], shape (N,).
-            sliding: s_i in [−1, 1], shape (N,).
+            direction: s_i in [−1, 1], shape (N,).
             m: The muscle.
         """
         layout, parameters = self.layouts[m], self.parameters[m]
         world, turn = self._world(poses, m)
         line = world[:, 1:] - world[:, :-1]
         norm = np.linalg.norm(line, axis=-1)
-        direction = line / np.maximum(norm, 1e-9)[..., None]
+        along = line / np.maximum(norm, 1e-9)[..., None]
         pull = np.zeros_like(world)
-        pull[:, 1:] += direction
-        pull[:, :-1] -= direction
+        pull[:, 1:] += along
+        pull[:, :-1] -= along
         by_point = (pull[:, :, None] @ turn).reshape(len(world), -1)
         absolute, at_zero = norm[:-1].sum(axis=1), norm[-1].sum()
         elastic = self.elastic(m)
-        end = np.maximum(tension * np.exp(-self.friction(m) * sliding), 0.0)
+        end = np.maximum(tension * np.exp(-self.friction(m) * direction), 0.0)
         smooth = self._smooth(theta, m)
         length = absolute - at_zero - elastic.elongation(absolute, end)
         length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
@@ -200,7 +182,7 @@ class CorrectedBody:
             ],
             axis=1,
         )
-        jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * sliding
+        jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * direction
         jacobian[:, layout.offset] = 1.0
         jacobian[:, layout.rest] = smooth
         return length, jacobian

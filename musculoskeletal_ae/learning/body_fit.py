@@ -9,18 +9,19 @@ Student distribution, so that a sample taken while the arm was touched, or a gli
 
 The torque balance at rest, g(θ) + Gᵀ T = 0 (PIMBS), is not fitted: what is learned from the lengths
 alone meets it as well as the true body does, which is as well as friction lets anyone
-(`experiments/torque_residual` measures both).
+(`bench/torque_residual` measures both).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.learning.body import CorrectedBody, Layout
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.kinematics import JointPoses
 
 FREEDOM = 4.0  # of the Student distribution
@@ -77,29 +78,6 @@ REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
 
 
 @dataclass(frozen=True)
-class Observations:
-    """N samples at rest.
-
-    Attributes:
-        theta: θ [rad], shape (N, D).
-        tension: T at the motors [N], shape (N, M).
-        length: l [m], shape (N, M).
-        sliding: s in [−1, 1], shape (N, M).
-        known: Which of them say something about which muscle, shape (N, M).
-    """
-
-    theta: Array
-    tension: Array
-    length: Array
-    sliding: Array
-    known: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        """N."""
-        return len(self.theta)
-
-
-@dataclass(frozen=True)
 class Fit:
     """What a fit found out about the samples.
 
@@ -118,7 +96,7 @@ def fit_body(
     body: CorrectedBody,
     seen: Observations,
     prior: Prior,
-    inherited: list[Array] | None = None,
+    prior_mean: list[Array] | None = None,
     rounds: int = ROUNDS,
 ) -> Fit:
     """Fit the parameters of a body in place.
@@ -128,7 +106,7 @@ def fit_body(
         seen: The samples.
         prior: What is known without any. A muscle with samples that say nothing about it any more
             was changed: what they said is where its new parameters are looked for.
-        inherited: Parameters learned before, without the samples that they came from; they take
+        prior_mean: Parameters learned before, without the samples that they came from; they take
             the place of the geometric model.
         rounds: Gauss–Newton steps.
     """
@@ -136,8 +114,8 @@ def fit_body(
     parts = []
     for m, layout in enumerate(body.layouts):
         known, mean, spread = seen.known[:, m], prior.mean(layout), prior.spread(layout)
-        if inherited is not None:
-            mean = inherited[m]
+        if prior_mean is not None:
+            mean = prior_mean[m]
         if (~known).sum() >= LEAST_ANCHOR:
             _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, rounds, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
@@ -150,7 +128,7 @@ def _fit_muscle(
     body: CorrectedBody,
     poses: JointPoses,
     seen: Observations,
-    used: NDArray[np.bool_],
+    used: Bools,
     mean: Array,
     spread: Array,
     least_noise: float,
@@ -160,7 +138,7 @@ def _fit_muscle(
     precision = 1.0 / spread**2
     known = used.astype(float)
     noise, weight = FIRST_NOISE, known
-    data = poses, seen.theta, seen.tension[:, m], seen.sliding[:, m]
+    data = poses, seen.theta, seen.tension[:, m], seen.direction[:, m]
     length, jacobian = body.linearised(*data, m)
     for _ in range(rounds):
         at = body.parameters[m]
@@ -170,16 +148,16 @@ def _fit_muscle(
             weighted = jacobian * (weight / noise**2)[:, None]
             curvature = weighted.T @ jacobian
             normal = curvature + np.diag(precision)
-            found = np.linalg.solve(normal, weighted.T @ target + precision * mean)
+            best = np.linalg.solve(normal, weighted.T @ target + precision * mean)
             determined = np.trace(np.linalg.solve(normal, curvature))
             freedom = max(1.0, float(known.sum() - determined))
-            residual = target - jacobian @ found
+            residual = target - jacobian @ best
             noise, weight = _noise_and_weight(residual, known, noise, freedom, least_noise)
 
         share = 1.0
         before = _cost(seen.length[:, m] - length, weight / noise**2, at - mean, precision)
         while share > SHORTEST:
-            body.parameters[m] = at + share * (found - at)
+            body.parameters[m] = at + share * (best - at)
             length, jacobian = body.linearised(*data, m)
             deviation = body.parameters[m] - mean
             residual = seen.length[:, m] - length
@@ -206,3 +184,30 @@ def _noise_and_weight(
     weight = known * (FREEDOM + 1.0) / (FREEDOM + (residual / noise) ** 2)
     variance = (weight @ residual**2 + 4.0 * least**2) / (freedom + 4.0)
     return max(least, float(np.sqrt(variance))), weight
+
+
+NETWORK_STATES = 400  # that a network is asked for
+NETWORK_ERROR = 0.001  # [m] by which its lengths may err
+
+
+def fit_to_network(body: CorrectedBody, mae: Mae, prior: Prior, seed: int = 0) -> None:
+    """Fit a body in place to the lengths that a learned network restores.
+
+    A checkpoint carries what was learned of an arm, but not the samples (`train --from-bag`,
+    another machine, a lost state). The first samples after that then correct the body that the
+    network knows instead of replacing it by the geometric model.
+
+    Args:
+        body: Becomes the network's.
+        mae: Learned on a real arm.
+        prior: How bodies differ from the geometric model.
+        seed: Draws the states that are asked for.
+    """
+    robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
+    theta = robot.random_postures(NETWORK_STATES, rng)
+    shape = NETWORK_STATES, robot.muscle_count
+    tension = rng.uniform(robot.tension.bias, robot.tension.limit, shape)
+    lengths = mae.lengths(theta, tension)
+    everything = np.ones(shape, dtype=bool)
+    seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
+    fit_body(body, seen, replace(prior, noise=NETWORK_ERROR))

@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the arm is at rest, and the mean of what the sensors said meanwhile.
+"""From messages to rests that may be learned from: plausible, still, and of a healthy arm.
 
 The arm rests while the means of the two halves of a short window differ by no more than the given
 rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
 sensor's). The rest is averaged until it ends, or for `LONGEST` at a time.
+
+What comes within `MARGIN` before an anomaly is noticed was already wrong; rests and healthy
+messages therefore wait that long before they count.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import math
+from collections import Counter, deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.sample import Sample
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
 MOST = 5000  # readings of one rest: an end where the clock stands still
@@ -55,11 +62,6 @@ class RestDetector:
         self._window.clear()
         self._rest.clear()
         self._span, self._time, self._still = 0.0, 0.0, False
-
-    @property
-    def still(self) -> bool:
-        """Whether the arm is at rest now."""
-        return self._still
 
     def step(self, reading: Sample, measured: bool, dt: float) -> Sample | None:
         """Take one reading; return the mean of a rest that ended or is long enough.
@@ -123,3 +125,162 @@ def _unmoved(halves: list[Array], allowed: float) -> bool:
         if len(half) > 1
     )
     return bool((difference <= allowed + SURE * np.sqrt(error)).all())
+
+
+# -- friction -------------------------------------------------------------------------------------
+
+REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
+SMOOTHING = 0.05  # [s], so that the sensor's noise does not slide the wire
+
+
+class FrictionDirection:
+    """Which way each wire slid last, from muscle lengths alone.
+
+        r ← clip(r, l − b, l + b),   s = (r − l)/b
+
+    (the stop operator of hysteresis theory). Friction along a wire acts against its last sliding,
+    so that T at the motor is T at the elastic unit times e^{μ s}: more if it was wound in (s = 1).
+    """
+
+    def __init__(self) -> None:
+        """Know nothing yet: s = 0."""
+        self._length: Array | None = None
+
+    def step(self, length: Array, dt: float) -> Array:
+        """Take l [m] (M,), `dt` [s] after the one before; return s (M,)."""
+        if self._length is None:
+            self._length, self._reference = length.copy(), length.copy()
+        share = 1.0 - math.exp(-dt / SMOOTHING)
+        self._length = self._length + share * (length - self._length)
+        low, high = self._length - REVERSAL, self._length + REVERSAL
+        self._reference = np.minimum(np.maximum(self._reference, low), high)
+        return (self._reference - self._length) / REVERSAL
+
+    def reset(self) -> None:
+        """Forget, as after a jump of the clock."""
+        self._length = None
+
+
+# -- what may be learned --------------------------------------------------------------------------
+
+MARGIN = 2.0  # [s] before a detection and after its reset
+# Beyond these a sensor errs, not the arm.
+OUTSIDE = 0.1  # of the joint's range
+TOO_TENSE = 1.1  # of tension.max
+POSTURES = 500  # that tell how long the muscles get
+LENGTH_MARGIN = 0.1  # [m], for wires that wrap, wind slack, or were tied elsewhere
+#: [s] without messages, and longer than a rest has to be, in which a wire may have slid anywhere
+HOLE = 0.5
+#: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
+MOST_WAITING = 5000
+
+
+class Waiting(NamedTuple):
+    """A message, and the rest that it ended, that count once no anomaly has followed for MARGIN."""
+
+    time: float
+    dt: float
+    tension: Array
+    length: Array
+    rest: Sample | None
+
+
+class RestCollector:
+    """Steps through the messages and gives out the rests that may be learned from.
+
+    Attributes:
+        anomaly: Whether an anomaly closes the gate.
+        rejected: Messages that no sensor measures, and rests that are not learned from, by reason.
+    """
+
+    def __init__(self, robot: Robot, settings: RestSettings, healthy: Reservoir) -> None:
+        """Watch `robot`; messages of the healthy arm go to `healthy`."""
+        self._robot, self._healthy = robot, healthy
+        self.anomaly = False
+        self.rejected: Counter[str] = Counter()
+        self._detector = RestDetector(settings)
+        self._hole = max(HOLE, settings.window)
+        self._longest = _longest(robot)
+        self._direction = FrictionDirection()
+        self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
+        self._time = self._skipped = 0.0
+        self._closed_until = 0.0
+
+    def step(
+        self, tension: Array, length: Array, dt: float, theta: Array | None = None
+    ) -> list[Sample]:
+        """Take one message of the muscle modules; return the rests that count from now on.
+
+        Args:
+            tension: T [N], shape (M,).
+            length: l [m], shape (M,).
+            dt: Time since the message before [s].
+            theta: θ measured at the same time [rad], shape (D,); None without.
+        """
+        dt += self._skipped
+        if dt > self._hole:
+            self._direction.reset()
+            dt = self._hole
+        if implausible := self._implausible(tension, length, theta):
+            self.rejected[implausible] += 1
+            self._skipped = dt
+            return []
+        self._skipped = 0.0
+        self._time += dt
+        direction = self._direction.step(length, dt)
+        nothing = np.full(self._robot.joint_count, np.nan)
+        reading = Sample(nothing if theta is None else theta, tension, length, direction)
+        rest = self._detector.step(reading, theta is not None, dt)
+        if self.anomaly or self._time < self._closed_until:
+            if rest is not None:
+                self.rejected['anomaly'] += 1
+            return []
+        self._waiting.append(Waiting(self._time, dt, tension, length, rest))
+        rests = []
+        while self._waiting and self._time - self._waiting[0].time >= MARGIN:
+            passed = self._waiting.popleft()
+            self._healthy.step(passed.tension, passed.length, passed.dt)
+            if passed.rest is not None:
+                rests.append(passed.rest)
+        return rests
+
+    def _implausible(self, tension: Array, length: Array, theta: Array | None) -> str:
+        """Return why no sensor of this arm measures that, or ''."""
+        if (tension > TOO_TENSE * self._robot.tension.max).any():
+            return 'tension beyond the maximum'
+        if (np.abs(length) > self._longest).any():
+            return 'length beyond what the joints allow'
+        if theta is not None:
+            reach = self._robot.upper - self._robot.lower
+            beyond = np.maximum(theta - self._robot.upper, self._robot.lower - theta)
+            if (beyond > OUTSIDE * reach).any():
+                return 'θ far outside the joint limits'
+        return ''
+
+    def set_anomaly(self, detected: bool) -> None:
+        """Close the gate on an anomaly, open it some time after the reset."""
+        if detected and not self.anomaly:
+            if lost := sum(waiting.rest is not None for waiting in self._waiting):
+                self.rejected['anomaly'] += lost
+            self._waiting.clear()
+        if self.anomaly and not detected:
+            self._closed_until = self._time + MARGIN
+        self.anomaly = detected
+
+    def reset(self) -> None:
+        """Forget what does not count yet, as after a backward jump of the clock."""
+        self._skipped = 0.0
+        self._detector.reset()
+        self._direction.reset()
+        self._waiting.clear()
+
+
+def _longest(robot: Robot) -> Array:
+    """Return |l| of every muscle that no posture passes [m], shape (M,)."""
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0), OUTSIDE)
+    slack = np.zeros((POSTURES, robot.muscle_count))
+    length = np.abs(
+        [robot.muscle_lengths(theta, slack + pull) for pull in (0.0, robot.tension.max)]
+    )
+    longest: Array = length.max(axis=(0, 1)) + LENGTH_MARGIN
+    return longest

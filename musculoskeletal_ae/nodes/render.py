@@ -12,10 +12,10 @@ import rclpy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments.picture import Line, save_picture
 from musculoskeletal_ae.nodes.qos import SENSOR
 from musculoskeletal_ae.nodes.tool import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
+from musculoskeletal_ae.robot.picture import Line, save_picture
 
 
 def _lines(message: MarkerArray) -> list[Line]:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import (
     OUTPUTS,
@@ -101,9 +101,9 @@ def _from_bags(robot: Robot, args: argparse.Namespace) -> int:
         else:
             print(f'training the network of {robot.description.directory.name} to start from')
             mae = initial_mae(robot, args.preset, args.seed, steps=_steps(args)).mae
-        learner = OnlineLearner(robot, mae, args.preset, args.seed)
-        learned = train_from_bags(robot, learner, recordings, args.hold_out)
-        checkpoint.save(learned, args.out)
+        learner = Learner(robot, mae, args.preset, args.seed)
+        train_from_bags(learner, recordings, args.hold_out)
+        checkpoint.save(learner.mae, args.out)
     except (MusculoskeletalError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1

@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.learning.offline import error, learn
-from musculoskeletal_ae.learning.online import OnlineLearner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -37,29 +38,59 @@ def read(path: Path, robot: Robot) -> Pairs:
     return pairs
 
 
-def train_from_bags(
-    robot: Robot, learner: OnlineLearner, recordings: dict[Path, Pairs], held_out: list[Path]
-) -> Mae:
-    """Learn from recordings in their order, print errors before and after, return the network.
+def learn(
+    learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
+) -> None:
+    """Feed a recording to a learner, message by message, as if the arm were moving now.
 
     Args:
-        robot: Whose arm was recorded.
+        learner: Is taught.
+        recording: θ, T, l in the order of time.
+        progress: Told the recorded seconds that have passed since it was last told.
+    """
+    detector = AnomalyDetector(learner.robot)
+    mae = learner.mae
+    detector.use(mae)
+    learner.reset()
+    learner.anomaly(False)
+    before = recording.time[0] if len(recording.time) else 0.0
+    for time, theta, length, tension in zip(*recording, strict=True):
+        dt, before = time - before, time
+        # The estimator gates live learning; here its detector does the same.
+        verdict = detector.step(mae.estimate(tension, length), tension, length, dt)
+        if verdict.cause:
+            learner.anomaly(True)
+        learner.step(time, theta, tension, length)
+        if learner.mae is not mae:
+            mae = learner.mae
+            detector.use(mae)
+        if progress is not None:
+            progress(dt)
+
+
+def error(mae: Mae, recording: Pairs) -> float:
+    """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
+    estimate = mae.estimate(recording.tension, recording.length).theta
+    return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
+
+
+def train_from_bags(learner: Learner, recordings: dict[Path, Pairs], held_out: list[Path]) -> None:
+    """Learn from recordings in their order; print errors before and after.
+
+    Args:
         learner: Starts from its network.
         recordings: As `read` gives them, by path.
         held_out: Those that are only judged.
     """
-    mae = learner.mae
-    before = {path: error(mae, pairs) for path, pairs in recordings.items()}
+    before = {path: error(learner.mae, pairs) for path, pairs in recordings.items()}
     for path in recordings:
         if path in held_out:
             continue
         seconds = recordings[path].time[-1] - recordings[path].time[0]
         with tqdm(total=round(seconds, 1), unit=' s', desc=path.name, disable=None) as bar:
-            learn(robot, learner, recordings[path], bar.update)
-    samples = len(learner.collector.store)
-    print(f'{samples} samples, {learner.updates} updates')
+            learn(learner, recordings[path], bar.update)
+    print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
         kind = 'held out' if path in held_out else 'learned from'
         after = error(learner.mae, pairs)
         print(f'{path} ({kind}): {before[path]:.4f} → {after:.4f} rad against its joint sensors')
-    return replace(learner.mae, version=mae.version + learner.updates)

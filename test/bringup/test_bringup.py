@@ -10,17 +10,21 @@ import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from graph import DEADLINE, Graph, Process
 from robots import write_robot
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-STATUS = re.compile(r'^ *\d+ s  error (\d+\.\d+) rad  A (\d+\.\d+)  samples \d+  checkpoints \d+')
+STATUS = re.compile(
+    r'^ *\d+ s  error (?P<error>\d+\.\d+) rad  A (?P<a>\d+\.\d+)  '
+    r'samples (?P<samples>\d+)  checkpoints (?P<checkpoints>\d+)'
+)
 
 
 @pytest.fixture(scope='module')
@@ -54,13 +58,13 @@ def test_a_robot_nobody_saw_before_is_trained_brought_up_and_estimated(environme
     assert run.process.returncode == 0, output
     lines = statuses(output)
     assert len(lines) >= 4, output
-    for line in lines:
-        assert float(line.group(1)) < 3.0
-        assert float(line.group(2)) < 100.0
+    # Seeds 0 to 4: 0.08 to 0.30 rad. The middle of the joint range would be 0.58 rad off.
+    assert np.median([float(line['error']) for line in lines]) < 0.45
+    assert all(0.0 < float(line['a']) < 2.0 for line in lines)
     assert left_behind(run) == ''
 
 
-def test_two_arms_share_a_graph_and_ctrl_c_ends_one_cleanly(environment):
+def test_two_arms_share_a_graph_one_learns_and_ctrl_c_ends_both_cleanly(environment):
     left = bringup(environment, '--robot', 'arm26', '--namespace', 'left_arm')
     right = bringup(environment, '--robot', 'arm26', '--namespace', 'right_arm', '--no-explore')
     graph = Graph()
@@ -74,12 +78,20 @@ def test_two_arms_share_a_graph_and_ctrl_c_ends_one_cleanly(environment):
                 f'{side} to estimate',
                 deadline=5 * DEADLINE,
             )
+        learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
+        graph.wait(lambda: len(learned) > 10, 'ten updates of the network', 2 * DEADLINE)
+        graph.spin(5.0)  # a status line is printed once a second
     finally:
         graph.processes.clear()
         graph.close()
         ended = [run.end(signal.SIGINT) for run in (left, right)]
     assert [status for status, _ in ended] == [130, 130], ended
     assert not any('Traceback' in output for _, output in ended)
+    lines = statuses(ended[0][1])
+    before = [float(line['error']) for line in lines if int(line['checkpoints']) <= 1]
+    after = [float(line['error']) for line in lines[-5:]]
+    # Over seeds and runs 0.05 to 0.13 rad fall to a tenth or a third of that within 20 s.
+    assert np.mean(after) < 0.7 * np.mean(before), ended[0][1]
     assert left_behind(left) == left_behind(right) == ''
 
 

@@ -68,10 +68,10 @@ def test_a_decision_takes_five_messages_running(
     assert not any(verdict.cause for verdict in verdicts(healthy, IN_A_ROW))
     assert not any(verdict.cause for verdict in verdicts(wound, IN_A_ROW - 1))
     assert not verdicts(healthy)[0].cause
-    found = verdicts(wound, IN_A_ROW)
-    assert not any(verdict.cause for verdict in found[:-1])
-    assert found[-1].cause.startswith(named)
-    assert found[-1].suspect == 1
+    judged = verdicts(wound, IN_A_ROW)
+    assert not any(verdict.cause for verdict in judged[:-1])
+    assert judged[-1].cause.startswith(named)
+    assert judged[-1].suspect == 1
 
 
 def test_a_reset_starts_the_count_anew(calibrated, judge, wound):
@@ -90,9 +90,9 @@ def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack,
         detector.commanded_length(slack.length - 0.003)
     else:
         detector.commanded_tension(np.full(6, 60.0))
-    found = verdicts(slack, messages)
-    assert not found[0].cause
-    assert 'no tension' in found[-1].cause and found[-1].suspect == 2
+    judged = verdicts(slack, messages)
+    assert not judged[0].cause
+    assert 'no tension' in judged[-1].cause and judged[-1].suspect == 2
 
 
 def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One quick run of every experiment, which all tests here look at."""
+"""One quick run of every experiment and two small networks, which all tests here look at."""
 
 from __future__ import annotations
 
@@ -7,13 +7,31 @@ from pathlib import Path
 
 import pytest
 
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
+
+#: of exploration: enough for updates of both presets
+MINUTES = 0.5
 
 
 @pytest.fixture(scope='session')
 def quick(tmp_path_factory) -> Path:
     """The folder of `experiment all --quick` on the small arm, from two processes."""
     folder = tmp_path_factory.mktemp('experiments')
-    command = ['all', '--robot', 'arm26', '--quick', '--jobs', '2', '--out', str(folder)]
-    assert experiment.main(command) == 0
+    options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2 --out {folder}'
+    assert experiment.main(options.split()) == 0
     return folder
+
+
+@pytest.fixture(scope='session')
+def arm26() -> Robot:
+    return Robot.load('arm26')
+
+
+@pytest.fixture(scope='session')
+def networks(arm26) -> dict[str, Mae]:
+    """Networks of the geometric model by preset, trained for a moment."""
+    return {preset: initial_mae(arm26, preset, steps=600).mae for preset in PRESETS}

@@ -6,13 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.experiments.baselines.estimator import unstretched
-from musculoskeletal_ae.experiments.baselines.geometric import GeometricLeastSquares
-from musculoskeletal_ae.experiments.baselines.mapping import PolynomialFilter
-from musculoskeletal_ae.experiments.baselines.table import TableSearch
+from musculoskeletal_ae.experiments.baselines import PolynomialFilter, TableSearch, unstretched
 from musculoskeletal_ae.robot.robot import Robot
-
-DT = 0.02
 
 
 @pytest.fixture(scope='module', params=['arm26', 'musashi_left_arm'])
@@ -41,23 +36,17 @@ def test_elongation_is_taken_off_exactly(robot, motion):
     assert np.abs(off).max() < 1e-5  # second order in wire stretch times elongation
 
 
-def test_least_squares_on_the_model_is_exact(robot, motion):
-    theta, tension, length = (part[::10] for part in motion)
-    estimate = GeometricLeastSquares(robot).estimate(tension, length, DT)
-    assert errors(estimate, theta).max() < 1e-3
-
-
 def test_the_filter_on_a_polynomial_mapping_follows_the_motion(robot, motion):
     theta, tension, length = motion
-    estimate = PolynomialFilter(robot).estimate(tension, length, DT)
+    estimate = PolynomialFilter(robot).estimate(tension, length)
     # What polynomials of degree 3 leave of these muscles is a few hundredths of a radian.
     assert errors(estimate, theta)[20:].mean() < 0.05
 
 
 def test_table_search_is_as_fine_as_its_table(robot, motion):
     theta, tension, length = motion
-    estimate = TableSearch(robot).estimate(tension, length, DT)
-    spacing = (robot.upper - robot.lower) / 100_000 ** (1.0 / robot.joint_count)
+    estimate = TableSearch(robot).estimate(tension, length)
+    spacing = (robot.upper - robot.lower) / TableSearch.ROWS ** (1.0 / robot.joint_count)
     assert errors(estimate, theta).mean() < np.linalg.norm(spacing)
 
 
@@ -79,6 +68,6 @@ def test_what_can_learn_follows_a_body_with_other_lengths(robot, motion, kind):
     taught.learn(seen, pull, other(seen, pull))
     length = other(theta, tension)
     before, after = (
-        errors(each.estimate(tension, length, DT), theta)[20:].mean() for each in (untaught, taught)
+        errors(each.estimate(tension, length), theta)[20:].mean() for each in (untaught, taught)
     )
     assert after < before

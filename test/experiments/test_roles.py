@@ -8,7 +8,7 @@ import math
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.experiments.suite.roles import (
+from musculoskeletal_ae.experiments.roles import (
     elbow,
     flexed,
     plotted,

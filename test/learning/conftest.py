@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One small arm, one network trained for a second, and bodies that differ from the model."""
+"""Bodies that differ from the model, samples of them, and a network that has learned one."""
 
 from __future__ import annotations
+
+import copy
 
 import numpy as np
 import pytest
 
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import Prior
-from musculoskeletal_ae.learning.sample import Sample
-from musculoskeletal_ae.learning.store import SampleStore
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.training import Job
+from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -20,19 +23,25 @@ def arm26() -> Robot:
 
 
 @pytest.fixture(scope='session')
-def initial(arm26):
+def initial(trained):
     """Return a network of the geometric model, trained for a moment."""
-    return initial_mae(arm26, 'default', steps=300).mae
+    return trained['default']
+
+
+def drawn_body(robot, features: int, seed: int, scale: float) -> CorrectedBody:
+    """Return a body drawn from the prior, wrapping and all."""
+    body, rng = CorrectedBody(robot, seed=features), np.random.default_rng(seed)
+    for m, layout in enumerate(body.layouts):
+        spread = Prior().spread(layout)
+        body.parameters[m] = Prior().mean(layout) + scale * spread * rng.standard_normal(
+            layout.size
+        )
+    return body
 
 
 @pytest.fixture(scope='session')
 def other_body(arm26) -> CorrectedBody:
-    """Return a body drawn from the prior, wrapping and all."""
-    body, rng = CorrectedBody(arm26, seed=7), np.random.default_rng(3)
-    for m, layout in enumerate(body.layouts):
-        spread = Prior().spread(layout)
-        body.parameters[m] = Prior().mean(layout) + 0.7 * spread * rng.standard_normal(layout.size)
-    return body
+    return drawn_body(arm26, 7, 3, 0.7)
 
 
 class Stage:
@@ -45,10 +54,10 @@ class Stage:
         robot = self.body.robot
         theta = robot.random_postures(1, self.rng)
         tension = self.rng.uniform(30.0, 200.0, (1, robot.muscle_count))
-        sliding = self.rng.choice([-1.0, 1.0], (1, robot.muscle_count))
-        (length,) = self.body.lengths(theta, tension, sliding)
+        direction = self.rng.choice([-1.0, 1.0], (1, robot.muscle_count))
+        (length,) = self.body.lengths(theta, tension, direction)
         noise = 1e-4 * self.rng.standard_normal(robot.muscle_count)
-        return Sample(theta[0], tension[0], length[0] + noise, sliding[0])
+        return Sample(theta[0], tension[0], length[0] + noise, direction[0])
 
     def store(self, count: int) -> SampleStore:
         store = SampleStore()
@@ -64,7 +73,34 @@ class Stage:
         (length,) = self.body.lengths(theta, tension, np.zeros_like(tension))
         return theta, tension, length
 
+    def messages(self, count: int):
+        """Return (T, l) without friction."""
+        _, tension, length = self.states(count)
+        return np.concatenate([tension, length], axis=1).astype(np.float32)
+
 
 @pytest.fixture
 def stage(other_body) -> Stage:
     return Stage(other_body)
+
+
+def job(store, messages=None, time=0.0, steps=60, hold=True, rests=100):
+    empty = np.empty((0, 12), dtype=np.float32)
+    healthy = Healthy(empty if messages is None else messages, time, rests)
+    return Job(store.observations(), healthy, hold, steps)
+
+
+@pytest.fixture(scope='session')
+def learned_once(arm26, initial, other_body):
+    stage = Stage(other_body)
+    updater = BodyUpdater(arm26, initial)
+    store = stage.store(20)
+    for _ in range(6):
+        update = updater.update(job(store))
+    return update.mae, updater, store, stage
+
+
+@pytest.fixture
+def learned(learned_once):
+    """Return a network that has learned a body of 20 samples, its updater, store and stage."""
+    return copy.deepcopy(learned_once)

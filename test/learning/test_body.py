@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import Observations, Prior, fit_body
+from musculoskeletal_ae.learning.body_fit import Prior, fit_body
+from musculoskeletal_ae.learning.samples import Observations
 
 
 def rms(body, theta, tension, length):
@@ -25,17 +26,17 @@ def test_without_corrections_it_is_the_geometric_model(arm26):
 def test_the_linearisation_is_the_derivative(other_body, arm26, m):
     rng = np.random.default_rng(m)
     theta, tension = arm26.random_postures(5, rng), rng.uniform(20.0, 200.0, 5)
-    sliding = rng.uniform(-1.0, 1.0, 5)
+    direction = rng.uniform(-1.0, 1.0, 5)
     body = CorrectedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
     poses = body.poses(theta)
-    _, jacobian = body.linearised(poses, theta, tension, sliding, m)
+    _, jacobian = body.linearised(poses, theta, tension, direction, m)
     step = 1e-6
     for k in range(body.layouts[m].size):
         at = body.parameters[m][k]
         values = []
         for sign in (1.0, -1.0):
             body.parameters[m][k] = at + sign * step
-            values.append(body.linearised(poses, theta, tension, sliding, m)[0])
+            values.append(body.linearised(poses, theta, tension, direction, m)[0])
         body.parameters[m][k] = at
         slope = (values[0] - values[1]) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6)

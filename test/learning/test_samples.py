@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rest, novelty, the budgeted store, the gate."""
+"""Rest, friction, novelty, the budgeted store, the gate."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.learning.collector import MARGIN, Collector
-from musculoskeletal_ae.learning.rest import RestDetector, RestSettings
-from musculoskeletal_ae.learning.sample import Sample
-from musculoskeletal_ae.learning.sliding import SlidingTracker
-from musculoskeletal_ae.learning.store import SampleStore
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.rest import (
+    HOLE,
+    MARGIN,
+    FrictionDirection,
+    RestCollector,
+    RestDetector,
+    RestSettings,
+)
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
 
 DT = 0.01
 
@@ -65,21 +70,21 @@ def test_no_rest_without_joint_angles():
     assert run(RestDetector(RestSettings()), 3.0, measured=lambda _: False) == []
 
 
-def test_sliding_follows_the_last_direction_and_ignores_noise():
-    tracker, rng = SlidingTracker(1), np.random.default_rng(0)
+def test_friction_acts_against_the_last_sliding_and_ignores_noise():
+    friction, rng = FrictionDirection(), np.random.default_rng(0)
     length = 0.0
     for speed, expected in ((-0.02, 1.0), (0.0, 1.0), (0.02, -1.0), (0.0, -1.0)):
         for _ in range(100):
             length += speed * DT
-            sliding = tracker.step(np.array([length]) + 1e-4 * rng.standard_normal(1), DT)
-        assert sliding[0] * expected > 0.6
+            direction = friction.step(np.array([length]) + 1e-4 * rng.standard_normal(1), DT)
+        assert direction[0] * expected > 0.6
 
 
 @given(st.lists(st.floats(-0.1, 0.1), min_size=1, max_size=50))
-def test_sliding_stays_within_one(lengths):
-    tracker = SlidingTracker(1)
+def test_the_direction_of_friction_stays_within_one(lengths):
+    friction = FrictionDirection()
     for length in lengths:
-        assert np.abs(tracker.step(np.array([length]), DT)).max() <= 1.0 + 1e-9
+        assert np.abs(friction.step(np.array([length]), DT)).max() <= 1.0 + 1e-9
 
 
 def at(*theta):
@@ -110,84 +115,89 @@ def test_a_full_store_keeps_the_newest_and_its_coverage():
 
 
 @pytest.fixture
-def collector(arm26):
-    return Collector(arm26)
+def healthy():
+    return Reservoir(6)
 
 
-def rest_at(collector, arm26, theta, seconds, tension=60.0):
+@pytest.fixture
+def collector(arm26, healthy):
+    return RestCollector(arm26, RestSettings(), healthy)
+
+
+def rests_at(collector, arm26, theta, seconds, tension=60.0):
     pull = np.full(6, tension)
     length = arm26.muscle_lengths(theta, pull)
-    accepted = [collector.step(pull, length, DT, theta) for _ in range(round(seconds / DT))]
-    return [sample for sample in accepted if sample is not None]
+    rests = []
+    for _ in range(round(seconds / DT)):
+        rests += collector.step(pull, length, DT, theta)
+    return rests
 
 
-def test_a_rest_becomes_one_sample_after_the_margin(collector, arm26):
+def test_a_rest_counts_after_the_margin(collector, arm26):
     theta = 0.5 * (arm26.lower + arm26.upper)
-    assert len(rest_at(collector, arm26, theta, 1.0 + MARGIN + 0.5)) == 1
-    assert rest_at(collector, arm26, theta, 5.0) == []
-    assert collector.rejected['like a stored one'] > 0
+    assert rests_at(collector, arm26, theta, MARGIN) == []
+    (rest, *_) = rests_at(collector, arm26, theta, 1.5)
+    np.testing.assert_allclose(rest.theta, theta)
 
 
-def test_what_comes_shortly_before_an_anomaly_is_not_learned(collector, arm26):
+def test_what_comes_shortly_before_an_anomaly_is_not_learned(collector, arm26, healthy):
     theta = 0.5 * (arm26.lower + arm26.upper)
-    rest_at(collector, arm26, theta, 2.0)
+    rests_at(collector, arm26, theta, 2.0)
     collector.set_anomaly(True)
-    rest_at(collector, arm26, theta, 10.0)
-    assert len(collector.store) == 0
-    healthy = collector.reservoir.time
+    assert rests_at(collector, arm26, theta, 10.0) == []
+    assert collector.rejected['anomaly'] > 5
+    seen = healthy.time
     collector.set_anomaly(False)
-    rest_at(collector, arm26, theta, 2.0 * MARGIN + 1.5)
-    assert len(collector.store) == 1
-    assert collector.reservoir.time > healthy
+    assert rests_at(collector, arm26, theta, MARGIN) == []
+    assert len(rests_at(collector, arm26, theta, MARGIN + 1.5)) >= 1
+    assert healthy.time > seen
 
 
 def test_what_no_arm_can_measure_is_refused_with_a_reason(collector, arm26):
-    rest_at(collector, arm26, arm26.upper + 1.0, 5.0)
-    rest_at(collector, arm26, arm26.upper, 5.0, tension=1000.0)
-    assert len(collector.store) == 0
+    assert rests_at(collector, arm26, arm26.upper + 1.0, 5.0) == []
+    assert rests_at(collector, arm26, arm26.upper, 5.0, tension=1000.0) == []
     assert set(collector.rejected) == {
         'θ far outside the joint limits',
         'tension beyond the maximum',
     }
 
 
-def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch):
-    monkeypatch.setattr('musculoskeletal_ae.learning.collector.MOST_WAITING', 20)
+def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch, collector):
+    monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST_WAITING', 20)
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
-    collector = Collector(arm26)
+    collector = RestCollector(arm26, RestSettings(), Reservoir(6))
     theta = 0.5 * (arm26.lower + arm26.upper)
-    rest_at(collector, arm26, theta, 0.5)
+    rests_at(collector, arm26, theta, 0.5)
     pull = np.full(6, 60.0)
     for _ in range(200):
         collector.step(pull, arm26.muscle_lengths(theta, pull), 0.0, theta)
     assert len(collector._waiting) <= 20
-    assert len(collector._rest._window) <= 50
-    assert len(collector._rest._rest) <= 50
+    assert len(collector._detector._window) <= 50
+    assert len(collector._detector._rest) <= 50
 
 
-def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26):
+def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26, healthy):
     theta = 0.5 * (arm26.lower + arm26.upper)
     pull = np.full(6, 60.0)
     length = arm26.muscle_lengths(theta, pull)
+    rests = []
     for n in range(800):
         glitch = n in (300, 500)
-        collector.step(pull, length + (0.5 if glitch else 0.0), DT, theta)
+        rests += collector.step(pull, length + (0.5 if glitch else 0.0), DT, theta)
     assert collector.rejected['length beyond what the joints allow'] == 2
-    assert len(collector.store) == 1
-    np.testing.assert_allclose(collector.store.samples[0].length, length)
-    assert np.ptp(collector.healthy().messages, axis=0).max() < 1e-6
+    for rest in rests:
+        np.testing.assert_allclose(rest.length, length)
+    assert np.ptp(healthy.healthy().messages, axis=0).max() < 1e-6
 
 
-def test_rests_count_as_often_as_they_differ_since_the_arm_was_changed(collector, arm26):
-    for place in (0.3, 0.5, 0.5, 0.7):
-        theta = arm26.lower + place * (arm26.upper - arm26.lower)
-        rest_at(collector, arm26, theta, 1.5)
-    rest_at(collector, arm26, theta, MARGIN)
-    stored = len(collector.store)
-    assert stored >= 3
-    assert collector.healthy().rests == stored
-    collector.relearn(0, 1)
-    assert collector.healthy().rests == 0
-    rest_at(collector, arm26, theta, 2.0 + MARGIN)
-    assert collector.healthy().rests == 1
-    assert len(collector.store) == stored
+def test_a_wire_may_have_slid_either_way_in_a_hole_of_the_stream(collector, arm26):
+    theta = 0.5 * (arm26.lower + arm26.upper)
+    pull = np.full(6, 60.0)
+    length = arm26.muscle_lengths(theta, pull)
+    for n in range(50):  # wound in, so that friction has a direction
+        collector.step(pull, length + 0.01 - 0.0002 * n, DT, theta)
+    (rest, *_) = [*rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)]
+    assert (rest.direction > 0.5).all()
+    collector.step(pull, length, HOLE + 1.0, theta)
+    *_, rest = rests_at(collector, arm26, theta, 2.0 + MARGIN)
+    assert (rest.direction == 0.0).all()

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learner among real processes: it learns, gates, saves, resumes, and never blocks."""
+"""The learner's node: it learns, gates, saves, resumes, and ends with all that it started."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -11,17 +12,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from graph import DEADLINE
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.learning.rest import MARGIN
+from musculoskeletal_ae.learning.state import FILE
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.nodes.qos import LATCHED
 
 # Faster than on a robot, so that a test takes seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}
 REST = 0.8  # [s] in one posture
+DT = 0.01
 
 
 class Arm:
@@ -32,22 +38,193 @@ class Arm:
         self.rng = np.random.default_rng(0)
         self.joints = graph.publisher(JointState, 'joint_states')
         self.muscles = graph.publisher(Float64MultiArray, 'muscle_states')
-        self.move()
-
-    def move(self):
-        self.theta = self.robot.random_postures(1, self.rng)[0]
-        self.tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
-        self.since = time.monotonic()
+        self.time = self.until = 0.0
 
     def publish(self):
         """Publish one message of each kind, of a new posture now and then."""
-        if time.monotonic() - self.since > REST:
-            self.move()
+        self.time += DT
+        if self.time > self.until:
+            self.theta = self.robot.random_postures(1, self.rng)[0]
+            self.tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
+            self.until = self.time + REST
         length = self.robot.muscle_lengths(self.theta, self.tension) + 0.005
         rows = np.stack([length, self.tension, np.full(self.robot.muscle_count, 25.0)])
         self.joints.publish(JointState(name=self.robot.joints, position=self.theta.tolist()))
         self.muscles.publish(array_message(rows, 'quantity', 'muscle'))
-        self.graph.spin(0.01)
+
+    def step(self):
+        """Publish in real time."""
+        self.publish()
+        self.graph.spin(DT)
+
+
+class HostedLearner:
+    """A learner in this process, whose time passes as fast as messages can be taken."""
+
+    def __init__(self, graph, robot, **parameters):
+        self.graph = graph
+        self.node = graph.host(Learner, robot='arm26', **{**QUICK, **parameters})
+        graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        self.arm = Arm(graph, robot)
+        self.node._now = lambda: self.arm.time
+        self.taken = 0
+        muscles = self.node.core.muscles
+
+        def take(*values):
+            self.taken += 1
+            muscles(*values)
+
+        self.node.core.muscles = take
+
+    @property
+    def samples(self):
+        return len(self.node.core.samples)
+
+    @property
+    def updates(self):
+        return self.node.core.updates
+
+    def report(self):
+        return self.node.report()
+
+    def step(self):
+        taken, deadline = self.taken, time.monotonic() + 1.0
+        self.arm.publish()
+        while self.taken == taken and time.monotonic() < deadline:
+            self.graph.executor.spin_once(timeout_sec=0.1)
+
+    def run(self, seconds):
+        """Let time pass."""
+        for _ in range(round(seconds / DT)):
+            self.step()
+
+    def learn(self, condition, what):
+        """Let time pass until a condition holds."""
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited in vain for {what}'
+            self.step()
+
+
+@pytest.fixture
+def state(tmp_path):
+    return str(tmp_path / 'state')
+
+
+@pytest.fixture
+def host(graph, arm26, trained):
+    return lambda **parameters: HostedLearner(
+        graph, arm26, **{'checkpoint': trained, 'state_directory': '', **parameters}
+    )
+
+
+def versions(graph, robot):
+    return [
+        checkpoint.from_bytes(bytes(m.data), robot).version
+        for m in graph.received['mae_checkpoint']
+    ]
+
+
+def test_it_learns_and_publishes_whole_checkpoints_that_count_up(host, graph, arm26, state):
+    learner = host(state_directory=state)
+    learner.learn(lambda: len(graph.received['mae_checkpoint']) >= 4, 'three updates')
+    assert learner.samples >= 3
+    assert versions(graph, arm26) == sorted(set(versions(graph, arm26)))
+    assert learner.report().level == 'ok'
+    assert (Path(state) / FILE).exists()
+    assert graph.call(Trigger, 'learner/save').success
+
+
+def test_an_anomaly_stops_learning_until_the_reset(host, graph):
+    learner = host()
+    detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
+    learner.learn(lambda: learner.updates >= 1, 'an update')
+    detected.publish(Bool(data=True))
+    learner.learn(lambda: 'anomaly' in learner.report().message, 'the gate')
+    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    samples, updates = learner.samples, learner.updates
+    learner.run(2.0 * MARGIN + 2.0)
+    assert (learner.samples, learner.updates) == (samples, updates)
+    assert int(learner.report().values['not learned: anomaly']) >= 3
+    detected.publish(Bool(data=False))
+    learner.learn(lambda: learner.updates > updates, 'learning again')
+    assert not graph.call(Trigger, 'learner/save').success  # nothing is kept
+
+
+def test_enable_stops_and_resumes(host, graph):
+    learner = host()
+    learner.learn(lambda: learner.updates >= 1, 'an update')
+    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
+    assert 'enable' in learner.report().message
+    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    samples, updates = learner.samples, learner.updates
+    learner.run(2.0 * MARGIN + 2.0)
+    assert (learner.samples, learner.updates) == (samples, updates)
+    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=True)).success
+    learner.learn(lambda: learner.updates > updates, 'learning again')
+
+
+def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backup(
+    host, graph, trained, state, tmp_path
+):
+    learner = host(state_directory=state)
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    broken = tmp_path / 'broken.safetensors'
+    broken.write_bytes(b'nonsense')
+    success, reason = graph.set_parameter('learner', 'checkpoint', str(broken))
+    assert not success
+    assert 'broken' in reason
+    assert learner.samples >= 2
+    before = len(graph.received['mae_checkpoint'])
+    assert graph.set_parameter('learner', 'checkpoint', trained) == (True, '')
+    assert learner.samples == 0
+    graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
+    assert (Path(state) / 'backup-1' / FILE).exists()
+    assert graph.set_parameter('learner', 'fresh', True) == (True, '')
+
+
+def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, graph, state):
+    learner = host(state_directory=state)
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    graph.executor.remove_node(learner.node)
+    learner.node.core.close()
+    fresh = host(state_directory=state, fresh=True)
+    assert fresh.samples == 0
+    assert (Path(state) / 'backup-1' / FILE).exists()
+    fresh.learn(lambda: fresh.updates >= 1, 'learning anew')
+
+
+def test_a_state_directory_that_is_deleted_is_an_error_that_heals(host, state):
+    learner = host(state_directory=state)
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    shutil.rmtree(state)
+    learner.learn(lambda: learner.report().level == 'error', 'the error')
+    learner.learn(lambda: learner.report().level == 'ok', 'a new directory')
+    assert (Path(state) / FILE).exists()
+
+
+def test_a_training_process_that_dies_is_noticed_and_replaced(host):
+    learner = host()
+    learner.learn(lambda: learner.updates >= 1, 'an update')
+    first = learner.report().values['training process']
+    os.kill(int(first), signal.SIGKILL)
+    learner.learn(lambda: learner.report().values['training process restarts'] == '1', 'a notice')
+    updates = learner.updates
+    learner.learn(lambda: learner.updates > updates, 'an update')
+    assert learner.report().values['training process'] != first
+
+
+def test_relearning_names_legal_muscles(host, graph, arm26):
+    learner = host()
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    success, reason = graph.set_parameter('learner', 'relearn_muscles', ['no_such_muscle'])
+    assert not success
+    assert arm26.muscles[0] in reason
+    assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
+    assert not any(known[1] for known in learner.node.core.samples.known)
+
+
+# -- real processes -------------------------------------------------------------------------------
 
 
 def start(graph, **parameters):
@@ -58,48 +235,30 @@ def start(graph, **parameters):
     return process
 
 
-def diagnosis(graph):
+def values(graph):
     name = f'{graph.namespace}/learner: state'
     found = [s for m in graph.received['/diagnostics'] for s in m.status if s.name == name]
-    return found[-1] if found else DiagnosticStatus()
-
-
-def values(graph):
-    return {v.key: v.value for v in diagnosis(graph).values}
-
-
-def versions(graph, robot):
-    return [
-        checkpoint.from_bytes(bytes(m.data), robot).version
-        for m in graph.received['mae_checkpoint']
-    ]
-
-
-def learn(graph, arm, condition, what):
-    def step():
-        arm.publish()
-        return condition()
-
-    graph.wait(step, what)
-
-
-@pytest.fixture
-def state(tmp_path):
-    return str(tmp_path / 'state')
+    return {v.key: v.value for v in (found or [DiagnosticStatus()])[-1].values}
 
 
 def samples(graph):
     return int(values(graph).get('samples', 0))
 
 
-def test_it_learns_and_publishes_whole_checkpoints_that_count_up(graph, arm26, trained, state):
-    start(graph, checkpoint=trained, state_directory=state)
-    arm = Arm(graph, arm26)
-    learn(graph, arm, lambda: len(graph.received['mae_checkpoint']) >= 4, 'three updates')
-    learn(graph, arm, lambda: samples(graph) >= 3, 'samples')
-    assert versions(graph, arm26) == sorted(set(versions(graph, arm26)))
-    assert (Path(state) / 'samples.log').exists()
-    assert graph.call(Trigger, 'learner/save').success
+def learn(graph, arm, condition, what):
+    def step():
+        arm.step()
+        return condition()
+
+    graph.wait(step, what)
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
@@ -114,84 +273,7 @@ def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained, state):
     start(graph, checkpoint='/no/such/file', state_directory=state)
     graph.wait(lambda: samples(graph) >= stored, 'the samples of before')
     graph.wait(lambda: versions(graph, arm26)[-1] >= version, 'the network of before')
-    graph.wait(lambda: not _alive(worker), 'the end of the orphaned training process')
-
-
-def _alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def test_an_anomaly_stops_learning_until_the_reset(graph, arm26, trained):
-    start(graph, checkpoint=trained, state_directory='')
-    arm = Arm(graph, arm26)
-    detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
-    learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
-    detected.publish(Bool(data=True))
-    learn(graph, arm, lambda: 'anomaly' in diagnosis(graph).message, 'the gate')
-    before = samples(graph)
-    learn(graph, arm, lambda: int(values(graph).get('not learned: anomaly', 0)) >= 3, 'refusals')
-    assert samples(graph) == before
-    detected.publish(Bool(data=False))
-    learn(graph, arm, lambda: samples(graph) > before, 'learning again')
-    assert not graph.call(Trigger, 'learner/save').success
-
-
-def test_enable_stops_and_resumes(graph, arm26, trained):
-    start(graph, checkpoint=trained, state_directory='')
-    arm = Arm(graph, arm26)
-    learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
-    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
-    learn(graph, arm, lambda: 'enable' in diagnosis(graph).message, 'the stop')
-    before = samples(graph)
-    for _ in range(100):
-        arm.publish()
-    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=True)).success
-    learn(graph, arm, lambda: samples(graph) > before, 'learning again')
-
-
-def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backup(
-    graph, arm26, trained, state, tmp_path
-):
-    start(graph, checkpoint=trained, state_directory=state)
-    arm = Arm(graph, arm26)
-    learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
-    broken = tmp_path / 'broken.safetensors'
-    broken.write_bytes(b'nonsense')
-    success, reason = graph.set_parameter('learner', 'checkpoint', str(broken))
-    assert not success
-    assert 'broken' in reason
-    before = len(graph.received['mae_checkpoint'])
-    assert graph.set_parameter('learner', 'checkpoint', trained) == (True, '')
-    graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
-    graph.wait(lambda: samples(graph) == 0, 'an empty store')
-    assert (Path(state) / 'backup-1' / 'samples.log').exists()
-    assert graph.set_parameter('learner', 'fresh', True) == (True, '')
-
-
-def test_a_training_process_that_dies_is_noticed_and_replaced(graph, arm26, trained):
-    start(graph, checkpoint=trained, state_directory='')
-    arm = Arm(graph, arm26)
-    learn(graph, arm, lambda: samples(graph) >= 2 and 'update' in values(graph), 'an update')
-    first = values(graph)['training process']
-    os.kill(int(first), signal.SIGKILL)
-    learn(graph, arm, lambda: values(graph).get('training process restarts') == '1', 'a notice')
-    before = len(graph.received['mae_checkpoint'])
-    learn(graph, arm, lambda: len(graph.received['mae_checkpoint']) > before, 'an update')
-    assert values(graph)['training process'] != first
-
-
-def test_relearning_names_legal_muscles(graph, arm26, trained, state):
-    start(graph, checkpoint=trained, state_directory=state)
-    arm = Arm(graph, arm26)
-    learn(graph, arm, lambda: samples(graph) >= 2, 'samples')
-    success, reason = graph.set_parameter('learner', 'relearn_muscles', ['no_such_muscle'])
-    assert not success
-    assert arm26.muscles[0] in reason
-    assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
+    graph.wait(lambda: not alive(worker), 'the end of the orphaned training process')
 
 
 def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained):
@@ -225,9 +307,8 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
     graph.wait(refused, 'the refusal of another frame')
 
 
-def test_two_learners_do_not_share_a_directory(graph, trained, state):
-    start(graph, checkpoint=trained, state_directory=state)
-    graph.wait(lambda: graph.received['mae_checkpoint'], 'the first one')
+def test_two_learners_do_not_share_a_directory(graph, host, state):
+    host(state_directory=state)
     second = graph.start('learner', robot='arm26', state_directory=state)
     graph.processes.remove(second)
     output, _ = second.process.communicate(timeout=60)
@@ -244,4 +325,4 @@ def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained):
     graph.processes.remove(process)
     assert status == 0
     assert 'Traceback' not in output
-    assert not _alive(worker)
+    assert not alive(worker)

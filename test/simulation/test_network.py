@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bench import sim_pictures
+from bench.simulation_nominal import compare, random_commands, rest_errors
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.experiments.simulation import compare, random_commands, rest_errors
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation

@@ -8,7 +8,7 @@ import pytest
 
 from bench.nominal_rest import nominal_rest
 from bench.sim_responses import NOTICEABLE, responses
-from musculoskeletal_ae.experiments.simulation import random_commands
+from bench.simulation_nominal import random_commands
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation import simulation
 from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED, follow

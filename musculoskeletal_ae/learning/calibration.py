@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrating the anomaly detector: residuals of ② over messages of the healthy arm.
+
+    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d
+
+Messages, moving and resting, are kept in a reservoir, a uniform draw from all that ever came; each
+new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
+friction gives d heavy tails, and on a part of the messages that Σ did not see. Glitches of
+a sensor are no part of that: a few messages at most, far beyond all the rest, are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, residuals
+
+CAPACITY = 4000
+SPACING = 0.1  # [s] between messages that are kept
+#: healthy time [s], samples learned, and different rests within that time before a detector is
+#: worth trusting
+LEAST_TIME, LEAST_SAMPLES = 60.0, 20
+#: Threshold over the largest d seen, for a body well known. A load of 3.6 kg that was never carried
+#: before doubles it; a wire that is cut multiplies it by six to ten within 0.3 s.
+MARGIN = 3.5
+#: and by how much more while few samples say what the body is: 1 + this / samples
+YOUNG = 20.0
+#: Σ is mixed with its own diagonal, so that no combination of muscles looks impossible that was
+#: only not seen
+DIAGONAL_SHARE = 0.1
+#: this share of the messages is left out at most, and what is so many times beyond all others
+GLITCHES, GLITCH = 0.002, 3.0
+
+
+class Healthy(NamedTuple):
+    """What was seen of the healthy arm since it was last changed.
+
+    Attributes:
+        messages: (T, l), shape (N, 2M).
+        time: Time that they were drawn from [s].
+        rests: How many different rests there were within.
+    """
+
+    messages: NDArray[np.float32]
+    time: float
+    rests: int
+
+
+class Reservoir:
+    """A uniform draw of bounded size from all messages of the healthy arm.
+
+    Attributes:
+        time: Healthy time seen [s].
+    """
+
+    def __init__(
+        self,
+        muscles: int,
+        seed: int = 0,
+        novelty: Novelty | None = None,
+        capacity: int = CAPACITY,
+    ) -> None:
+        """Start empty; rests differ by `novelty`."""
+        self._rng = np.random.default_rng([seed, 0x4E])
+        self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
+        self._rests = SampleStore(novelty)
+        self._seen, self._since, self.time = 0, 0.0, 0.0
+
+    def step(self, tension: Array, length: Array, dt: float) -> None:
+        """Take a message."""
+        self._since += dt
+        if self._since < SPACING - 1e-9:
+            return
+        self.time += min(self._since, 2.0 * SPACING)
+        self._since = 0.0
+        capacity = len(self._kept)
+        place = self._seen if self._seen < capacity else int(self._rng.integers(self._seen + 1))
+        if place < capacity:
+            self._kept[place] = np.concatenate([tension, length])
+        self._seen += 1
+
+    def rest(self, rest: Sample) -> None:
+        """Count a rest if it differs from those before."""
+        if self._rests.is_new(rest):
+            self._rests.add(rest)
+
+    def clear(self) -> None:
+        """Forget all, as when the body has changed."""
+        self._seen, self._since, self.time = 0, 0.0, 0.0
+        self._rests.clear()
+
+    def healthy(self) -> Healthy:
+        """Return what was seen."""
+        messages = self._kept[: min(self._seen, len(self._kept))].copy()
+        return Healthy(messages, self.time, len(self._rests))
+
+
+def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
+    """Return a network with statistics of its residuals, at least as trusted as those before.
+
+    After a restart the messages are few, and the calibrated statistics of the network that was
+    saved serve its successors until there are enough.
+
+    Args:
+        mae: The network.
+        before: Statistics of its predecessor.
+        healthy: What the healthy arm showed.
+        samples: How many samples the network has learned.
+    """
+    statistics = calibrate(mae, healthy, samples)
+    keep = before is not None and before.calibrated
+    if statistics is None or (keep and not statistics.calibrated):
+        statistics = before
+    return replace(mae, anomaly=statistics)
+
+
+def uncalibrated(mae: Mae) -> Mae:
+    """Return a network that says that its statistics are not of the arm as it is now."""
+    if mae.anomaly is None:
+        return mae
+    return replace(mae, anomaly=replace(mae.anomaly, calibrated=False))
+
+
+def is_calibrated(mae: Mae) -> bool:
+    """Whether a network's statistics come from the real arm."""
+    return mae.anomaly is not None and mae.anomaly.calibrated
+
+
+def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
+    """Return statistics of a network's residuals, or None where there is too little.
+
+    Arguments as `recalibrated`.
+    """
+    if len(healthy.messages) < 2:
+        return None
+    tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
+    error = residuals(mae.estimate(tension, length), tension, length)
+    sound = ~_glitches(error)
+    known = min(samples, healthy.rests)
+    calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
+    # Each message has its part whatever is left out, so that a glitch moves no other one.
+    first = np.arange(len(error)) % 2 == 0
+    part = _regularised(AnomalyStatistics.of(error[sound & first], calibrated))
+    statistics = _regularised(AnomalyStatistics.of(error[sound], calibrated))
+    largest = max(
+        distances(part, error[sound & ~first]).max(initial=0.0),
+        distances(statistics, error[sound]).max(),
+    )
+    norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error[sound], 2, axis=1))
+    thresholds = {
+        DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
+        'norm': float(np.max(norm)),
+    }
+    return replace(statistics, thresholds=thresholds)
+
+
+def _glitches(error: Array) -> Bools:
+    few = int(GLITCHES * len(error))
+    if few == 0:
+        return np.zeros(len(error), dtype=bool)
+    # Statistics that glitches cannot spoil: of the others, first by each residual's own spread.
+    middle = np.median(error, axis=0)
+    spread = np.median(np.abs(error - middle), axis=0) + FLOOR
+    order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
+    distance = distances(_regularised(AnomalyStatistics.of(error[order[:-few]], False)), error)
+    rest = np.sort(distance)[-few - 1]
+    glitches: Bools = distance > GLITCH * rest
+    return glitches
+
+
+def distances(statistics: AnomalyStatistics, error: Array) -> Array:
+    """Return d of residuals (N, 2M)."""
+    centred = error - statistics.mean
+    squares = np.einsum('ni,ni->n', centred, np.linalg.solve(statistics.covariance, centred.T).T)
+    return np.sqrt(squares)
+
+
+def _regularised(statistics: AnomalyStatistics) -> AnomalyStatistics:
+    covariance = statistics.covariance
+    mixed = (1.0 - DIAGONAL_SHARE) * covariance + DIAGONAL_SHARE * np.diag(np.diag(covariance))
+    return replace(statistics, covariance=mixed)

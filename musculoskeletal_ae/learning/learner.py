@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Online learning from messages to checkpoints: what the node ships and experiments measure.
+
+    θ, (T, l) ─ paired by time ─► rests that may be learned from ─ new ones ─► samples
+                     │                                                            │
+                     └─► messages of the healthy arm ─► update of the network ◄───┘
+                                                                 │
+                                            disk, subscribers ◄──┘
+
+Time is the caller's: the ROS clock, recorded or simulated time. All rules on time are rules on
+that, so that a recording steps exactly what runs on a robot, but that training takes no time there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import StateError
+from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
+from musculoskeletal_ae.learning.rest import RestCollector, RestSettings
+from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.learning.state import State
+from musculoskeletal_ae.learning.training import Job, Training, Update
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.report import Level, Report
+from musculoskeletal_ae.robot.robot import Robot
+
+STEPS = 100  # of training in one update of preset default
+#: between the beginnings of two updates, and between two checkpoints [s]
+LEAST_INTERVAL = 1.0
+
+
+class Learner:
+    """Learns the body of one arm.
+
+    Attributes:
+        robot: The geometric model.
+        samples: What is learned from.
+        checkpoint: The network as learned so far; None without.
+        enabled: Whether it learns.
+        training: Where updates are made.
+        updates: How many updates there were.
+        update: What came of the last one.
+        published: How many checkpoints `poll` has given out.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        mae: Mae | None = None,
+        preset: str = 'default',
+        seed: int = 0,
+        *,
+        steps: int = STEPS,
+        period: float = 0.01,
+        rest: RestSettings | None = None,
+        novelty: Novelty | None = None,
+        training: Callable[[Robot, str, int], Training] = Training,
+        directory: Path | None = None,
+    ) -> None:
+        """Go on from the saved state, if there is one that fits, else from a network.
+
+        Args:
+            robot: The geometric model.
+            mae: Fits the robot; None: wait for one.
+            preset: How to learn, 'default' or 'paper'.
+            seed: Random seed.
+            steps: Of training per update, in preset default.
+            period: Of the messages of the muscle modules [s].
+            rest: What counts as rest.
+            novelty: What counts as new.
+            training: Makes what makes the updates.
+            directory: Where samples and network are kept; None for nowhere.
+
+        Raises:
+            MusculoskeletalError: If there is no such preset.
+            StateError: If the directory cannot be used.
+        """
+        self.robot = robot
+        self.training = training(robot, preset, seed)
+        self.samples = SampleStore(novelty)
+        self._mae: Mae | None = None
+        self.checkpoint: bytes | None = None
+        self.enabled = True
+        self.update: Update | None = None
+        self.updates = self.published = 0
+        self._pairing = Pairing(period)
+        self._healthy = Reservoir(robot.muscle_count, seed, novelty)
+        self._rests = RestCollector(robot, rest or RestSettings(), self._healthy)
+        self._steps = steps
+        self._news = True  # to learn from, since the last update began
+        self._begun = self._given = -math.inf  # the last update, the last checkpoint [s]
+        self._to_publish = False
+        # Where they do not, the network says that its detector is not calibrated.
+        self._statistics_hold = True
+        self._forgot = False  # a muscle, since the update began
+        self._state = None if directory is None else State(directory, robot)
+        saved = None if self._state is None else self._state.load(self.samples)
+        if saved is not None:
+            self._go_on_from(saved)
+        elif mae is not None:
+            self.begin(mae)
+
+    # -- messages → samples ---------------------------------------------------------------------
+
+    def step(self, time: float, theta: Array | None, tension: Array, length: Array) -> bytes | None:
+        """Take what was measured at `time` [s], and `poll`; θ is None where it was not."""
+        if theta is not None:
+            self.joints(time, theta)
+        self.muscles(time, tension, length)
+        return self.poll(time)
+
+    def joints(self, time: float, theta: Array) -> None:
+        """Take a θ [rad] (D,) that came at `time` [s]."""
+        self._pairing.joints(time, theta)
+
+    def muscles(self, time: float, tension: Array, length: Array) -> None:
+        """Take T [N] and l [m] (M,) that came at `time` [s]."""
+        paired = self._pairing.muscles(time, tension, length)
+        if paired is None or not self.enabled:
+            return
+        _, tension, length, dt, theta = paired
+        for rest in self._rests.step(tension, length, dt, theta):
+            self._healthy.rest(rest)
+            if self.samples.is_new(rest):
+                self.accept(rest)
+            else:
+                self.rejected['like a stored one'] += 1
+
+    def accept(self, sample: Sample) -> None:
+        """Keep a new sample, on disk too, and learn from it soon."""
+        self.samples.add(sample)
+        self._keep()
+        self._news = True
+
+    def anomaly(self, detected: bool) -> None:
+        """Stop learning when an anomaly is detected, resume when it is reset."""
+        self._rests.set_anomaly(detected)
+
+    def enable(self, enabled: bool) -> None:
+        """Stop or resume learning; samples and network stay."""
+        if enabled and not self.enabled:
+            self.reset()
+        self.enabled = enabled
+
+    def reset(self) -> None:
+        """Forget what is no sample yet, as after a backward jump of the clock."""
+        self._pairing.reset()
+        self._rests.reset()
+
+    # -- samples → checkpoints ------------------------------------------------------------------
+
+    def poll(self, now: float) -> bytes | None:
+        """Begin and end updates; return a checkpoint if one is to be published.
+
+        Args:
+            now: Time [s] on the clock of the messages.
+        """
+        if self._may_begin(now):
+            self._news, self._begun, self._forgot = False, now, False
+            seen, healthy = self.samples.observations(), self._healthy.healthy()
+            self.training.submit(Job(seen, healthy, self._statistics_hold, self._steps))
+        update = self.training.poll()
+        if update is not None:
+            self._take(update)
+        if self._state is not None:
+            self._state.poll(self.samples, self.checkpoint)
+        if not self._to_publish or _lately(self._given, now):
+            return None
+        self._to_publish, self._given = False, now
+        self.published += 1
+        return self.checkpoint
+
+    def _may_begin(self, now: float) -> bool:
+        return (
+            self._news
+            and not _lately(self._begun, now)
+            and self.enabled
+            and not self._rests.anomaly
+            and len(self.samples) >= self.training.preset.least_samples
+            and self.training.ready
+        )
+
+    def _take(self, update: Update) -> None:
+        """Use what came of an update."""
+        self.update, self.updates = update, self.updates + 1
+        # Its statistics may be of the arm before a muscle was changed.
+        mae = uncalibrated(update.mae) if self._forgot or update.changed else update.mae
+        self._statistics_hold |= is_calibrated(mae)
+        for muscle, newest in update.changed:
+            self._forget(muscle, newest)
+        self._use(self._numbered(mae))
+
+    def _numbered(self, mae: Mae) -> Mae:
+        before = 0 if self._mae is None else self._mae.version
+        return replace(mae, version=1 + max(mae.version, before))
+
+    def _use(self, mae: Mae) -> None:
+        self._mae, self.checkpoint = mae, checkpoint.to_bytes(mae)
+        # What is published is on disk before it leaves.
+        self._keep()
+        self._to_publish = True
+
+    def relearn(self, muscles: Iterable[int]) -> None:
+        """Learn the constants of muscles anew from what comes.
+
+        The detector is uncalibrated until enough of the changed arm has been seen.
+        """
+        for muscle in muscles:
+            self._forget(muscle)
+            self._rests.reset()
+        if not self._statistics_hold and self._mae is not None and is_calibrated(self._mae):
+            self._use(self._numbered(uncalibrated(self._mae)))
+        self._keep()
+
+    def _forget(self, muscle: int, newest: int = 0) -> None:
+        """Let all samples but the newest ones say nothing about a muscle."""
+        self.samples.forget(muscle, newest)
+        self._healthy.clear()
+        self._statistics_hold, self._forgot, self._news = False, True, True
+
+    # -- the state ------------------------------------------------------------------------------
+
+    def begin(self, mae: Mae) -> None:
+        """Go on from a network, where none was saved; samples stay."""
+        self._go_on_from(self._numbered(mae))
+
+    def _go_on_from(self, mae: Mae) -> None:
+        self._statistics_hold, self._given = True, -math.inf
+        self.training.begin(mae)
+        self._use(mae)
+
+    def replace(self, mae: Mae | None) -> None:
+        """Start anew from a network, or without; what was learned so far is kept as a backup.
+
+        Raises:
+            StateError: If the backup cannot be made; nothing is changed then.
+        """
+        if self._state is not None and (self.samples or self.checkpoint):
+            self._state.back_up(self.samples, self.checkpoint)
+        successor = None if mae is None else self._numbered(mae)
+        self.training.close()
+        self.samples.clear()
+        self._healthy.clear()
+        self.reset()
+        self._mae, self.checkpoint, self._to_publish = None, None, False
+        if successor is None:
+            self._keep()
+        else:
+            self._go_on_from(successor)
+
+    def save(self) -> Path:
+        """Bring the disk in line at once; returns where.
+
+        Raises:
+            StateError: If nothing is to be kept, or the disk is full or gone.
+        """
+        if self._state is None:
+            raise StateError("state_directory is '': nothing is kept; start with a directory")
+        self._state.keep(self.samples, self.checkpoint, at_once=True)
+        if self._state.trouble:
+            raise StateError(self._state.trouble)
+        return self._state.directory
+
+    def _keep(self) -> None:
+        if self._state is not None:
+            self._state.keep(self.samples, self.checkpoint)
+
+    def close(self) -> None:
+        """End the training process and release the directory."""
+        self.training.close()
+        if self._state is not None:
+            self._state.close()
+
+    # -- what there is to say -------------------------------------------------------------------
+
+    @property
+    def mae(self) -> Mae:
+        """The network as learned so far; only where there is a `checkpoint`."""
+        assert self._mae is not None
+        return self._mae
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Messages and rests that were not learned from, by reason."""
+        return self._rests.rejected
+
+    def report(self) -> Report:
+        """Return how it is, for /diagnostics."""
+        level: Level = 'warn'
+        disk = '' if self._state is None else self._state.trouble
+        if trouble := '; '.join(filter(None, (self.training.trouble, disk))):
+            level, message = 'error', trouble
+        elif self.checkpoint is None:
+            message = 'waiting for a checkpoint: set the parameter `checkpoint`'
+        elif not self.enabled:
+            message = 'stopped by learner/enable'
+        elif self._rests.anomaly:
+            message = 'stopped by an anomaly until estimator/reset'
+        else:
+            level, message = 'ok', 'learning'
+        return Report(level, message, {**self._values(), 'state': message})
+
+    def _values(self) -> dict[str, str]:
+        values = {
+            'samples': str(len(self.samples)),
+            'accepted': str(self.samples.accepted),
+            'checkpoints': str(self.published),
+            'checkpoint version': str(0 if self._mae is None else self._mae.version),
+            'preset': self.training.preset.name,
+            'healthy time': f'{self._healthy.time:.0f} s',
+            **self.training.values(),
+        }
+        if self._state is not None:
+            values['state directory'] = str(self._state.directory)
+            if self._state.not_used:
+                values['saved state not used'] = self._state.not_used
+        if self.update is not None:
+            values |= self._values_of(self.update)
+        return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}
+
+    def _values_of(self, update: Update) -> dict[str, str]:
+        values = {
+            'error at newest samples': f'{update.error:.4f} rad',
+            'loss': f'{update.loss:.4f}',
+            'update': f'{update.seconds:.2f} s',
+            'anomaly calibrated': str(is_calibrated(update.mae)),
+        }
+        muscles = self.robot.muscles
+        if len(update.noise):
+            worst = int(update.noise.argmax())
+            values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({muscles[worst]})'
+        if update.contradicted:
+            names = ', '.join(muscles[m] for m in update.contradicted)
+            what = 'newest samples contradict several muscles'
+            values[what] = f'{names}; look at the joint sensors'
+        return values
+
+
+def _lately(then: float, now: float) -> bool:
+    """Whether something was less than `LEAST_INTERVAL` ago; not if the clock went back since."""
+    return 0.0 <= now - then < LEAST_INTERVAL

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples: what the sensors said while the arm was at rest, and which of them are kept.
+
+A sample is new when θ or T differs from every stored one by more than a threshold (paper, section
+"Online Learning"). When the store is full, one of the two samples nearest to each other goes, the
+older one, so that what remains is spread over the postures and tensions ever seen, and the newest
+always stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+
+CAPACITY = 400
+
+
+class Sample(NamedTuple):
+    """Means over a rest.
+
+    Attributes:
+        theta: θ [rad], shape (D,).
+        tension: T [N], shape (M,).
+        length: l [m], shape (M,).
+        direction: s of every wire's friction, +1 wound in last, −1 paid out last, shape (M,).
+    """
+
+    theta: Array
+    tension: Array
+    length: Array
+    direction: Array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N samples as arrays.
+
+    Attributes:
+        theta: θ [rad], shape (N, D).
+        tension: T at the motors [N], shape (N, M).
+        length: l [m], shape (N, M).
+        direction: s in [−1, 1], shape (N, M).
+        known: Which of them say something about which muscle, shape (N, M).
+    """
+
+    theta: Array
+    tension: Array
+    length: Array
+    direction: Array
+    known: Bools
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.theta)
+
+
+@dataclass(frozen=True)
+class Novelty:
+    """By how much a sample has to differ from every stored one.
+
+    Attributes:
+        joint: In one joint [rad].
+        tension: In one muscle [N].
+    """
+
+    joint: float = 0.05
+    tension: float = 10.0
+
+
+class SampleStore:
+    """Samples in the order in which they came, at most `capacity`.
+
+    Attributes:
+        samples: The oldest first.
+        known: For each sample the muscles that it says something about, shape (M,).
+        numbers: Each sample's place among all that were ever accepted, from 1.
+        accepted: How many were ever accepted.
+    """
+
+    def __init__(self, novelty: Novelty | None = None, capacity: int = CAPACITY) -> None:
+        """Start empty."""
+        self.novelty = novelty or Novelty()
+        self.capacity = capacity
+        self.accepted = 0
+        self.clear()
+
+    def __len__(self) -> int:
+        """Samples stored."""
+        return len(self.samples)
+
+    def is_new(self, sample: Sample) -> bool:
+        """Whether a sample differs enough from every stored one."""
+        return not self.samples or bool(self._distances(sample).min() > 1.0)
+
+    def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
+        """Store a sample, as the newest; `known` and `number` are given to one stored before."""
+        self.accepted = number or self.accepted + 1
+        self.samples.append(sample)
+        self.known.append(np.ones(len(sample.tension), dtype=bool) if known is None else known)
+        self.numbers.append(self.accepted)
+        if len(self.samples) > self.capacity:
+            worst = self._dispensable()
+            del self.samples[worst], self.known[worst], self.numbers[worst]
+
+    def forget(self, muscle: int, newest: int = 0) -> None:
+        """Let all samples but the newest ones say nothing about a muscle any more."""
+        for known in self.known[: len(self.known) - newest]:
+            known[muscle] = False
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self.samples: list[Sample] = []
+        self.known: list[Bools] = []
+        self.numbers: list[int] = []
+        self.accepted = 0
+
+    def observations(self) -> Observations:
+        """Return all samples as arrays."""
+        theta, tension, length, direction = map(np.array, zip(*self.samples, strict=True))
+        return Observations(theta, tension, length, direction, np.array(self.known))
+
+    def _scaled(self, sample: Sample) -> Array:
+        return np.concatenate(
+            [sample.theta / self.novelty.joint, sample.tension / self.novelty.tension]
+        )
+
+    def _distances(self, sample: Sample) -> Array:
+        stored = np.array([self._scaled(s) for s in self.samples])
+        return np.abs(stored - self._scaled(sample)).max(axis=1)
+
+    def _dispensable(self) -> int:
+        points = np.array([self._scaled(s) for s in self.samples])
+        square = np.sum(points**2, axis=1)
+        distance = square[:, None] + square - 2.0 * points @ points.T
+        distance[np.diag_indices_from(distance)] = np.inf
+        # A sample that says nothing about some muscle any more goes before one that does.
+        lost = 1.0 - np.array(self.known).mean(axis=1)
+        distance /= 1.0 + lost[:, None] + lost
+        return int(min(np.unravel_index(np.argmin(distance), distance.shape)))

@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a learner has on disk, so that nothing learned is lost when it is killed at any moment.
+
+    learner.sqlite   the samples and the newest network
+    backup-N/        a state that was replaced or could not be used: a state directory of its own
+
+Memory is the truth, and the disk is brought in line with it, each time in one transaction. What
+could not be written (disk full, read-only, deleted under our feet) is written as soon as that
+succeeds, and until then `trouble` says why it was not.
+
+The journal is a rollback journal, not a write-ahead log: between two transactions the directory
+holds one file that is whole, however it is copied. Each sample's record carries its checksum, and a
+mark by which it is found even where the disk has damaged the structure of the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sqlite3
+import struct
+import time
+import zlib
+from contextlib import closing, suppress
+from pathlib import Path
+
+import numpy as np
+
+from musculoskeletal_ae.exceptions import CheckpointError, StateError
+from musculoskeletal_ae.learning import old_state
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.mae import checkpoint as checkpoints
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+FILE = 'learner.sqlite'
+TABLES = (
+    'CREATE TABLE IF NOT EXISTS sample (number INTEGER PRIMARY KEY, record BLOB NOT NULL)',
+    'CREATE TABLE IF NOT EXISTS network (checksum INTEGER NOT NULL, checkpoint BLOB NOT NULL)',
+)
+SAMPLES = 'SELECT number, record FROM sample ORDER BY number'
+HEAD = struct.Struct('<8sIQ')  # mark, checksum, number
+MARK = b'MAEsampl'
+#: between two looks at the file, and two attempts to write what could not be written [s]
+LOOK, PAUSE = 0.5, 2.0
+
+
+class State:
+    """The directory of one robot's learner.
+
+    Attributes:
+        directory: Where it is.
+        not_used: What was found at the start and could not be used, or ''.
+        trouble: Why the disk is not in line with memory, or ''.
+    """
+
+    def __init__(self, directory: str | Path, robot: Robot) -> None:
+        """Open a directory, made if missing, for this process alone.
+
+        Raises:
+            StateError: If it cannot be written, or another learner works there.
+        """
+        self.directory = Path(directory).expanduser()
+        self.not_used = self.trouble = ''
+        self._file = self.directory / FILE
+        self._robot = robot
+        self._names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
+        self._connection: sqlite3.Connection | None = None
+        self._next_look = 0.0
+        try:
+            self._open()
+            for unfinished in self.directory.glob('backup-*.tmp'):
+                shutil.rmtree(unfinished, ignore_errors=True)
+        except (OSError, ValueError, sqlite3.OperationalError) as error:
+            problem, remedy = f'cannot be written ({error})', "a directory that can, or ''"
+            if 'locked' in str(error):
+                problem, remedy = 'is used by another learner', 'each its own, or stop the other'
+            elif self._empty():
+                self._failed(error)  # with a full disk, a new learner goes on and says so
+                return
+            raise StateError(
+                f'state_directory {str(directory)!r} {problem}; give {remedy}'
+            ) from error
+        except sqlite3.DatabaseError:
+            pass  # no database: `load` says so
+
+    def _empty(self) -> bool:
+        try:
+            return self._file.stat().st_size == 0
+        except (OSError, ValueError):
+            return False
+
+    def _open(self) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        self._connection = _connect(self._file)
+        self._opened = self._identity()
+
+    def _identity(self) -> tuple[int, int]:
+        found = self._file.stat()
+        return found.st_dev, found.st_ino
+
+    # -- reading --------------------------------------------------------------------------------
+
+    def load(self, samples: SampleStore) -> Mae | None:
+        """Fill an empty store with the samples on disk and return the network, if there is one.
+
+        A file that is damaged or another robot's becomes a backup, and what can be used is used.
+
+        Raises:
+            StateError: If it can neither be used nor become a backup.
+        """
+        old = old_state.files(self.directory)
+        try:
+            if self._empty():
+                problem, data = old_state.read(self.directory, self._robot, samples)
+            else:
+                problem, data = self._read(samples)
+            mae = None
+            if data is not None:
+                try:
+                    mae = checkpoints.from_bytes(data, self._robot)
+                except CheckpointError as error:
+                    problem = problem or f'the saved network: {error}'
+            if problem and not old:
+                self._put_away([self._file], problem)
+            # With a full disk the learner goes on with what was read, and says so.
+            self.keep(samples, None if mae is None else data)
+            if old and not self.trouble:
+                self._put_away(old, problem)
+        except OSError as error:
+            raise StateError(f'{self.directory}: cannot be used ({error})') from error
+        return mae
+
+    def _read(self, samples: SampleStore) -> tuple[str, bytes | None]:
+        """Read the file; return what is wrong with it, or '', and the checkpoint."""
+        problem, data, records = '', None, []
+        try:
+            if self._connection is None:
+                raise sqlite3.DatabaseError('not a database')
+            for checksum, checkpoint in self._connection.execute('SELECT * FROM network'):
+                if zlib.crc32(checkpoint) == checksum:
+                    data = checkpoint
+                else:
+                    problem = f'{self._file}: the saved network is damaged'
+            records = [record for _, record in self._connection.execute(SAMPLES)]
+            ((said,),) = self._connection.execute('PRAGMA integrity_check(1)')
+            if said != 'ok':
+                raise sqlite3.DatabaseError(said)
+        except (sqlite3.Error, TypeError, ValueError) as error:
+            problem, records = f'{self._file}: damaged ({error})', self._salvaged()
+        for record in records:
+            self._restore(record, samples)
+        if records and not samples:
+            problem = f'{self._file}: made by a learner of other joints and muscles'
+        return problem, data
+
+    def _salvaged(self) -> list[bytes]:
+        """Return what looks like a record of ours, wherever it is in the file."""
+        data, size = self._file.read_bytes(), HEAD.size + 8 * self._width
+        places = (match.start() for match in re.finditer(re.escape(MARK), data))
+        records = {data[place : place + size] for place in places}
+        return sorted(records, key=lambda record: HEAD.unpack_from(record.ljust(HEAD.size))[2])
+
+    @property
+    def _width(self) -> int:
+        return self._robot.joint_count + 4 * self._robot.muscle_count
+
+    def _restore(self, record: bytes, samples: SampleStore) -> None:
+        if len(record) != HEAD.size + 8 * self._width:
+            return
+        _, checksum, number = HEAD.unpack_from(record)
+        payload = record[HEAD.size :]
+        if checksum != self._checksum(number, payload):
+            return
+        joints, muscles = self._robot.joint_count, self._robot.muscle_count
+        *parts, known = np.split(np.frombuffer(payload), joints + muscles * np.arange(4))
+        if number in samples.numbers:  # an older copy, salvaged: what was forgotten stays so
+            samples.known[samples.numbers.index(number)] &= known > 0.5
+        else:
+            samples.add(Sample(*(part.copy() for part in parts)), known > 0.5, number)
+
+    # -- writing --------------------------------------------------------------------------------
+
+    def _checksum(self, number: int, payload: bytes) -> int:
+        return zlib.crc32(number.to_bytes(8, 'little') + payload, zlib.crc32(self._names.encode()))
+
+    def _records(self, samples: SampleStore) -> dict[int, bytes]:
+        records = {}
+        for number, sample, known in zip(
+            samples.numbers, samples.samples, samples.known, strict=True
+        ):
+            payload = np.concatenate([*sample, known]).astype('<f8').tobytes()
+            head = HEAD.pack(MARK, self._checksum(number, payload), number)
+            records[number] = head + payload
+        return records
+
+    def keep(self, samples: SampleStore, checkpoint: bytes | None, at_once: bool = False) -> None:
+        """Bring the disk in line with memory; it is on return, or there is `trouble`.
+
+        Args:
+            samples: All samples.
+            checkpoint: The newest network; None for none.
+            at_once: In trouble too, not only some time after the last attempt.
+        """
+        if self.trouble and not at_once and time.monotonic() < self._next_look:
+            return
+        try:
+            self._look()
+            if self._connection is None:
+                self._open()
+            assert self._connection is not None
+            self._write(self._connection, samples, checkpoint)
+            self.trouble = ''
+        except (OSError, sqlite3.Error) as error:
+            self._failed(error)
+
+    def poll(self, samples: SampleStore, checkpoint: bytes | None) -> None:
+        """Look now and then whether the file is still there; mend what is amiss."""
+        if time.monotonic() < self._next_look:
+            return
+        self._next_look = time.monotonic() + LOOK
+        try:
+            self._look()
+        except OSError as error:
+            self._failed(error)
+        if self.trouble:
+            self.keep(samples, checkpoint)
+
+    def _look(self) -> None:
+        if self._connection is not None and self._identity() != self._opened:
+            raise FileNotFoundError(f'{self._file} was replaced')
+        if self.directory.exists() and not os.access(self.directory, os.W_OK):
+            raise PermissionError(f'{self.directory} is read-only')
+
+    def _failed(self, error: Exception) -> None:
+        self.close()
+        self.trouble = f'samples and network cannot be saved: {error}'
+        self._next_look = time.monotonic() + PAUSE
+        if type(error) is sqlite3.DatabaseError:  # the file itself is damaged
+            with suppress(OSError):
+                self._put_away([self._file], str(error))
+
+    def _write(
+        self, connection: sqlite3.Connection, samples: SampleStore, checkpoint: bytes | None
+    ) -> None:
+        with connection:  # commits, or rolls back
+            connection.execute('BEGIN IMMEDIATE')
+            for table in TABLES:
+                connection.execute(table)
+            wanted, stored = self._records(samples), dict(connection.execute(SAMPLES))
+            gone = [(n,) for n, record in stored.items() if wanted.get(n) != record]
+            new = [(n, record) for n, record in wanted.items() if stored.get(n) != record]
+            connection.executemany('DELETE FROM sample WHERE number = ?', gone)
+            connection.executemany('INSERT INTO sample VALUES (?, ?)', new)
+            network = [] if checkpoint is None else [(zlib.crc32(checkpoint),)]
+            if network != list(connection.execute('SELECT checksum FROM network')):
+                connection.execute('DELETE FROM network')
+                connection.executemany(
+                    'INSERT INTO network VALUES (?, ?)', [(*row, checkpoint) for row in network]
+                )
+
+    # -- backups --------------------------------------------------------------------------------
+
+    def back_up(self, samples: SampleStore, checkpoint: bytes | None) -> None:
+        """Make a backup of what is in memory, before that is replaced.
+
+        Raises:
+            StateError: If the disk is full or gone; nothing is changed then.
+        """
+        backup = self._next_backup()
+        unfinished = backup.with_suffix('.tmp')
+        try:
+            unfinished.mkdir()
+            with closing(_connect(unfinished / FILE)) as connection:
+                self._write(connection, samples, checkpoint)
+            unfinished.rename(backup)
+            _sync(self.directory)
+        except (OSError, sqlite3.Error) as error:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise StateError(f'{self.directory}: no backup can be made ({error})') from error
+
+    def _next_backup(self) -> Path:
+        number = 1
+        while (backup := self.directory / f'backup-{number}').exists():
+            number += 1
+        return backup
+
+    def _put_away(self, files: list[Path], problem: str) -> None:
+        """Move files into a backup."""
+        self.close()
+        backup = self._next_backup()
+        backup.mkdir()
+        for file in files:
+            file.rename(backup / file.name)
+        _sync(backup)
+        _sync(self.directory)
+        if problem:
+            self.not_used = f'{problem} (kept in {backup})'
+
+    def close(self) -> None:
+        """Release the directory; all is on disk already."""
+        if self._connection is not None:
+            with suppress(sqlite3.Error):
+                self._connection.close()
+            self._connection = None
+
+
+def _connect(file: Path) -> sqlite3.Connection:
+    """Open a database for this process alone."""
+    connection = sqlite3.connect(file, timeout=0.0, check_same_thread=False)
+    try:
+        for setting in ('locking_mode=EXCLUSIVE', 'synchronous=EXTRA', 'secure_delete=ON'):
+            connection.execute(f'PRAGMA {setting}')
+        connection.execute('BEGIN EXCLUSIVE')
+        connection.rollback()  # the lock stays, and nothing is written
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _sync(directory: Path) -> None:
+    """Let names in a directory survive a power cut."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

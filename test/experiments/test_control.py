@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's control protocol on a small arm without mismatch: who comes nearer, and how taut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.control_nominal import nominal_arm, nominal_tables
+from musculoskeletal_ae.experiments.control import METHODS, holdable_postures, protocol
+
+
+def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm26, networks):
+    ended = protocol(nominal_arm(arm26), networks, seed=0, count=1)
+    error = {name: np.linalg.norm(offset) for name, offset in ended.offset.items()}
+    assert set(error) == set(METHODS)
+    assert error['proposed'] < 0.1
+    assert error['proposed'] < error['first']
+    assert ended.tension['proposed'].mean() == pytest.approx(ended.bound.mean(), rel=0.15)
+
+
+def test_a_posture_at_the_target_needs_the_bound(arm26, networks):
+    """Where an arm came close to θ_eval, holding it there takes what holding θ_eval takes."""
+    ended = protocol(nominal_arm(arm26), networks, seed=0, count=1)
+    assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
+
+
+def test_holdable_postures_are_held_by_their_tensions(arm26):
+    arm = nominal_arm(arm26)
+    for theta, tension in holdable_postures(arm26, arm.individual, 5, np.random.default_rng(0)):
+        jacobian = arm.individual.muscle_jacobian(theta[None])[0]
+        exerted = -jacobian.T @ tension
+        np.testing.assert_allclose(exerted, arm26.kinematics.holding_torque(theta), atol=1e-4)
+        assert (tension > arm26.tension.bias - 1e-6).all()
+        assert (tension < arm26.tension.limit + 1e-6).all()
+
+
+def test_the_table_of_the_nominal_body_names_every_method(arm26, networks):
+    table = nominal_tables(arm26, networks['default'], networks['paper'], quick=True)
+    for word in ('bound', 'proposed, paper', 'second', 'stiffness', 'torque'):
+        assert word in table

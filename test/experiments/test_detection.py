@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The script of grasps and cuts, and how alarms and scores are counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.experiments.detection import (
+    CARRYING,
+    CUT_TIME,
+    LATEST_CUT,
+    PAYLOAD,
+    SLOT,
+    GraspAndCut,
+    Watched,
+    alarms_begun,
+    auroc,
+    detection,
+    grasp_and_release,
+)
+
+
+class Fake:
+    """Records what a script does to an arm whose muscles all pull alike."""
+
+    def __init__(self, robot, tension):
+        self.time, self.done = 0.0, []
+        self.tension = np.full(robot.muscle_count, tension)
+
+    def set_payload(self, mass):
+        self.done.append((self.time, mass))
+
+    def set_ruptured(self, names):
+        self.done.append((self.time, tuple(names)))
+
+    def follow(self, script, duration):
+        for tick in range(round(duration / 0.01)):
+            self.time = 0.01 * tick
+            script(self, self.time)
+
+
+def test_grasp_comes_midway_and_every_muscle_is_cut_once_and_mended(arm26):
+    plan = GraspAndCut(arm26, 4.0, seed=0)
+    arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
+    arm.follow(plan, plan.duration)
+    assert [time for time, what in arm.done if what == PAYLOAD] == [2.0]
+    cuts = [what for what in arm.done if isinstance(what[1], tuple)]
+    assert sorted(names[0] for _, names in cuts if names) == sorted(arm26.muscles)
+    assert plan.carried.all()
+    assert plan.order[0] == 1  # the muscle that the paper deactivates
+    for (cut, names), (mended, none) in zip(cuts[::2], cuts[1::2], strict=True):
+        assert names and not none
+        assert mended - cut == pytest.approx(CUT_TIME, abs=0.02)
+        assert (cut - 4.0) // SLOT == (mended - 4.0) // SLOT
+
+
+def test_a_muscle_that_never_carries_tension_is_cut_at_the_end_of_its_wait(arm26):
+    plan = GraspAndCut(arm26, 4.0, seed=0)
+    Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
+    assert not plan.carried.any()
+    np.testing.assert_allclose((plan.cut - 4.0) % SLOT, LATEST_CUT, atol=0.011)
+    assert plan.counted.tolist() == list(range(arm26.muscle_count))  # rather all than none
+
+
+def test_the_weight_is_grasped_and_released_every_minute(arm26):
+    arm = Fake(arm26, 0.0)
+    arm.follow(grasp_and_release, 181.0)
+    assert arm.done == [(0.0, 0.0), (60.0, PAYLOAD), (120.0, 0.0), (180.0, PAYLOAD)]
+
+
+def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, networks):
+    plan = GraspAndCut(arm26, 4.0, seed=0)
+    count, muscles = round(plan.duration / 0.01), arm26.muscle_count
+    plan.cut, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
+    alarm, suspect = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
+    starts = np.round(plan.cut / 0.01).astype(int)
+    alarm[starts[0] + 9 : starts[0] + 20] = True  # noticed after 0.1 s, named rightly
+    alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, and muscle 0 is named
+    alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
+    seen = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
+    well = Watched(*(np.zeros(5, dtype=bool) for _ in range(5)))
+    numbers = detection(arm26, plan, seen, well, networks['default'])
+    cuts = list(numbers['cuts'].values())
+    assert [cut['detected'] for cut in cuts[:3]] == [True, True, False]
+    assert [cut['named'] for cut in cuts[:3]] == [True, False, False]
+    assert [cut['detection_s'] for cut in cuts[:3]] == pytest.approx([0.1, 0.2, CUT_TIME])
+    assert numbers['detected_share'] == pytest.approx(2.0 / muscles)
+    assert numbers['false_alarms'] == 0 and numbers['false_alarms_beside_cuts'] == 1
+
+
+def test_auroc_is_the_share_of_pairs_in_the_right_order():
+    assert auroc(np.array([0.0, 1.0]), np.array([2.0, 3.0])) == 1.0
+    assert auroc(np.array([2.0, 3.0]), np.array([0.0, 1.0])) == 0.0
+    assert auroc(np.array([1.0, 3.0]), np.array([2.0])) == 0.5
+    assert auroc(np.array([1.0]), np.array([1.0])) == 0.5
+
+
+def test_alarms_are_counted_when_they_begin():
+    assert alarms_begun(np.array([True, True, False, True, False, False, True, True])) == 3
+    assert alarms_begun(np.zeros(5, dtype=bool)) == 0
+    assert alarms_begun(np.zeros(0, dtype=bool)) == 0

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has to hold for the comparison to be fair: same motion, same stream, same seeds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.online_learning import (
+    Curve,
+    exponential_fit,
+    measure,
+    samples_to_halve,
+)
+from musculoskeletal_ae.experiments.recording import HELD_OUT_STREAM, record
+from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.presets import PRESETS
+
+
+@pytest.fixture(scope='module')
+def twice(tmp_path_factory, networks):
+    """The same individual measured twice, in different folders."""
+    measured = []
+    for _ in range(2):
+        study = Study('arm26', 'default', (0,), 0.25, True, tmp_path_factory.mktemp('study'))
+        for preset, mae in networks.items():
+            checkpoint.save(mae, study.network_file(preset, None))
+        done: list[float] = []
+        measured.append((study, measure(study, 0, done.append)))
+        assert sum(done) <= 1.0
+    return measured
+
+
+def test_the_same_seed_gives_the_same_numbers_and_networks(twice, arm26):
+    (one, first), (two, second) = twice
+    assert first.numbers == second.numbers
+    for preset in PRESETS:
+        networks = [study.learned(arm26, 0, preset) for study in (one, two)]
+        for layer in range(len(networks[0].decoder)):
+            weights = [network.decoder[layer][0] for network in networks]
+            np.testing.assert_array_equal(*weights)
+
+
+def test_both_presets_learn_and_from_the_same_stream(twice, arm26):
+    (study, measured), _ = twice
+    assert measured.numbers['samples'] == measured.numbers['paper_samples'] > 0
+    assert measured.numbers['updates'] > 0
+    changed = study.learned(arm26, 0).decoder[0][0] - study.initial(arm26).decoder[0][0]
+    assert np.abs(changed).max() > 0.0
+
+
+def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice, arm26):
+    (study, _), _ = twice
+    other = record(EmulatedArm(arm26, 1), study.initial(arm26), HELD_OUT_STREAM, 20.0)
+    one = study.stream(0, 'held_out')
+    # The first ramp starts where each arm hangs; from the second goal on they are one list.
+    start = 500
+    np.testing.assert_array_equal(one.command[start:], other.command[start:])
+    assert np.abs(one.theta - other.theta).max() > 1e-3  # but they are other arms
+
+
+def test_the_held_out_motion_is_not_the_one_learned_from(twice):
+    (study, _), _ = twice
+    learned, held_out = (study.stream(0, name).command for name in ('exploring', 'held_out'))
+    assert np.abs(learned[499] - held_out[499]).max() > 1e-3
+
+
+def test_the_fit_finds_an_exponential():
+    time = 0.01 * np.arange(60_000)
+    error = 0.15 + 0.17 * np.exp(-time / 90.0)
+    np.testing.assert_allclose(exponential_fit(time, error), error, atol=1e-6)
+
+
+def test_the_error_counts_as_halved_once_it_stays_below():
+    samples, none = [0, 5, 10, 15], np.zeros(0)
+    assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.6, 0.3], none)) == 15
+    assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.3, 0.2], none)) == 5
+    assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.3, 0.6], none)) is None
+    assert samples_to_halve(Curve([0], [math.e], none)) is None

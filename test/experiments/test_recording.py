@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Driving an arm through commands, and what a script may do on the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.recording import (
+    SAMPLE_TIME,
+    frictionless,
+    record,
+    rows_between,
+    times,
+)
+
+
+@pytest.fixture(scope='module')
+def mae(networks):
+    return networks['default']
+
+
+@pytest.fixture(scope='module')
+def plain(arm26, mae):
+    return record(EmulatedArm(arm26, 3), mae, 7, 8.0)
+
+
+def test_it_lasts_for_whole_steps_and_rests_at_the_end_of_each(plain):
+    assert len(plain.theta) == round(10.0 / SAMPLE_TIME)  # 5 s + 2 s are too short for 8 s
+    for end in (5.0, 7.0, 10.0):
+        commands = plain.command[rows_between(end - 0.5, end)]
+        np.testing.assert_array_equal(commands, np.broadcast_to(commands[0], commands.shape))
+
+
+def test_a_script_that_does_nothing_changes_nothing_and_is_told_every_step(arm26, mae, plain):
+    told = []
+
+    def script(arm, time):
+        assert isinstance(arm, EmulatedArm)
+        told.append(time)
+
+    recording = record(EmulatedArm(arm26, 3), mae, 7, 8.0, script)
+    for ours, theirs in zip(recording, plain, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(told, times(len(plain.theta)))
+
+
+def test_a_script_changes_the_arm_from_its_moment_on(arm26, mae, plain):
+    def load(arm, time):
+        if time == 2.0:
+            arm.set_payload(3.6)
+
+    loaded = record(EmulatedArm(arm26, 3), mae, 7, 8.0, load)
+    before, after = rows_between(0.0, 2.0), rows_between(2.0, 5.0)
+    np.testing.assert_array_equal(loaded.theta[before], plain.theta[before])
+    assert np.abs(loaded.theta[after] - plain.theta[after]).max() > 0.01
+    np.testing.assert_array_equal(loaded.command, plain.command)
+
+
+def test_without_friction_it_is_the_same_body_otherwise(arm26):
+    smooth, rubbing = frictionless(arm26, 3).individual, EmulatedArm(arm26, 3).individual
+    assert not smooth.cable_friction.any() and not smooth.joint_friction.any()
+    assert rubbing.cable_friction.all() and rubbing.joint_friction.all()
+    theta = arm26.random_postures(3, np.random.default_rng(0))
+    np.testing.assert_array_equal(smooth.absolute_lengths(theta), rubbing.absolute_lengths(theta))

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The README's results table is what its command makes of the committed results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.results import read
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS
+from musculoskeletal_ae.experiments.table import (
+    BEGIN,
+    END,
+    KEPT,
+    ROWS,
+    markdown,
+    update_readme,
+)
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def test_the_readme_says_what_the_committed_results_say():
+    text = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    between = text.split(BEGIN)[1].split(END)[0]
+    expected = markdown(read(REPOSITORY / KEPT))
+    remedy = 'run: python -m musculoskeletal_ae.experiments.table README.md'
+    assert between == f'\n{expected}\n', remedy
+
+
+def test_committed_results_are_of_full_runs_of_every_experiment():
+    results = read(REPOSITORY / KEPT)
+    assert set(results) == set(EXPERIMENTS)
+    for name, result in results.items():
+        assert not result['about']['quick'], name
+        assert len(result['about']['seeds']) >= 5, name
+
+
+@pytest.mark.parametrize('row', ROWS, ids=lambda row: row.quantity)
+def test_every_row_is_filled_from_the_committed_results(row):
+    results = read(REPOSITORY / KEPT)
+    for key in filter(None, (row.paper, row.default, row.bound)):
+        assert row.number(results, key) is not None, key
+
+
+def test_a_row_of_the_worst_individual_shows_the_largest_of_them():
+    (row,) = [row for row in ROWS if row.worst]
+    seeds = {'0': {row.default: 0.2}, '1': {row.default: 0.7}}
+    results = {row.experiment: {row.default: 0.45, 'seeds': seeds}}
+    assert row.number(results, row.default) == 0.7
+
+
+def test_a_run_is_kept_and_its_table_written(quick, tmp_path):
+    readme = tmp_path / 'README.md'
+    readme.write_text(f'before\n{BEGIN}\nlast year\n{END}\nafter\n', encoding='utf-8')
+    files = update_readme(readme, quick)
+    assert (tmp_path / KEPT / 'control' / 'result.json') in files
+    text = readme.read_text(encoding='utf-8')
+    assert text.startswith('before\n') and text.endswith('\nafter\n')
+    assert 'last year' not in text
+    assert text.count('\n| ') == 1 + len(ROWS)
+    assert update_readme(readme) == [readme]
+    assert readme.read_text(encoding='utf-8') == text
+
+
+def test_a_readme_without_markers_is_left_alone(tmp_path):
+    readme = tmp_path / 'README.md'
+    readme.write_text('no place', encoding='utf-8')
+    with pytest.raises(MusculoskeletalError, match='results'):
+        assert update_readme(readme) == [readme]
+    assert readme.read_text(encoding='utf-8') == 'no place'
+
+
+def test_aims_are_judged_in_the_right_direction():
+    after = next(r for r in ROWS if r.default == 'after_rad' and r.experiment == 'online_learning')
+    named = next(r for r in ROWS if r.default == 'named_share')
+    good = {'online_learning': {'after_rad': 0.08}, 'estimation': {'named_share': 0.95}}
+    bad = {'online_learning': {'after_rad': 0.13}, 'estimation': {'named_share': 0.5}}
+    assert [row.verdict(good) for row in (after, named)] == ['met', 'met']
+    assert after.verdict(bad) == 'missed by 0.030'
+    assert named.missed(bad) == pytest.approx(0.4)
+    assert after.verdict({}) == ''

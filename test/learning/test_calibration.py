@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The detector is calibrated on what is healthy, and on nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.learning.calibration import (
+    GLITCHES,
+    LEAST_SAMPLES,
+    LEAST_TIME,
+    Healthy,
+    Reservoir,
+    calibrate,
+    distances,
+)
+from musculoskeletal_ae.mae.residuals import residuals
+
+from .conftest import Stage, job
+
+
+def test_the_detector_is_calibrated_only_with_enough_healthy_data(learned):
+    _, updater, store, stage = learned
+    few = updater.update(job(store, stage.messages(100), LEAST_TIME - 1.0, 1)).mae.anomaly
+    assert not few.calibrated
+    enough = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
+    assert enough.anomaly.calibrated
+    kept = updater.update(job(store, stage.messages(10), 1.0, 1)).mae.anomaly
+    assert kept.calibrated  # as after a restart, whose messages are few
+    lost = updater.update(job(store, stage.messages(10), 1.0, 1, hold=False)).mae.anomaly
+    assert not lost.calibrated  # after a muscle was replaced
+
+
+def test_one_posture_is_not_enough_for_a_detector(learned):
+    _, updater, store, stage = learned
+    seen = stage.messages(600)
+    few = updater.update(job(store, seen, LEAST_TIME, 1, rests=LEAST_SAMPLES - 1)).mae
+    assert not few.anomaly.calibrated
+
+
+def test_the_statistics_of_many_rests_are_kept_until_there_are_as_many_again(learned):
+    _, updater, store, stage = learned
+    before = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae.anomaly
+    assert before.calibrated
+    after = updater.update(job(store, stage.messages(600), LEAST_TIME, 1, rests=1)).mae.anomaly
+    assert after is before
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_glitch_does_not_spoil_the_detector(learned, seed):
+    mae, _, _, stage = learned
+    seen = Stage(stage.body, seed).messages(1000)
+    clean = calibrate(mae, Healthy(seen, LEAST_TIME, 50), 50)
+    for row in range(int(GLITCHES * len(seen))):
+        seen[100 * row + 7, 6 + row] += 0.2
+    spoilt = calibrate(mae, Healthy(seen, LEAST_TIME, 50), 50)
+    assert clean.samples == 1000
+    assert spoilt.samples == 1000 - int(GLITCHES * len(seen))
+    for name, threshold in clean.thresholds.items():
+        assert spoilt.thresholds[name] == pytest.approx(threshold, rel=0.02)
+
+
+def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(learned):
+    _, updater, store, stage = learned
+    mae = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
+
+    def distance(tension, length):
+        return distances(mae.anomaly, residuals(mae.estimate(tension, length), tension, length))
+
+    _, tension, length = stage.states(2000)
+    threshold = mae.anomaly.thresholds[DISTANCE]
+    assert distance(tension, length).max() < threshold
+    cut = distance(tension * (np.arange(6) != 2), length - 0.1 * (np.arange(6) == 2))
+    assert cut.min() > threshold
+
+
+def test_the_reservoir_is_a_uniform_draw_of_bounded_size():
+    reservoir = Reservoir(1, capacity=200)
+    for n in range(4000):
+        reservoir.step(np.array([float(n)]), np.zeros(1), 0.1)
+    kept = reservoir.healthy().messages[:, 0]
+    assert len(kept) == 200
+    assert abs(kept.mean() - 2000.0) < 400.0
+    assert reservoir.time == pytest.approx(400.0)

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning from the shipped recordings, and `train --from-bag`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.train import main
+from musculoskeletal_ae.tools.train_from_bag import error, learn, read
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('musashi_left_arm')
+
+
+def part(recording, start, end):
+    inside = (recording.time >= start) & (recording.time < end)
+    return Pairs(*(column[inside] for column in recording))
+
+
+def test_what_is_learned_from_one_recording_improves_another(robot):
+    exploration = part(read(BAGS / 'exploration', robot), 0.0, 40.0)
+    other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the muscle is cut later
+    mae = initial_mae(robot, steps=600).mae
+    learner = Learner(robot, mae)
+    told = []
+    learn(learner, exploration, told.append)
+    assert sum(told) == pytest.approx(exploration.time[-1] - exploration.time[0])
+    assert learner.updates > 0
+    assert error(learner.mae, other) < 0.6 * error(mae, other)
+
+
+def test_the_faults_of_a_recording_are_left_out_and_said(robot, capsys):
+    recording = read(BAGS / 'faults', robot)
+    assert len(recording.time) > 2000
+    said = capsys.readouterr().err
+    assert '2 messages rejected, /muscle_states: not finite' in said
+    assert '/muscle_states: wrong length' in said
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status', 'expected'),
+    [
+        (['--from-bag', '/no/such/bag'], 1, '/no/such/bag'),
+        (['--from-bag', str(BAGS / 'README.md')], 1, 'README.md'),
+        (['--from-bag', str(BAGS / 'rupture'), '--robot', 'arm26'], 1, 'missing joint'),
+        (['--hold-out', str(BAGS / 'rupture')], 2, '--from-bag'),
+    ],
+)
+def test_a_bag_that_cannot_be_learned_from_is_one_clear_error(
+    tmp_path, capsys, arguments, status, expected
+):
+    out = tmp_path / 'out.safetensors'
+    everything = ['--robot', 'musashi_left_arm', '--out', str(out), *arguments, '--quick']
+    if status == 2:
+        with pytest.raises(SystemExit) as ended:
+            main(everything)
+        assert ended.value.code == 2
+    else:
+        assert main(everything) == status
+    assert expected in capsys.readouterr().err
+    assert not out.exists()

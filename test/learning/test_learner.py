@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The learner's story, and its rules on time, which is the caller's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.rest import MARGIN
+from musculoskeletal_ae.learning.training import Training, Update
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+
+DT = 0.01
+
+
+class Prepared(Training):
+    """Answers with the network that it began with, when the test lets it."""
+
+    def __init__(self, *arguments) -> None:
+        super().__init__(*arguments)
+        self.jobs, self.released, self.calibrated, self.changed = [], True, False, ()
+        self._job = None
+
+    def begin(self, mae):
+        self._mae, self._job = mae, None
+
+    @property
+    def ready(self):
+        return self._job is None
+
+    def submit(self, job):
+        self.jobs.append(job)
+        self._job = job
+
+    def poll(self):
+        if self._job is None or not self.released:
+            return None
+        self._job = None
+        statistics = AnomalyStatistics(np.zeros(12), np.eye(12), self.calibrated, 100)
+        from dataclasses import replace
+
+        mae = replace(self._mae, anomaly=statistics)
+        return Update(mae, 0.0, 0.0, np.empty(0), self.changed)
+
+    def close(self):
+        self._job = None
+
+
+@pytest.fixture
+def learner(arm26, initial):
+    return Learner(arm26, initial, training=Prepared)
+
+
+class Arm:
+    """Rests in one posture after another, on a clock of its own."""
+
+    def __init__(self, learner, stage, time=0.0):
+        self.learner, self.stage, self.time, self.published = learner, stage, time, []
+
+    def rest(self, seconds, sample=None):
+        sample = sample or self.stage.sample()
+        for _ in range(round(seconds / DT)):
+            self.time += DT
+            data = self.learner.step(self.time, sample.theta, sample.tension, sample.length)
+            if data is not None:
+                self.published.append(self.time)
+        return sample
+
+
+def test_one_stream_gives_one_network(arm26, initial, stage):
+    rests = [stage.sample() for _ in range(4)]
+    networks = []
+    for _ in range(2):
+        learner = Learner(arm26, initial, steps=3)
+        arm = Arm(learner, stage)
+        for rest in rests:
+            arm.rest(1.1, rest)
+        arm.rest(3.0, rests[0])
+        networks.append(learner.mae)
+        assert learner.updates >= 3
+    np.testing.assert_array_equal(networks[0].encoder[0][0], networks[1].encoder[0][0])
+
+
+def test_a_rest_becomes_one_sample_and_the_next_one_in_its_place_none(learner, stage):
+    arm = Arm(learner, stage)
+    posture = arm.rest(1.0 + MARGIN + 0.5)
+    assert len(learner.samples) == 1
+    arm.rest(5.0, posture)
+    assert len(learner.samples) == 1
+    assert learner.rejected['like a stored one'] > 0
+    arm.rest(1.0 + MARGIN + 0.5)
+    assert len(learner.samples) == 2
+
+
+def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner, stage):
+    learner.accept(stage.sample())
+    for now in np.arange(0.0, 5.0, 0.25):
+        learner.poll(now)
+    assert learner.training.jobs == []  # two samples at least
+    times = []
+    for now in np.arange(5.0, 10.0, 0.25):
+        if now < 6.0:
+            learner.accept(stage.sample())
+        before = len(learner.training.jobs)
+        learner.poll(now)
+        times += [now] * (len(learner.training.jobs) - before)
+    assert times == [5.0, 6.0]
+    assert [len(job.seen) for job in learner.training.jobs] == [2, 5]
+
+
+def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm26, initial, stage):
+    learner = Learner(arm26, initial, 'paper', training=Prepared)
+    for count in range(1, 23):
+        learner.accept(stage.sample())
+        for now in (3.0 * count, 3.0 * count + 1.5):
+            learner.poll(now)
+    assert [len(job.seen) for job in learner.training.jobs] == [21, 22]
+
+
+def test_a_sample_that_comes_during_an_update_is_learned_in_the_next(learner, stage):
+    for _ in range(2):
+        learner.accept(stage.sample())
+    learner.training.released = False
+    learner.poll(0.0)
+    learner.accept(stage.sample())
+    learner.poll(2.0)
+    assert len(learner.training.jobs) == 1
+    learner.training.released = True
+    for now in (3.0, 4.0, 5.0, 6.0):
+        learner.poll(now)
+    assert [len(job.seen) for job in learner.training.jobs] == [2, 3]
+
+
+def test_checkpoints_are_published_once_a_second_the_latest_of_several(learner, initial):
+    assert learner.poll(100.0) is not None
+    learner._use(learner._numbered(initial))
+    learner._use(learner._numbered(initial))
+    assert learner.poll(100.5) is None
+    assert learner.poll(101.0) == learner.checkpoint
+    assert learner.poll(102.0) is None
+    assert learner.published == 2
+
+
+def test_a_clock_that_goes_back_stops_neither_updates_nor_checkpoints(learner, stage):
+    arm = Arm(learner, stage, 1e9)
+    arm.rest(1.5)
+    for _ in range(2):
+        learner.accept(stage.sample())
+        learner.poll(arm.time)
+    learner.accept(stage.sample())
+    jobs, published = len(learner.training.jobs), learner.published
+    arm.time = 0.0
+    arm.rest(0.1)
+    assert len(learner.training.jobs) == jobs + 1
+    assert learner.published == published + 1
+
+
+def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
+    for _ in range(2):
+        learner.accept(stage.sample())
+    learner.anomaly(True)
+    arm = Arm(learner, stage)
+    arm.rest(10.0)
+    assert learner.training.jobs == []
+    assert len(learner.samples) == 2
+    learner.anomaly(False)
+    arm.rest(2.0 * MARGIN + 1.5)
+    assert len(learner.samples) == 3
+    assert learner.training.jobs
+
+
+def test_a_disabled_learner_learns_nothing(learner, stage):
+    for _ in range(2):
+        learner.accept(stage.sample())
+    learner.enable(False)
+    arm = Arm(learner, stage)
+    arm.rest(10.0)
+    assert learner.training.jobs == []
+    assert len(learner.samples) == 2
+    learner.enable(True)
+    arm.rest(MARGIN + 1.5)
+    assert len(learner.samples) == 3
+
+
+def calibrated(learner):
+    return learner.mae.anomaly.calibrated
+
+
+def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learner, stage):
+    for _ in range(3):
+        learner.accept(stage.sample())
+    learner.training.calibrated, learner.training.released = True, False
+    learner.poll(0.0)
+    learner.relearn([2])
+    learner.training.released = True
+    learner.poll(0.5)
+    assert not calibrated(learner)
+    assert not any(known[2] for known in learner.samples.known)
+    learner.poll(1.5)  # begun after the change: its statistics are of the arm as it is
+    assert not learner.training.jobs[-1].statistics_hold
+    assert calibrated(learner)
+
+
+def test_a_changed_muscle_is_relearned_from_the_samples_that_told_of_it(learner, stage):
+    for _ in range(6):
+        learner.accept(stage.sample())
+    learner.training.calibrated, learner.training.changed = True, ((1, 4),)
+    learner.poll(0.0)
+    assert [bool(known[1]) for known in learner.samples.known] == [False] * 2 + [True] * 4
+    assert not calibrated(learner)
+
+
+def test_rests_count_as_often_as_they_differ_since_the_arm_was_changed(learner, stage):
+    arm = Arm(learner, stage)
+    for _ in range(3):
+        posture = arm.rest(1.5)
+    arm.rest(MARGIN, posture)
+    for _ in range(2):
+        learner.poll(arm.time)
+        arm.rest(1.0, posture)
+    assert learner.training.jobs[-1].healthy.rests == len(learner.samples) >= 3
+    learner.relearn([0])
+    arm.rest(2.0 + MARGIN, posture)
+    assert learner.training.jobs[-1].healthy.rests <= 1
+
+
+def test_a_replaced_network_starts_anew_and_counts_on(learner, initial, stage):
+    for _ in range(3):
+        learner.accept(stage.sample())
+    version = learner.mae.version
+    learner.replace(initial)
+    assert len(learner.samples) == 0
+    assert learner.mae.version == version + 1
+    assert learner.poll(0.0) == learner.checkpoint  # at once
+    learner.replace(None)
+    assert learner.checkpoint is None
+    learner.accept(stage.sample())
+    assert learner.poll(5.0) is None

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network follows the body, and the paper what it prints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.learning.paper import PaperUpdater
+from musculoskeletal_ae.learning.training import Training, learned_steps, make_updater
+from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.presets import PAPER
+
+from .conftest import Stage, drawn_body, job
+
+
+def error(mae, theta, tension, length):
+    return float(np.linalg.norm(mae.estimate(tension, length).theta - theta, axis=1).mean())
+
+
+def test_twenty_samples_halve_the_error(learned, initial):
+    mae, _, _, stage = learned
+    states = stage.states(1000)
+    assert error(mae, *states) < 0.5 * error(initial, *states)
+
+
+def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
+    mae, updater, store, stage = learned
+    states = stage.states(1000)
+    before = error(mae, *states)
+    newest = stage.sample()
+    for _ in range(10):
+        store.add(newest)
+    for _ in range(3):
+        update = updater.update(job(store))
+    assert error(update.mae, *states) < 1.2 * before
+
+
+def test_a_changed_muscle_is_noticed_unasked(arm26, initial, stage):
+    updater, store = BodyUpdater(arm26, initial), stage.store(20)
+    assert updater.update(job(store, steps=1)).changed == ()
+    for _ in range(5):
+        sample = stage.sample()
+        shift = 0.01 * (np.arange(6) == 3)
+        store.add(sample._replace(length=sample.length + shift))
+    assert updater.update(job(store, steps=1)).changed == ((3, 5),)
+
+
+def test_a_slipped_joint_sensor_reopens_no_muscle(arm26, initial, stage):
+    updater, store = BodyUpdater(arm26, initial), stage.store(20)
+    updater.update(job(store, steps=1))
+    for _ in range(4):
+        sample = stage.sample()
+        store.add(sample._replace(theta=sample.theta + np.array([0.15, 0.0])))
+    update = updater.update(job(store, steps=1))
+    assert update.changed == ()
+    assert len(update.contradicted) > 1
+
+
+def test_preset_paper_takes_its_hundred_steps(arm26, initial, stage):
+    updater = PaperUpdater(arm26, initial)
+    store = stage.store(PAPER.least_samples)
+    states = stage.states(500)
+    for _ in range(10):
+        update = updater.update(job(store))
+    assert error(update.mae, *states) < error(initial, *states)
+    assert f'preset paper, {10 * 100} steps' in update.mae.training
+
+
+def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26, initial, stage):
+    updater = PaperUpdater(arm26, initial)
+    store = stage.store(30)
+    store.forget(1, 5)
+    update = updater.update(job(store))
+    np.testing.assert_array_equal(update.mae.encoder[0][0], initial.encoder[0][0])
+    for _ in range(PAPER.least_samples - 5):
+        store.add(stage.sample())
+    update = updater.update(job(store))
+    assert (update.mae.encoder[0][0] != initial.encoder[0][0]).any()
+
+
+def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26, initial):
+    with pytest.raises(MusculoskeletalError, match='default, paper'):
+        make_updater(arm26, initial, 'best')
+    with pytest.raises(MusculoskeletalError, match='default, paper'):
+        Training(arm26, 'best')
+
+
+def test_a_learned_network_without_its_samples_is_not_forgotten(learned, arm26):
+    mae, _, _, stage = learned
+    states = stage.states(1000)
+    before = error(mae, *states)
+    updater = BodyUpdater(arm26, mae)
+    store = stage.store(2)
+    for _ in range(3):
+        update = updater.update(job(store))
+        store.add(stage.sample())
+    assert error(update.mae, *states) < 1.2 * before
+
+
+def test_a_learner_that_starts_again_goes_on_as_calmly_as_it_was(learned, arm26):
+    mae, _, store, stage = learned
+    assert learned_steps(mae) == 6 * 60
+    states = stage.states(1000)
+    again = BodyUpdater(arm26, mae)
+    for _ in range(2):
+        update = again.update(job(store))
+    assert error(update.mae, *states) < 1.1 * error(mae, *states)
+    assert learned_steps(update.mae) == learned_steps(mae) + 2 * 60
+
+
+def test_a_network_of_another_arm_is_learned_anew_as_fast_as_one_of_geometry(
+    learned, arm26, initial
+):
+    stage = Stage(drawn_body(arm26, 8, 5, 1.0))
+    states = stage.states(1000)
+    store = stage.store(20)
+    ends = []
+    for start in (learned[0], initial):
+        updater = BodyUpdater(arm26, start)
+        for _ in range(6):
+            update = updater.update(job(store))
+        ends.append(error(update.mae, *states))
+    assert ends[0] < 1.3 * ends[1]
+
+
+def test_a_network_of_geometry_brings_no_body(arm26, initial):
+    assert learned_steps(initial) == 0
+    body = BodyUpdater(arm26, initial).body
+    assert all((parameters == 0.0).all() for parameters in body.parameters)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m bench` lists and starts what is there."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from bench.__main__ import benches, main
+
+# Measured for the README; a bench that loses its main would leave the list without a word.
+NAMED = {'calibration', 'control_nominal', 'fuzz', 'kills', 'simulation_nominal', 'soak', 'timings'}
+
+
+def test_every_bench_is_listed_with_what_it_measures(capsys):
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert set(benches()) >= NAMED
+    for name, text in benches().items():
+        assert any(line.startswith(name) and line.endswith(text) for line in lines) and text
+
+
+def test_every_bench_is_explained():
+    text = (Path(__file__).parents[1] / 'bench' / 'README.md').read_text(encoding='utf-8')
+    assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
+
+
+@pytest.mark.parametrize('name', benches())
+def test_every_bench_has_help(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f'bench.{name}').main(['--help'])
+    assert ended.value.code == 0
+    assert 'usage' in capsys.readouterr().out
+
+
+def test_an_unknown_bench_ends_with_status_2(capsys):
+    assert main(['speed']) == 2
+    assert 'calibration' in capsys.readouterr().err
+
+
+def test_options_and_status_are_handed_through(monkeypatch):
+    given = []
+
+    def fuzz(argv):
+        given.append(argv)
+        return 3
+
+    monkeypatch.setattr('bench.fuzz.main', fuzz)
+    assert main(['fuzz', '--count', '5']) == 3
+    assert given == [['--count', '5']]
