@@ -98,11 +98,10 @@ def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
     assert predicted.max() > 1.2  # and not because both are one
 
 
-def test_a_stiffer_body_with_friction_is_turned_less(trained):
-    arm26 = Robot.load('arm26')
-    # Large against friction; the shoulder alone, whose stiffness differs by a tenth.
-    measured, predicted = stiffness_ratios(
-        arm26, trained['default'], 1, EmulatedArm(arm26, 1), push=3.0
-    )[0]
-    assert predicted > 1.05
-    assert measured > 1.05
+def test_bodies_with_friction_are_turned_less_where_they_are_to_be_stiffer(robot, mae):
+    # A push that is large against friction; single arms scatter by 0.1 about the prediction.
+    arms = [EmulatedArm(robot, seed) for seed in range(4)]
+    ratios = [stiffness_ratios(robot, mae, 2, arm, push=3.0)[1] for arm in arms]
+    measured, predicted = np.mean(ratios, axis=0)
+    assert predicted > 1.25
+    assert measured == pytest.approx(predicted, abs=0.2)
