@@ -18,23 +18,12 @@ from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, exit_status
-from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
-from musculoskeletal_ae.robot.picture import Line, save_picture
+from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
-BONE_COLOUR = (0.75, 0.75, 0.7)
 LOAD = -50.0  # [N] in z, as in the paper's simulation
-
-
-def lines(drawing: Drawing) -> list[Line]:
-    """Return the lines of an arm as a picture wants them."""
-    muscles = zip(drawing.muscles, drawing.colours.tolist(), strict=True)
-    return [Line(bone, BONE_WIDTH, BONE_COLOUR) for bone in drawing.bones] + [
-        Line(muscle, MUSCLE_WIDTH, tuple(colour)) for muscle, colour in muscles
-    ]
 
 
 def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
@@ -56,14 +45,14 @@ def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
     ):
         simulated.wrench = np.array([[0.0, 0.0, force, 0.0, 0.0, 0.0]])
         state = simulated.settle()
-        drawing = draw_arm(robot, state.theta[0], state.tension[0])
+        lines = draw_arm(robot, state.theta[0], state.tension[0])
         title = (
             f'simulated arm, {load}: '
             f'{state.tension.min():.0f} to {state.tension.max():.0f} N '
             '(green at bias, red at the limit)'
         )
         files.append(folder / f'sim_{name}.png')
-        save_picture(lines(drawing), files[-1], title)
+        save_picture(lines, files[-1], title)
     return files
 
 

@@ -4,23 +4,25 @@
     python -m bench simulation_nominal --checkpoint FILE [--robot NAME|DIR] [--preset …] [--quick]
 
 (Paper, section "Simulation".) On a network trained on the geometric model, against that model as a
-body: the emulated arm without individual differences and friction. `compare` puts simulator and any
-emulated arm under the same commands.
+body: the emulated arm without individual differences and friction, and the equations of its rest,
+
+    T = T_bias + max(0, K_stiff (l(θ, T) − l_target)),   g(θ) − JᵀF + Gᵀ T = τ_stop
+
+which, unlike the emulated arm, can hold joints fast.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.sim_responses import FLEXED, FORCED, print_responses
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.mechanics import STOP_STIFFNESS
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -32,13 +34,11 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 STEP = 0.01  # [s]
 STILL = 1e-4  # [rad/s]
 LONGEST_WAIT = 20.0  # [s]
-
-
-class Distance(NamedTuple):
-    """Mean over samples of ‖θ_sim − θ‖₂ [rad] and ‖T_sim − T‖₂ [N]."""
-
-    theta: float
-    tension: float
+TENSION_UNIT = 100.0  # [N] per unknown, so that all are of one size
+FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
+FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
+#: a joint has to move this far in the body before its direction and size are judged
+NOTICEABLE = 0.05  # [rad]
 
 
 def random_commands(robot: Robot, count: int, seed: int) -> Array:
@@ -97,27 +97,128 @@ def rest_errors(
     return np.abs(rest.theta - theta), np.abs(rest.tension - tension), drift, tension_drift
 
 
-def compare(
-    arm: EmulatedArm, simulated: Simulation, commands: Sequence[Array], duration: float
-) -> Distance:
-    """Return how far the simulator is from an arm under the same commands, moving and resting.
+class Rest(NamedTuple):
+    """θ [rad] (D,), T [N] (M,), and the largest residual of the equations."""
+
+    theta: Array
+    tension: Array
+    residual: float
+
+
+def nominal_rest(
+    robot: Robot,
+    command: Array,
+    theta: Array,
+    tension: Array,
+    wrench: Array,
+    fixed: Array,
+) -> Rest:
+    """Return the rest reached from (θ, T).
 
     Args:
-        arm: Any individual.
-        simulated: One simulated arm.
-        commands: l_target [m], each shape (M,).
-        duration: How long each is held [s].
+        robot: The geometric model.
+        command: l_target [m], shape (M,).
+        theta: Where to start [rad], shape (D,).
+        tension: Where to start [N], shape (M,).
+        wrench: On the end effector, axes of the root link, shape (6,).
+        fixed: Angles of joints held fast [rad], shape (D,); nan for a free joint.
     """
-    theta, tension = [], []
-    for command in commands:
-        simulated.command = command[None]
-        for _ in range(round(duration / STEP)):
-            arm.command_length(command)
-            arm.step(STEP)
-            state = simulated.step(STEP)
-            theta.append(np.linalg.norm(state.theta[0] - arm.theta))
-            tension.append(np.linalg.norm(state.tension[0] - arm.tension))
-    return Distance(float(np.mean(theta)), float(np.mean(tension)))
+    from scipy.optimize import least_squares
+
+    free = np.isnan(fixed)
+    posture = np.where(free, theta, fixed)
+    bias, most = robot.tension.bias, robot.tension.max
+    kin = robot.kinematics
+
+    def unpack(unknown: Array) -> tuple[Array, Array]:
+        full = posture.copy()
+        full[free] = unknown[: free.sum()]
+        return full, TENSION_UNIT * unknown[free.sum() :]
+
+    def residual(unknown: Array) -> Array:
+        angles, pull = unpack(unknown)
+        wound = robot.stiffness * (robot.muscle_lengths(angles, pull) - command)
+        msc = pull - np.clip(bias + wound, bias, most)
+        torque = kin.holding_torque(angles) - kin.end_effector_jacobian(angles).T @ wrench
+        torque = torque + robot.routes.muscle_jacobian(angles).T @ pull
+        beyond = angles - np.clip(angles, robot.lower, robot.upper)
+        torque = torque + STOP_STIFFNESS * beyond
+        return np.concatenate([torque[free], msc / TENSION_UNIT])
+
+    start = np.concatenate([posture[free], tension / TENSION_UNIT])
+    solved = least_squares(residual, start, x_scale='jac', max_nfev=500)
+    return Rest(*unpack(solved.x), float(np.abs(solved.fun).max()))
+
+
+class Response(NamedTuple):
+    """How body and simulator answer a push or a forced joint, from the same rest.
+
+    Attributes:
+        name: What was done.
+        body: Δθ of the body [rad], shape (D,).
+        simulated: Δθ of the simulator [rad], shape (D,).
+        body_tension: ΔT of the body [N], shape (M,).
+        simulated_tension: ΔT of the simulator [N], shape (M,).
+    """
+
+    name: str
+    body: Array
+    simulated: Array
+    body_tension: Array
+    simulated_tension: Array
+
+
+def responses(robot: Robot, mae: Mae, preset: str) -> list[Response]:
+    """Return the answers of the geometric model as a body, and of the simulator."""
+    theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
+    theta[robot.joints.index(FLEXED)] = FLEXION
+    jacobian = robot.routes.muscle_jacobian(theta)
+    torque = robot.kinematics.holding_torque(theta)
+    limits = robot.tension
+    tension = holding_tension(jacobian, torque, limits.bias, limits.limit, 2.0 * limits.bias)
+    command = robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension)
+    simulated = Simulation(robot, mae, preset)
+    simulated.start_from(theta[None])
+    simulated.command = command[None]
+    start = simulated.settle()
+    result = []
+    forced = np.full(robot.joint_count, np.nan)
+    forced[robot.joints.index(FORCED)] = FORCED_TO
+    free, none = np.full(robot.joint_count, np.nan), np.zeros(6)
+    for name, wrench, fixed in (
+        ('-50 N in z', np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0]), free),
+        ('50 N in y', np.array([0.0, 50.0, 0.0, 0.0, 0.0, 0.0]), free),
+        (f'{FORCED} forced to 30°', none, forced),
+    ):
+        simulated.state = start
+        simulated.wrench, simulated.fixed = wrench[None], fixed[None]
+        after = simulated.settle()
+        body = nominal_rest(robot, command, theta, tension, wrench, fixed)
+        result.append(
+            Response(
+                name,
+                body.theta - theta,
+                (after.theta - start.theta)[0],
+                body.tension - tension,
+                (after.tension - start.tension)[0],
+            )
+        )
+    return result
+
+
+def print_responses(robot: Robot, mae: Mae, preset: str) -> None:
+    """Print the answers side by side."""
+    for answer in responses(robot, mae, preset):
+        print(f'{answer.name}: Δθ [rad] of body and simulator')
+        for name, body, simulated in zip(robot.joints, answer.body, answer.simulated):
+            note = ''
+            if abs(body) > NOTICEABLE:
+                share = simulated / body
+                note = f'  {share:.0%}' + ('' if 0.7 <= share <= 1.3 else '  beyond 30 %')
+            print(f'  {name:<16}{body:>8.3f}{simulated:>8.3f}{note}')
+        body_size = np.linalg.norm(answer.body_tension)
+        apart = np.linalg.norm(answer.simulated_tension - answer.body_tension)
+        print(f'  ‖ΔT‖ {body_size:.1f} N, {apart:.1f} N apart')
 
 
 def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:

@@ -112,12 +112,13 @@ def picture_rows(
 
 
 def _draw(axes: Any, robot: Robot, theta: Array, tension: Array) -> None:
-    drawing = draw_arm(robot, theta, tension)
-    style = {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1, 'clip_on': False}
-    for bone in drawing.bones:
-        axes.plot(*bone.T, color='#B8B8AE', **style)
-    for line, colour in zip(drawing.muscles, drawing.colours, strict=True):
-        axes.plot(*line.T, color=tuple(0.85 * colour), linewidth=2.0, zorder=2, clip_on=False)
+    styles: dict[str, dict[str, Any]] = {
+        'bones': {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1},
+        'muscles': {'linewidth': 2.0, 'zorder': 2},
+    }
+    for line in draw_arm(robot, theta, tension):
+        colour = 0.9 * np.array(line.colour)
+        axes.plot(*line.points.T, color=tuple(colour), clip_on=False, **styles[line.kind])
 
 
 def _reach(robot: Robot, postures: Array) -> tuple[Array, Array]:

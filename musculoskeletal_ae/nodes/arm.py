@@ -6,6 +6,7 @@ RViz and Foxglove draw bones and muscles from markers in the root link's frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.robot.drawing import Drawing
+from musculoskeletal_ae.robot.drawing import Line
 
 MARKER_RATE = 10.0  # [Hz]
-BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
-BONE_COLOUR = (0.85, 0.85, 0.8)
 
 
 class Arm(Shell):
@@ -61,37 +60,27 @@ class Arm(Shell):
         rows = np.stack([length, tension, temperature])
         self._muscles.publish(array_message(rows, 'quantity', 'muscle'))
 
-    def drawing(self) -> Drawing | None:
-        """Return the arm as lines, or None where there is nothing to draw yet."""
+    def lines(self) -> list[Line]:
+        """Return the arm as lines; none where there is nothing to draw yet."""
         raise NotImplementedError
 
     def _publish_markers(self) -> None:
-        if self._markers.get_subscription_count() == 0:
-            return
-        drawing = self.drawing()
-        if drawing is not None:
+        if self._markers.get_subscription_count() > 0 and (lines := self.lines()):
             stamp = self.get_clock().now().to_msg()
-            self._markers.publish(arm_markers(drawing, self.robot.root_link, stamp))
+            self._markers.publish(arm_markers(lines, self.robot.root_link, stamp))
 
 
-def arm_markers(drawing: Drawing, frame: str, stamp: Time) -> MarkerArray:
-    """Return one line strip per bone and per muscle."""
-
-    def strip(space: str, index: int, points: Array, width: float, colour: Any) -> Marker:
-        red, green, blue = map(float, colour)
-        marker = Marker(ns=space, id=index, type=Marker.LINE_STRIP, action=Marker.ADD)
+def arm_markers(lines: Sequence[Line], frame: str, stamp: Time) -> MarkerArray:
+    """Return one line strip for each bone and muscle."""
+    markers: list[Marker] = []
+    for line in lines:
+        number = sum(marker.ns == line.kind for marker in markers)
+        marker = Marker(ns=line.kind, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
         marker.header.frame_id, marker.header.stamp = frame, stamp
         marker.pose.orientation.w = 1.0
-        marker.scale.x = width
+        marker.scale.x = line.width
+        red, green, blue = line.colour
         marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
-        marker.points = [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]
-        return marker
-
-    bones = [
-        strip('bones', i, line, BONE_WIDTH, BONE_COLOUR) for i, line in enumerate(drawing.bones)
-    ]
-    muscles = [
-        strip('muscles', i, line, MUSCLE_WIDTH, colour)
-        for i, (line, colour) in enumerate(zip(drawing.muscles, drawing.colours, strict=True))
-    ]
-    return MarkerArray(markers=bones + muscles)
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
+        markers.append(marker)
+    return MarkerArray(markers=markers)

@@ -19,7 +19,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.nodes.arm import Arm
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
+from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.validity import read_array, read_wrench
 
 # After a pause (a debugger, a suspended machine) the arm goes on instead of catching up.
@@ -90,7 +90,7 @@ class HardwareEmulator(Arm):
         turn.x, turn.y, turn.z, turn.w = pin.Quaternion(pose.rotation).coeffs().tolist()
         self.pose.publish(message)
 
-    def drawing(self) -> Drawing:
+    def lines(self) -> list[Line]:
         """Return the arm as lines, along its true routes."""
         arm = self.arm
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())

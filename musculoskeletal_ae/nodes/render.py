@@ -15,13 +15,14 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.qos import SENSOR
 from musculoskeletal_ae.nodes.tool import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
-from musculoskeletal_ae.robot.picture import Line, save_picture
+from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 
 def _lines(message: MarkerArray) -> list[Line]:
     """Return the line strips of a marker array."""
     return [
         Line(
+            marker.ns,
             np.array([[p.x, p.y, p.z] for p in marker.points]),
             marker.scale.x,
             (marker.color.r, marker.color.g, marker.color.b),

@@ -20,7 +20,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Arm
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.robot.drawing import Drawing, draw_arm
+from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.validity import read_array, read_joints, read_wrench
@@ -83,10 +83,10 @@ class Sim(Arm):
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
         self.publish_state(state.theta[0], state.length[0], state.tension[0], temperature)
 
-    def drawing(self) -> Drawing | None:
+    def lines(self) -> list[Line]:
         """Return the simulated arm as lines."""
         if self.arm is None:
-            return None
+            return []
         return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
 
     def clock_jumped_back(self) -> None:

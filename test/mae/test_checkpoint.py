@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,6 +83,10 @@ def test_round_trip_keeps_every_bit(mae, robot):
     bare = replace(small(), anomaly=None)
     assert from_bytes(to_bytes(bare)).anomaly is None
     check_same(bare, from_bytes(to_bytes(bare)))
+
+
+def test_a_file_of_the_first_release_is_read():
+    check_same(small(), load(Path(__file__).parent / 'format_1.safetensors'))
 
 
 def test_file_round_trip_leaves_nothing_beside_it(mae, robot, tmp_path):

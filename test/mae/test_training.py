@@ -10,7 +10,6 @@ import torch
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
-from musculoskeletal_ae.mae.optimiser import orthogonal
 from musculoskeletal_ae.mae.training import (
     POSTURE_MARGIN,
     annealing,
@@ -148,14 +147,6 @@ def test_annealing_rises_and_then_falls_to_nothing():
     assert annealing(0.0) == 0.0
     assert annealing(0.05) == pytest.approx(1.0)
     assert annealing(1.0) == pytest.approx(0.0)
-
-
-@pytest.mark.parametrize('shape', [(4, 9), (9, 4), (1, 3)])
-def test_orthogonalised_matrix_has_singular_values_near_one(shape):
-    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    singular = torch.linalg.svdvals(orthogonal(matrix))
-    assert (singular - 1.0).abs().max() < 0.15
-    assert torch.equal(orthogonal(torch.zeros(shape)), torch.zeros(shape))
 
 
 def check_trains(arm: Robot) -> None:

@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator on a body whose lengths are exact, so that only the simulator can be wrong."""
+"""The simulator on a body whose lengths are exact, so that only it can be wrong; on networks."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bench.nominal_rest import nominal_rest
-from bench.sim_responses import NOTICEABLE, responses
-from bench.simulation_nominal import random_commands
+from bench import sim_pictures
+from bench.simulation_nominal import (
+    NOTICEABLE,
+    nominal_rest,
+    random_commands,
+    responses,
+    rest_errors,
+)
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation import simulation
-from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED, follow
-from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED
+from musculoskeletal_ae.simulation.simulation import Simulation, on_all_cores
 
 
 class GeometricBody:
@@ -32,6 +39,16 @@ class GeometricBody:
 @pytest.fixture(scope='module')
 def robot():
     return Robot.load('musashi_left_arm')
+
+
+@pytest.fixture(scope='module')
+def arm26():
+    return Robot.load('arm26')
+
+
+@pytest.fixture(scope='module')
+def mae(trained):
+    return trained['default']
 
 
 @pytest.fixture(scope='module')
@@ -195,11 +212,53 @@ def test_one_arm_and_a_batch_agree(robot, body, commands, monkeypatch):
             np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
 
 
-def test_modules_wind_at_a_limited_speed_and_never_far_beyond_what_counts():
-    followed = np.array([[0.0, 0.0, 0.0]])
-    command = np.array([[0.5, -0.5, 1e-4]])
-    length = np.zeros((1, 3))
-    np.testing.assert_allclose(follow(command, followed, length, 0.05, 0.01), [[0.01, -0.01, 1e-4]])
-    for _ in range(100):
-        followed = follow(command, followed, length, 0.05, 0.01)
-    np.testing.assert_allclose(followed, [[0.01, -0.05, 1e-4]])
+def test_pieces_keep_their_order_and_a_fault_in_one_is_told():
+    assert on_all_cores(lambda i: i * i, range(50)) == [i * i for i in range(50)]
+    with pytest.raises(ZeroDivisionError):
+        on_all_cores(lambda i: 1 // i, [1, 0])
+
+
+# -- on networks ----------------------------------------------------------------------------------
+
+
+def test_on_a_network_it_rests_where_the_nominal_body_rests_and_stays_there(arm26, mae):
+    commands = random_commands(arm26, 10, seed=2)
+    theta, _, drift, tension_drift = rest_errors(arm26, mae, 'default', commands)
+    # Over five seeds of the training at most 0.004 rad, 1e-6 rad and 1e-4 N.
+    assert np.median(theta.max(axis=1)) < 0.02
+    assert drift.max() < 1e-4
+    assert tension_drift.max() < 0.05
+
+
+def test_on_a_network_one_arm_and_a_batch_agree(arm26, mae):
+    commands = random_commands(arm26, 300, seed=3)
+    batch = Simulation(arm26, mae, arms=300)
+    batch.command = commands
+    batch.wrench[:, 2] = -10.0
+    batch.step(0.3)
+    for i in (0, 17, 299):
+        single = Simulation(arm26, mae)
+        single.command, single.wrench = commands[[i]], batch.wrench[[i]]
+        for ours, theirs in zip(single.step(0.3), batch.state, strict=True):
+            np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize('preset', ['default', 'paper'])
+def test_a_nonsense_network_moves_it_within_its_limits_only(arm26, mae, preset):
+    rng = np.random.default_rng(5)
+    wild = tuple((1e3 * rng.normal(size=w.shape), 1e3 * b) for w, b in mae.decoder)
+    arms = Simulation(arm26, replace(mae, decoder=wild), preset, arms=3)
+    arms.command = random_commands(arm26, 3, seed=0)
+    arms.wrench[:] = 1e6
+    state = arms.step(2.0)
+    assert np.all((state.theta >= arm26.lower) & (state.theta <= arm26.upper))
+    assert np.all((state.tension >= arm26.tension.bias) & (state.tension <= arm26.tension.max))
+    arms.use(mae)
+    arms.wrench[:] = 0.0
+    assert np.isfinite(arms.settle().length).all()
+
+
+def test_pictures_of_an_arm_at_rest_and_loaded_are_written(arm26, mae, tmp_path):
+    files = sim_pictures.save_both(arm26, mae, tmp_path / 'new')
+    assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
+    assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)

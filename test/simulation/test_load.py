@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the simulator stands on: gravity and pushes for many arms, slopes, threads."""
+"""Gravity and pushes for many arms at once are what pinocchio says for each."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.equilibrium import Slopes
 from musculoskeletal_ae.simulation.load import Load
-from musculoskeletal_ae.simulation.simulation import on_all_cores
 
 
 def sliding_tree():
@@ -63,30 +61,3 @@ def test_the_slope_of_the_load_is_its_derivative(kinematics):
     for k, offset in enumerate(1e-6 * np.eye(theta.shape[1])):
         change = load(theta + offset, wrench)[0] - load(theta - offset, wrench)[0]
         np.testing.assert_allclose(slope[:, :, k], change / 2e-6, atol=1e-5)
-
-
-class Cubic:
-    """A body whose lengths are cubic in θ, so that the fit can be exact."""
-
-    def lengths(self, theta, tension):  # noqa: ARG002
-        a, b = theta.T
-        return np.stack([a**3 - a * b + 2.0 * b, a * b * b, 1.0 + a, b**2, a * a * b, b], axis=1)
-
-
-def test_slopes_are_the_derivatives_of_the_cubic_they_fit():
-    robot = Robot.load('arm26')
-    theta = robot.random_postures(7, np.random.default_rng(0))
-    tension = np.random.default_rng(1).uniform(30.0, 200.0, (7, 6))
-    jacobian, curvature = Slopes(robot, Cubic())(theta, tension)
-    a, b = theta.T
-    np.testing.assert_allclose(jacobian[:, 0], np.stack([3 * a * a - b, 2.0 - a], 1), atol=1e-8)
-    np.testing.assert_allclose(jacobian[:, 1], np.stack([b * b, 2.0 * a * b], 1), atol=1e-8)
-    expected = tension[:, 0] * 6.0 * a + tension[:, 4] * 2.0 * b
-    np.testing.assert_allclose(curvature[:, 0, 0], expected, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(curvature, curvature.swapaxes(1, 2), atol=1e-6)
-
-
-def test_pieces_keep_their_order_and_a_fault_in_one_is_told():
-    assert on_all_cores(lambda i: i * i, range(50)) == [i * i for i in range(50)]
-    with pytest.raises(ZeroDivisionError):
-        on_all_cores(lambda i: 1 // i, [1, 0])
