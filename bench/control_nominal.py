@@ -110,7 +110,7 @@ def stiffness_ratios(
         joint = n % robot.joint_count
         torque = robot.kinematics.holding_torque(theta)
         desired = np.zeros(robot.joint_count)
-        free = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit)
+        free = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit).stiffness
         low, high = free.lowest[joint], free.highest[joint]
         jacobian = robot.kinematics.end_effector_jacobian(theta)
         wrench = np.asarray(push * np.linalg.pinv(jacobian.T)[:, joint], dtype=np.float64)
@@ -118,8 +118,8 @@ def stiffness_ratios(
         for quarter in QUARTERS:
             desired[joint] = low + quarter * (high - low)
             solution = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit)
-            expected = push_deflection(robot, theta, solution.stiffness, wrench)[joint]
-            moved = _pushed(arm, theta, solution.command.length, wrench)[joint]
+            expected = push_deflection(robot, theta, solution.stiffness.expected, wrench)[joint]
+            moved = _pushed(arm, theta, solution.length, wrench)[joint]
             deflections.append((moved, expected))
         (soft, soft_expected), (stiff, stiff_expected) = deflections
         ratios.append((soft / stiff, soft_expected / stiff_expected))

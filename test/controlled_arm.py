@@ -8,16 +8,30 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_array
 
 RATE_LIMIT = 0.2  # [m/s]
+LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
+NODES = {
+    'hardware_emulator': HardwareEmulator,
+    'estimator': Estimator,
+    'controller': Controller,
+}
 
 
 class ControlledArm:
-    """The whole loop of arm26 in a test's graph."""
+    """The whole loop of arm26 in a test's graph.
 
-    def __init__(self, graph, robot, checkpoint, **hardware):
+    The nodes run in the test's process, but for those whose processes are to be killed.
+    """
+
+    def __init__(self, graph, robot, checkpoint, processes=(), **hardware):
         self.graph, self.robot, self.checkpoint = graph, robot, checkpoint
+        self.processes = processes
         for kind, topic in (
             (Float64MultiArray, 'muscle_states'),
             (Float64MultiArray, 'muscle_length_command'),
@@ -27,32 +41,33 @@ class ControlledArm:
             (DiagnosticArray, '/diagnostics'),
         ):
             graph.listen(kind, topic, 1000)
-        self.hardware = self.start_hardware(**hardware)
-        self.estimator = self.start_estimator()
+        self.hardware = self.start('hardware_emulator', seed=1, **hardware)
+        self.estimator = self.start('estimator', checkpoint=checkpoint)
         self.controller = self.start_controller()
-        graph.next('estimated_joint_states')
         self.targets = graph.publisher(JointState, 'target_joint_states')
+        self.says('no target')  # it knows posture and network
 
-    def start_hardware(self, **chosen):
-        return self.graph.start('hardware_emulator', robot='arm26', seed=1, **chosen)
-
-    def start_estimator(self):
-        return self.graph.start('estimator', robot='arm26', checkpoint=self.checkpoint)
+    def start(self, name, **parameters):
+        if name in self.processes:
+            return self.graph.start(name, robot='arm26', **parameters)
+        return self.graph.host(NODES[name], robot='arm26', **parameters)
 
     def start_controller(self):
-        return self.graph.start(
+        return self.start(
             'controller',
-            robot='arm26',
             checkpoint=self.checkpoint,
             first_duration=1.0,
             second_duration=0.5,
             rate_limit=RATE_LIMIT,
+            max_age=1.0,  # a loaded machine is not the cause of a stop
         )
 
-    def kill(self, process, number):
-        """End a node without the graph taking it for an accident."""
+    def kill(self, process):
+        """Kill a node without the graph taking it for an accident; the others go on meanwhile."""
         self.graph.processes.remove(process)
-        process.end(number)
+        process.process.kill()
+        self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
+        process.process.stdout.close()
 
     def target(self, theta, effort=()):
         self.targets.publish(
@@ -81,24 +96,27 @@ class ControlledArm:
         self.graph.wait(lambda: self.tension().max() < bias + 8.0, 'tensions near the bias')
 
     def state(self, node='controller'):
-        """Return the node's last diagnostic status."""
+        """Return what a node says of itself: the controller now, others once a second."""
+        if node == 'controller' and node not in self.processes:
+            return self.controller.report()
         name = f'{self.graph.namespace}/{node}: state'
         for message in reversed(self.graph.received['/diagnostics']):
             for status in message.status:
                 if status.name == name:
-                    return status
-        return DiagnosticStatus()
+                    values = {pair.key: pair.value for pair in status.values}
+                    return Report(LEVELS[status.level], status.message, values)
+        return Report('warn', 'not heard of', {})
 
-    def reachable(self, joint):
-        """Return the range of a joint's stiffness that the controller reports."""
-        key = f'joint stiffness {joint}'
+    def said(self, key):
+        """Return a value of the controller's diagnostics, once it is there."""
         self.says(key)
-        said = {pair.key: pair.value for pair in self.state().values}[key]
-        low, high = said.split('reachable ')[1].split(',')[0].split(' to ')
-        return float(low), float(high)
+        return self.state().values[key]
 
     def says(self, words, node='controller'):
         """Wait until the node's diagnostics contain words."""
-        self.graph.wait(
-            lambda: words in f'{self.state(node).message} {self.state(node).values}', repr(words)
-        )
+
+        def said():
+            state = self.state(node)
+            return words in f'{state.message} {state.values}'
+
+        self.graph.wait(said, repr(words))

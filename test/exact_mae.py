@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body image without error, as of a network that had learnt the geometric model perfectly."""
+"""A body image without error, as of a network that had learned the geometric model perfectly."""
 
 from __future__ import annotations
 

@@ -98,6 +98,12 @@ class Graph:
         self.executor.add_node(node)
         return node
 
+    def end(self, node: Node) -> None:
+        """End a node that runs in this process."""
+        self.hosted.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
+
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
         """Subscribe; return the list that messages are appended to."""
         self.node.create_subscription(kind, topic, self.received[topic].append, qos)

@@ -194,7 +194,11 @@ class Controller:
         in_tension = self.settings.method == 'tension' and not posture.exploring
         if self._starts:
             self._starts = False
-            self._start(TENSION if in_tension else LENGTH, muscles)
+            # Go on from the last command, or from how the muscles pull at this moment.
+            kind, command = TENSION if in_tension else LENGTH, self.safety.command
+            if command is None or command.kind != kind:
+                command = unchanging(self._robot, kind, muscles)
+            (self.torque if in_tension else posture).start_from(command.value)
         planned = np.minimum(self.limit, self._robot.tension.limit)
         if not in_tension:
             length = posture.step(muscles.tension, estimate, planned, dt)
@@ -204,13 +208,3 @@ class Controller:
         target, effort = posture.theta, posture.effort
         tension = self.torque.step(mae, estimate, target, effort, planned, dt)
         return Command(TENSION, tension)
-
-    def _start(self, kind: str, muscles: Muscles) -> None:
-        """Go on from the last command, or from how the muscles pull at this moment."""
-        command = self.safety.command
-        if command is None or command.kind != kind:
-            command = unchanging(self._robot, kind, muscles)
-        if kind == TENSION:
-            self.torque.start_from(command.value)
-        else:
-            self.posture.start_from(command.value)

@@ -41,6 +41,20 @@ SEARCH = StepSearch(largest_step=0.5, candidates=10, epochs=10)
 SOLVES = 2
 
 
+class JointStiffness(NamedTuple):
+    """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad].
+
+    Attributes:
+        expected: K_θ, shape (D, D).
+        lowest: Least K_jj, each joint alone, shape (D,).
+        highest: Greatest ones, shape (D,).
+    """
+
+    expected: Array
+    lowest: Array
+    highest: Array
+
+
 class Solution(NamedTuple):
     """A command and what it is expected to bring.
 
@@ -48,11 +62,13 @@ class Solution(NamedTuple):
         length: l_target [m], shape (M,).
         tension: T [N], shape (M,).
         missing_torque: Torque that no tension within its limits gives [N·m], shape (D,).
+        stiffness: Of the method `stiffness` alone.
     """
 
     length: Array
     tension: Array
     missing_torque: Array
+    stiffness: JointStiffness | None = None
 
 
 def msc_compensation(robot: Robot, tension: Array) -> Array:

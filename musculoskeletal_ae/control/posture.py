@@ -24,7 +24,7 @@ from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
 from musculoskeletal_ae.control.feedback import RestFeedback
 from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stiffness import StiffnessSolution, stiffness_command
+from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -68,11 +68,11 @@ class Ramp:
 
 
 class Goal(NamedTuple):
-    """A method, how long it may take [s], and whether it reads T_current anew."""
+    """A method, how long it may take [s], and its tension [N] (M,); None to read T_current."""
 
     method: str
     duration: float
-    reads: bool = True
+    tension: Array | None = None
 
 
 class PostureControl:
@@ -83,7 +83,6 @@ class PostureControl:
         theta: θ_target [rad], shape (D,), or None before the first target.
         effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
         solution: Command of the last goal and what it is expected to bring, or None.
-        stiffness: What the last goal of `stiffness` expects, or None.
         feedback: Corrections at rest.
     """
 
@@ -94,14 +93,12 @@ class PostureControl:
         self.theta: Array | None = None
         self.effort: Array = np.zeros(robot.joint_count)
         self.solution: Solution | None = None
-        self.stiffness: StiffnessSolution | None = None
         self.feedback = RestFeedback(robot)
         self._exploration: Exploration | None = None
         self._goals: list[Goal] = []
         self._method = ''
         self._remaining = 0.0
-        self._constant: Array = np.full(robot.muscle_count, robot.tension.bias)
-        self._current: Array = self._constant
+        self._tension: Array = np.full(robot.muscle_count, robot.tension.bias)
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
@@ -134,15 +131,13 @@ class PostureControl:
             return
         chosen, tension = self.settings, self._robot.tension
         constant = np.clip(chosen.constant_tension, tension.bias, tension.limit)
-        self._constant = np.full(self._robot.muscle_count, constant)
+        first = Goal('first', chosen.first_duration, np.full(self._robot.muscle_count, constant))
+        self._goals = {
+            'first': [first],
+            'second': [first, Goal('second', chosen.second_duration)],
+        }.get(chosen.method, [Goal(chosen.method, chosen.first_duration)])
         self._remaining = 0.0
         self.feedback.reset()
-        self._goals = [Goal(chosen.method, chosen.first_duration)]
-        if chosen.method == 'second':
-            self._goals = [
-                Goal('first', chosen.first_duration),
-                Goal('second', chosen.second_duration),
-            ]
 
     def start_from(self, command: Array) -> None:
         """Continue from a command [m] (M,): at the start, after a stop or another method."""
@@ -179,20 +174,20 @@ class PostureControl:
 
     def _solve_again(self) -> None:
         if self._ramp is not None and not self._goals and not self.exploring:
-            self._goals = [Goal(self._method, self.settings.second_duration, reads=False)]
+            self._goals = [Goal(self._method, self.settings.second_duration, self._tension)]
             if self._ramp.done:
                 self._remaining = 0.0
 
     def _next_goal(self, tension: Array, limit: Array) -> None:
         if self._exploration is not None and not self._goals:
             planned = self._exploration.next_step()
-            self.theta, self._constant = planned.theta, planned.tension
-            self._goals = [Goal(planned.method, planned.duration)]
+            self.theta = planned.theta
+            constant = planned.tension if planned.method == 'first' else None
+            self._goals = [Goal(planned.method, planned.duration, constant)]
         if not self._goals or self._mae is None or self.theta is None:
             return
-        self._method, duration, reads = self._goals.pop(0)
-        if reads:
-            self._current = tension
+        self._method, duration, constant = self._goals.pop(0)
+        self._tension = tension if constant is None else constant
         self._limit = limit
         self.solution = self._solve(self._mae, self.theta, limit)
         goal = self.solution.length
@@ -203,24 +198,21 @@ class PostureControl:
         self.feedback.moving()
 
     def _solve(self, mae: Mae, theta: Array, limit: Array) -> Solution:
-        robot, current = self._robot, self._current
-        self.solution = self.stiffness = self._jacobian = None
+        robot, tension = self._robot, self._tension
+        self.solution = self._jacobian = None
         nothing = np.zeros(robot.joint_count)
         if self._method == 'geometric':
             bias = np.full(robot.muscle_count, robot.tension.bias)
             return Solution(methods.geometric_command(robot, theta), bias, nothing)
         if self._method in ('first', 'second'):
-            tension = self._constant if self._method == 'first' else current
-            length = methods.first_command(robot, mae, theta, tension)
-            return Solution(length, tension, nothing)
+            return Solution(methods.first_command(robot, mae, theta, tension), tension, nothing)
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':
             desired = np.array(self.settings.desired_stiffness(robot.joint_count))
-            self.stiffness = stiffness_command(robot, mae, theta, torque, desired, limit)
-            return self.stiffness.command
+            return stiffness_command(robot, mae, theta, torque, desired, limit)
         if self.settings.by_balance:
-            return methods.proposed(robot, mae, theta, torque, current, limit)
-        return methods.proposed_paper(robot, mae, theta, torque, current)
+            return methods.proposed(robot, mae, theta, torque, tension, limit)
+        return methods.proposed_paper(robot, mae, theta, torque, tension)
 
     def _correct(self, tension: Array, theta: Array, dt: float) -> None:
         """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""

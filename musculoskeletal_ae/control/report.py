@@ -58,16 +58,16 @@ def _missing_torque(control: Controller) -> Array:
 
 def _stiffness_values(robot: Robot, control: Controller) -> dict[str, str]:
     """Return each joint's expected and reachable stiffness, and whether the desired one is not."""
-    solution = control.posture.stiffness
-    if solution is None:
+    solution = control.posture.solution
+    if solution is None or solution.stiffness is None:
         return {}
     values = {}
     rows = zip(
         robot.joints,
         control.settings.desired_stiffness(robot.joint_count),
-        solution.stiffness.diagonal(),
-        solution.lowest,
-        solution.highest,
+        solution.stiffness.expected.diagonal(),
+        solution.stiffness.lowest,
+        solution.stiffness.highest,
     )
     for name, desired, expected, low, high in rows:
         text = f'{expected:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'

@@ -4,7 +4,7 @@
 Order: model → rate limit → saturate → finite check last. MSC pulls with T_bias + K (l − l_target),
 so the tension limit of a muscle is a length limit,
 
-    l_target ≥ l − (T_limit − T_bias)/K_stiff,
+    l_target ≥ l + l_comp(T_limit),   l_comp(T) = −(T − T_bias)/K_stiff,
 
 which may pay a muscle out faster than the rate limit, never wind it in. l is the median of the last
 three readings there, so that a glitch of a sensor lets no muscle go. The limit of a muscle whose
@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -64,7 +65,7 @@ def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:
     tension = np.maximum(muscles.tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
-    return Command(LENGTH, muscles.length - (tension - robot.tension.bias) / robot.stiffness)
+    return Command(LENGTH, muscles.length + msc_compensation(robot, tension))
 
 
 class SafetyFilter:
@@ -142,8 +143,7 @@ class SafetyFilter:
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
         length = np.minimum(np.median(self._lengths, axis=0), self._longest)
-        shortest = length - (limit - robot.tension.bias) / robot.stiffness
-        return Command(kind, np.maximum(value, shortest))
+        return Command(kind, np.maximum(value, length + msc_compensation(robot, limit)))
 
     def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
         self._held += dt

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import SOLVES, Solution, first_command
+from musculoskeletal_ae.control.methods import SOLVES, JointStiffness, Solution, first_command
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
@@ -34,22 +34,6 @@ FAR = 1e5  # [N²] turns a quadratic programme into a linear one: its gradient o
 LEVELS = 8  # tensions between T_bias and limit at which the elongation is read
 # [rad] for the slope of G; small against the bends of a route, large against errors of the MAE.
 STEP = 0.05
-
-
-class StiffnessSolution(NamedTuple):
-    """A command and the stiffness it is expected to bring.
-
-    Attributes:
-        command: Lengths, tensions and missing torque.
-        stiffness: Expected K_θ [N·m/rad], shape (D, D).
-        lowest: Least K_jj that the posture allows, each joint alone, shape (D,).
-        highest: Greatest ones, shape (D,).
-    """
-
-    command: Solution
-    stiffness: Array
-    lowest: Array
-    highest: Array
 
 
 class StiffnessModel(NamedTuple):
@@ -108,7 +92,7 @@ class StiffnessModel(NamedTuple):
 
 def stiffness_command(
     robot: Robot, mae: Mae, theta: Array, torque: Array, desired: Array, limit: Array | float
-) -> StiffnessSolution:
+) -> Solution:
     """Return the command whose joint stiffness is as near as possible to the desired one.
 
     Args:
@@ -145,8 +129,8 @@ def stiffness_command(
         tension = _approach(model, programme, start, within)
         model = StiffnessModel.read(robot, mae, theta, tension)
         missing = torque + model.jacobian.T @ tension if missing.any() else missing
-    command = Solution(first_command(robot, mae, theta, tension), tension, missing)
-    return StiffnessSolution(command, model.joint_stiffness(tension), lowest, highest)
+    stiffness = JointStiffness(model.joint_stiffness(tension), lowest, highest)
+    return Solution(first_command(robot, mae, theta, tension), tension, missing, stiffness)
 
 
 def _approach(

@@ -39,7 +39,7 @@ class Controller(Shell):
         self.core = Core(self.robot, seed=self.parameter('seed'))
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name))
-        self.told: list[str] = []
+        self.logged: list[str] = []
         self.publishers_of = {
             LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
             TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
@@ -115,8 +115,8 @@ class Controller(Shell):
         stopped = [report.message] if self.core.safety.cause else []
         stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
         for line in stopped + stiffness:
-            if line not in self.told:
+            if line not in self.logged:
                 log = self.get_logger().warning if line in stopped else self.get_logger().info
                 log(line)
-        self.told = stopped + stiffness
+        self.logged = stopped + stiffness
         return report

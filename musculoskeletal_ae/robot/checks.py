@@ -11,6 +11,8 @@ muscles at the bias tension count as slack.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,53 +118,45 @@ def _measure(
     return tension, np.zeros(robot.joint_count), values[0], softest, one_sided
 
 
-def _inertia_faults(robot: Robot, theta: Array) -> list[Finding]:
+def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
     least = np.min([robot.kinematics.joint_inertia(posture) for posture in theta], axis=0)
-    return [
-        Finding(
-            'no_inertia',
-            f'joint {name!r} moves no mass (inertia {value:.2g} kg·m²)',
-            'give the links it carries an <inertial> in robot.urdf',
-        )
-        for name, value in zip(robot.joints, least, strict=True)
-        if value < LEAST_INERTIA
-    ]
+    for name, value in zip(robot.joints, least, strict=True):
+        if value < LEAST_INERTIA:
+            yield Finding(
+                'no_inertia',
+                f'joint {name!r} moves no mass (inertia {value:.2g} kg·m²)',
+                'give the links it carries an <inertial> in robot.urdf',
+            )
 
 
-def _holding_faults(robot: Robot, stiffness: Array, softest: Ints, missing: Array) -> list[Finding]:
+def _holding_faults(
+    robot: Robot, stiffness: Array, softest: Ints, missing: Array
+) -> Iterator[Finding]:
     held, stiff = np.isfinite(stiffness), stiffness >= REQUIRED_STIFFNESS
     required = f'required {100 * REQUIRED_SHARE:.0f} %'
-    faults = []
     if held.mean() < REQUIRED_SHARE:
         lack = np.abs(missing[~held])
         worst = lack.argmax(axis=1)
-        joints = sorted(set(worst.tolist()), key=lambda k: -int((worst == k).sum()))
         where = ', '.join(
-            f'{robot.joints[k]} in {(worst == k).sum()} (up to {lack[worst == k, k].max():.2f} N·m)'
-            for k in joints
+            f'{robot.joints[k]} in {count} (up to {lack[worst == k, k].max():.2f} N·m)'
+            for k, count in Counter(sorted(worst.tolist())).most_common()
         )
-        faults.append(
-            Finding(
-                'not_held',
-                f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
-                f'weight with T in [{robot.tension.bias:g}, {robot.tension.limit:g}] N, '
-                f'{required}; of the {len(lack)} others torque lacks most at {where}',
-                'lengthen the moment arms of the muscles at these joints, raise tension.limit '
-                'or lighten the links',
-            )
+        yield Finding(
+            'not_held',
+            f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
+            f'weight with T in [{robot.tension.bias:g}, {robot.tension.limit:g}] N, '
+            f'{required}; of the {len(lack)} others torque lacks most at {where}',
+            'lengthen the moment arms of the muscles at these joints, raise tension.limit '
+            'or lighten the links',
         )
     if stiff.mean() < REQUIRED_SHARE:
-        soft = softest[held & ~stiff]
-        counts = {robot.joints[k]: int((soft == k).sum()) for k in set(soft.tolist())}
-        where = ', '.join(f'{name} ({count})' for name, count in counts.items())
-        faults.append(
-            Finding(
-                'not_stiff',
-                f'the arm is not stiff: {100 * stiff.mean():.1f} % of postures have a smallest '
-                f'stiffness eigenvalue >= {REQUIRED_STIFFNESS:g} N·m/rad, {required} '
-                '(a posture that is not held counts as not stiff); softest joint of the held ones, '
-                f'in postures: {where or "none"}',
-                'lengthen the moment arms at these joints on both sides, or raise stiffness',
-            )
+        counts = Counter(sorted(softest[held & ~stiff].tolist()))
+        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts.items())
+        yield Finding(
+            'not_stiff',
+            f'the arm is not stiff: {100 * stiff.mean():.1f} % of postures have a smallest '
+            f'stiffness eigenvalue >= {REQUIRED_STIFFNESS:g} N·m/rad, {required} '
+            '(a posture that is not held counts as not stiff); softest joint of the held ones, '
+            f'in postures: {where or "none"}',
+            'lengthen the moment arms at these joints on both sides, or raise stiffness',
         )
-    return faults

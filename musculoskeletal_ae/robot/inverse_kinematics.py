@@ -19,9 +19,9 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-# How far a camera's marker pose can be trusted: of a usual one, and only their ratio matters.
-POSITION_SPREAD, TURN_SPREAD = 0.002, 0.01  # [m], [rad]
-ESTIMATE_SPREAD = 0.2  # [rad]
+# How far the pose of a usual camera's marker can be trusted: σ_p [m], σ_R [rad].
+SPREADS = np.repeat([0.002, 0.01], 3)
+ESTIMATE_SPREAD = 0.2  # σ_θ [rad]
 ITERATIONS = 30
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 SMALL_STEP = 1e-6  # [rad]
@@ -49,24 +49,20 @@ def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
         pose: Of the end effector in the root link's frame.
         start: θ to start from [rad], shape (D,).
     """
-    kin = robot.kinematics
-    theta = np.clip(start, robot.lower, robot.upper)
-    damping = 1e-2
+    kin, lower, upper = robot.kinematics, robot.lower, robot.upper
+    theta, damping = np.clip(start, lower, upper), 1e-2
     error = _error(robot, pose, theta, start)
     prior = np.eye(len(theta)) / ESTIMATE_SPREAD
     for _ in range(ITERATIONS):
-        by_pose = kin.end_effector_jacobian(theta) / _SPREADS[:, None]
-        jacobian = np.vstack([by_pose, prior])
+        jacobian = np.vstack([kin.end_effector_jacobian(theta) / SPREADS[:, None], prior])
         # At a limit, a joint that wants to go beyond is held.
         gradient = jacobian.T @ error
-        held = ((theta <= robot.lower) & (gradient < 0.0)) | (
-            (theta >= robot.upper) & (gradient > 0.0)
-        )
+        held = (theta <= lower) & (gradient < 0.0) | (theta >= upper) & (gradient > 0.0)
         jacobian[:, held] = 0.0
         normal = jacobian.T @ jacobian
         scale = damping * np.maximum(np.diag(normal), 1e-3 * np.diag(normal).max() + 1e-12)
         step = np.linalg.solve(normal + np.diag(scale), jacobian.T @ error)
-        tried = np.clip(theta + step, robot.lower, robot.upper)
+        tried = np.clip(theta + step, lower, upper)
         tried_error = _error(robot, pose, tried, start)
         if tried_error @ tried_error < error @ error:
             moved = np.abs(tried - theta).max()
@@ -77,16 +73,13 @@ def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
-    left = error[:6] * _SPREADS
+    left = error[:6] * SPREADS
     return Posture(theta, float(np.linalg.norm(left[:3])), float(np.linalg.norm(left[3:])))
-
-
-_SPREADS = np.repeat([POSITION_SPREAD, TURN_SPREAD], 3)
 
 
 def _error(robot: Robot, pose: pin.SE3, theta: Array, start: Array) -> Array:
     """Return what is missing in position, orientation and to the estimate, weighted, (6+D,)."""
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
-    missing = np.concatenate([pose.translation - here.translation, turn]) / _SPREADS
+    missing = np.concatenate([pose.translation - here.translation, turn]) / SPREADS
     return np.concatenate([missing, (start - theta) / ESTIMATE_SPREAD])

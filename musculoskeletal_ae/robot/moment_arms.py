@@ -12,6 +12,7 @@ even where the arm could still hold itself.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -70,8 +71,8 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     return actions
 
 
-def moment_arm_faults(description: RobotDescription, moment_arms: Array) -> list[Finding]:
-    """Return what makes an arm unsound.
+def moment_arm_faults(description: RobotDescription, moment_arms: Array) -> Iterator[Finding]:
+    """Yield what makes an arm unsound.
 
     Args:
         description: Names, and the directory of the declared actions.
@@ -80,45 +81,43 @@ def moment_arm_faults(description: RobotDescription, moment_arms: Array) -> list
     Raises:
         RobotDescriptionError: If `moment_arms.csv` is not valid.
     """
-    return [
-        *_wrong_signs(description, moment_arms),
-        *_one_way_joints(description, moment_arms),
-        *_useless_muscles(description, moment_arms),
-    ]
+    yield from _wrong_signs(description, moment_arms)
+    yield from _one_way_joints(description, moment_arms)
+    for name, arm in zip(description.muscles, np.abs(moment_arms).max(axis=(0, 2)), strict=True):
+        if arm < MATTERS:
+            yield Finding(
+                'useless_muscle',
+                f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
+                f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
+            )
 
 
-def _wrong_signs(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+def _wrong_signs(description: RobotDescription, moment_arms: Array) -> Iterator[Finding]:
     """Declared actions that too many postures contradict."""
-    faults = []
     for (muscle, joint), sign in read_declared_actions(description).items():
         arm = moment_arms[:, muscle, joint]
         against = np.mean(arm * sign <= 0.0)
-        if against <= TOLERATED_SHARE:
-            continue
-        expected, found = ('+', '-') if sign > 0 else ('-', '+')
+        expected, actual = ('+', '-') if sign > 0 else ('-', '+')
         if not arm.any():
-            found = '0, it does not cross the joint,'
-        faults.append(
-            Finding(
+            actual = '0, it does not cross the joint,'
+        if against > TOLERATED_SHARE:
+            yield Finding(
                 'wrong_sign',
                 f'muscle {description.muscles[muscle]!r} has a moment arm of wrong sign at joint '
-                f'{description.joints[joint]!r}: expected {expected}, found {found} in '
+                f'{description.joints[joint]!r}: expected {expected}, found {actual} in '
                 f'{100 * against:.0f} % of postures (median {1e3 * np.median(arm):+.1f} mm)',
                 'lead its route along the other side of the joint axis, or correct '
                 f'{DECLARATION_FILE}',
             )
-        )
-    return faults
 
 
-def _one_way_joints(description: RobotDescription, moment_arms: Array) -> list[Finding]:
+def _one_way_joints(description: RobotDescription, moment_arms: Array) -> Iterator[Finding]:
     """Joints that too often have muscles on one side only."""
     lacks = {
         '+': np.max(moment_arms, axis=1) <= MATTERS,
         '-': np.min(moment_arms, axis=1) >= -MATTERS,
     }
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
-    faults = []
     for joint in np.flatnonzero(np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE):
         missing = ' and '.join(
             f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'
@@ -129,44 +128,23 @@ def _one_way_joints(description: RobotDescription, moment_arms: Array) -> list[F
             f'{description.muscles[m]} ({1e3 * median[m, joint]:+.0f} mm)'
             for m in np.flatnonzero(longest[:, joint] > MATTERS)
         )
-        faults.append(
-            Finding(
-                'one_way_joint',
-                f'joint {description.joints[joint]!r} has no muscle that pulls in direction '
-                f'{missing}; muscles that act on it: {acting or "none"}',
-                'a wire only pulls: lead a muscle along the other side of its axis',
-            )
+        yield Finding(
+            'one_way_joint',
+            f'joint {description.joints[joint]!r} has no muscle that pulls in direction '
+            f'{missing}; muscles that act on it: {acting or "none"}',
+            'a wire only pulls: lead a muscle along the other side of its axis',
         )
-    return faults
 
 
-def _useless_muscles(description: RobotDescription, moment_arms: Array) -> list[Finding]:
-    """Muscles whose moment arms are short at every joint and posture."""
-    longest = np.abs(moment_arms).max(axis=(0, 2))
-    return [
-        Finding(
-            'useless_muscle',
-            f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
-            f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
-        )
-        for name, arm in zip(description.muscles, longest, strict=True)
-        if arm < MATTERS
-    ]
-
-
-def moment_arm_warnings(description: RobotDescription, moment_arms: Array) -> list[Finding]:
-    """Return the muscles whose main action changes sign over the range; arguments as for faults."""
+def moment_arm_warnings(description: RobotDescription, moment_arms: Array) -> Iterator[Finding]:
+    """Yield the muscles whose main action changes sign over the range; arguments as for faults."""
     median = np.median(moment_arms, axis=0)
-    warnings = []
     for m, joint in enumerate(np.abs(median).argmax(axis=1)):
         against = (moment_arms[:, m, joint] * np.sign(median[m, joint]) < 0.0).mean()
         if against > TOLERATED_SHARE:
-            warnings.append(
-                Finding(
-                    'flipping_muscle',
-                    f'muscle {description.muscles[m]!r} changes the sign of its main action, '
-                    f'at joint {description.joints[joint]!r}, in {100 * against:.0f} % of postures',
-                    'lead it further from the axis of that joint',
-                )
+            yield Finding(
+                'flipping_muscle',
+                f'muscle {description.muscles[m]!r} changes the sign of its main action, '
+                f'at joint {description.joints[joint]!r}, in {100 * against:.0f} % of postures',
+                'lead it further from the axis of that joint',
             )
-    return warnings

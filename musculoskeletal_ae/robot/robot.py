@@ -20,7 +20,13 @@ class Robot:
     """Geometric model of D joints and M muscles (paper, section "Initial Training").
 
     Attributes:
-        description: The checked description.
+        description: The checked description; what follows is taken from it.
+        joints: Names of the D joints, in the order of θ.
+        muscles: Names of the M muscles, in the order of T and l.
+        series_elastic: Elastic constants of the muscles.
+        tension: Tension range [N].
+        stiffness: K_stiff of muscle stiffness control [N/m].
+        root_link: The URDF's root link, in whose frame poses and markers are given.
         kinematics: Link poses, gravity torque, end-effector Jacobian.
         routes: Muscle lengths and the muscle Jacobian of the nominal routes.
         lower: Lower joint limits [rad], shape (D,).
@@ -30,36 +36,21 @@ class Robot:
     def __init__(self, description: RobotDescription) -> None:
         """Build the nominal body of a description."""
         self.description = description
+        self.joints, self.muscles = description.joints, description.muscles
+        self.joint_count, self.muscle_count = len(self.joints), len(self.muscles)
+        self.series_elastic = description.series_elastic
+        self.tension, self.stiffness = description.tension, description.stiffness
+        self.root_link = description.root_link
         self.kinematics = Kinematics(
             description.model, description.joints, description.end_effector
         )
         self.routes = Routes(self.kinematics, description.routes)
-        self.series_elastic = description.series_elastic
-        self.tension = description.tension
-        self.stiffness = description.stiffness
-        self.joints = description.joints
-        self.muscles = description.muscles
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
 
     @classmethod
     def load(cls, robot: str | Path) -> Robot:
         """Read a shipped robot's name or a directory; see `load_description` for errors."""
         return cls(load_description(robot))
-
-    @property
-    def joint_count(self) -> int:
-        """D."""
-        return len(self.joints)
-
-    @property
-    def muscle_count(self) -> int:
-        """M."""
-        return len(self.muscles)
-
-    @property
-    def root_link(self) -> str:
-        """Name of the URDF's root link, in whose frame poses and markers are given."""
-        return self.description.root_link
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
         """Return where in T and l the named muscles stand.

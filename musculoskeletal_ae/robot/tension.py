@@ -37,7 +37,11 @@ class Exertion(NamedTuple):
 
 
 class TensionProgramme:
-    """Quadratic programmes over the tensions that produce a torque within their limits."""
+    """Quadratic programmes over the tensions that produce a torque within their limits.
+
+    Every one raises an `InfeasibleError` if no tension within the limits produces the torque, or an
+    entry is not finite: quadprog would answer with zeros, as if all were well.
+    """
 
     def __init__(
         self, muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
@@ -49,26 +53,15 @@ class TensionProgramme:
             torque: τ [N·m], shape (D,).
             low: Least tension [N], scalar or shape (M,).
             high: Highest tension [N], scalar or shape (M,).
-
-        Raises:
-            InfeasibleError: If an entry is not finite; quadprog would answer with zeros, as if all
-                were well.
         """
-        self._jacobian, self._torque = muscle_jacobian, torque
-        count = len(muscle_jacobian)
-        eye = np.eye(count)
+        self._jacobian, self._torque, self._count = muscle_jacobian, torque, len(muscle_jacobian)
+        eye, low = np.eye(self._count), np.broadcast_to(low, self._count)
         self._constraints = np.hstack([-muscle_jacobian, eye, -eye])
-        low = np.broadcast_to(low, count)
         self._bounds = np.concatenate([torque, low, -np.maximum(high, low + ROOM)])
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
-        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,), over the limits alone if not `hard`.
-
-        Raises:
-            InfeasibleError: If no tension within the limits produces the torque, or an entry is
-                not finite.
-        """
+        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,), over the limits alone if not `hard`."""
         _require_finite(quadratic, linear)
         equalities = len(self._torque) if hard else 0
         first = len(self._torque) - equalities
@@ -76,21 +69,21 @@ class TensionProgramme:
         try:
             solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)
         except ValueError as error:
+            torque = np.round(self._torque, 2)
             raise InfeasibleError(
-                f'no tension within its limits produces the torque {np.round(self._torque, 2)} N·m'
+                f'no tension within its limits produces the torque {torque} N·m'
             ) from error
         tension: Array = solution[0]
         return tension
 
     def nearest(self, desired: Array | float) -> Array:
-        """Return the tensions nearest to desired ones; errors as for `minimum`."""
-        count = len(self._jacobian)
-        return self.minimum(np.eye(count), np.array(np.broadcast_to(desired, count), dtype=float))
+        """Return the hard form: of all tensions the nearest to desired ones [N]."""
+        return self.minimum(np.eye(self._count), np.full(self._count, desired, dtype=float))
 
     def compromise(self) -> Exertion:
         """Return the soft form: what comes nearest to the torque, and of that the least."""
         jacobian = self._jacobian
-        quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * np.eye(len(jacobian))
+        quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * np.eye(self._count)
         tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
         return Exertion(tension, self._torque + jacobian.T @ tension)
 
@@ -102,21 +95,14 @@ def holding_tension(
     high: Array | float,
     desired: Array | float,
 ) -> Array:
-    """Return the tensions nearest to desired ones [N] that produce a joint torque, shape (M,).
-
-    Arguments as for `TensionProgramme`.
-
-    Raises:
-        InfeasibleError: If no tension within the limits produces the torque, or an entry is not
-            finite.
-    """
+    """Return the hard form; arguments and errors as for `TensionProgramme`."""
     return TensionProgramme(muscle_jacobian, torque, low, high).nearest(desired)
 
 
 def least_tension(
     muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
 ) -> Exertion:
-    """Return the least tensions that produce a joint torque, or else come nearest to it.
+    """Return the least tensions that produce a torque, or else what comes nearest to it.
 
     Hard where it can be, soft where the limits do not allow it. Arguments as for
     `TensionProgramme`.

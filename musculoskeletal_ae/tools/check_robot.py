@@ -28,7 +28,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def check(args: Namespace) -> int:
-    """Check a robot and say what was found; return the exit status."""
+    """Check a robot and print the report; return the exit status."""
     # Imported here because they take longer than the help of the command.
     from musculoskeletal_ae.robot.checks import check_robot
     from musculoskeletal_ae.robot.robot import Robot

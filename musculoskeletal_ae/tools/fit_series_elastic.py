@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def fit(args: Namespace) -> None:
-    """Fit a table and say what was found."""
+    """Fit a table and print the constants."""
     table = read_table(args.table)
     try:
         constants = fit_series_elastic(*table.T)

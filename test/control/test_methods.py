@@ -45,37 +45,37 @@ def holdable(robot, seed):
 def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_tension(robot, seed):
     theta, torque, least = holdable(robot, seed)
     bias = np.full(robot.muscle_count, robot.tension.bias)
-    found = methods.proposed(robot, ExactMae(robot), theta, torque, bias, robot.tension.limit)
+    solution = methods.proposed(robot, ExactMae(robot), theta, torque, bias, robot.tension.limit)
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     arm.reset(theta + 0.1)
     for _ in range(150):
-        arm.command_length(found.length)
+        arm.command_length(solution.length)
         arm.step(0.02)
     assert np.linalg.norm(arm.theta - theta) < 0.01
     # The wire's stretch grows with its length, which lowers its torque by up to half a percent.
-    assert np.linalg.norm(found.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
-    assert not found.missing_torque.any()
+    assert np.linalg.norm(solution.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
+    assert not solution.missing_torque.any()
 
 
 def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
     theta, torque, _ = holdable(robot, 7)
     mae, limit = ExactMae(robot), robot.tension.limit
     start = np.full(robot.muscle_count, 30.0)
-    found = methods.proposed(robot, mae, theta, torque, start, limit)
-    jacobian = mae.muscle_jacobian(theta, found.tension)
-    np.testing.assert_allclose(jacobian.T @ found.tension, -torque, atol=0.02)
+    solution = methods.proposed(robot, mae, theta, torque, start, limit)
+    jacobian = mae.muscle_jacobian(theta, solution.tension)
+    np.testing.assert_allclose(jacobian.T @ solution.tension, -torque, atol=0.02)
     for desired in np.random.default_rng(0).uniform(30.0, limit, (10, robot.muscle_count)):
         other = holding_tension(jacobian, torque, robot.tension.bias, limit, desired)
-        assert np.linalg.norm(found.tension) <= np.linalg.norm(other) + 0.1
+        assert np.linalg.norm(solution.tension) <= np.linalg.norm(other) + 0.1
 
 
 def test_torque_beyond_the_muscles_is_told_and_tensions_stay_within_their_limits(robot):
     theta, torque, _ = holdable(robot, 1)
     limit = np.linspace(60.0, 120.0, robot.muscle_count)
-    found = methods.proposed(robot, ExactMae(robot), theta, torque + 500.0, limit, limit)
-    assert (found.tension >= 30.0 - 1e-6).all()
-    assert (found.tension <= limit + 1e-6).all()
-    assert np.linalg.norm(found.missing_torque) > 100.0
+    solution = methods.proposed(robot, ExactMae(robot), theta, torque + 500.0, limit, limit)
+    assert (solution.tension >= 30.0 - 1e-6).all()
+    assert (solution.tension <= limit + 1e-6).all()
+    assert np.linalg.norm(solution.missing_torque) > 100.0
 
 
 def test_an_image_that_is_not_finite_is_refused_and_never_commanded(robot):

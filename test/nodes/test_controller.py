@@ -6,25 +6,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from controlled_arm import RATE_LIMIT, ControlledArm
-from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
-from musculoskeletal_ae.control.stiffness import stiffness_command
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
-from musculoskeletal_ae.robot.stiffness import push_deflection
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
 
 @pytest.fixture
-def arm(graph, arm26, trained_file):
-    return ControlledArm(graph, arm26, trained_file)
+def arm(graph, arm26, trained):
+    return ControlledArm(graph, arm26, trained)
 
 
 def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
@@ -65,46 +61,35 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     arm.goes_to(THERE)
 
 
-def test_a_push_measures_the_stiffness_that_was_wished_within_the_reported_range(arm, trained_file):
-    theta, robot = np.array([0.3, -0.8]), arm.robot
-    mae = checkpoint.load(trained_file, robot)
-    # A torque on the shoulder alone, large against friction.
-    wrench = 3.0 * np.linalg.pinv(robot.kinematics.end_effector_jacobian(theta).T)[:, 0]
+def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_joint_refused(arm):
+    posture, joint = arm.controller.core.posture, arm.robot.joints[0]
     assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
     assert not arm.graph.set_parameter('controller', 'joint_stiffness', [1.0, 2.0, 3.0])[0]
-    arm.target(theta)
-    low, high = arm.reachable(robot.joints[0])
-    push = arm.graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
-    turned, expected = [], []
+    arm.target([0.3, -0.8])
+    text = arm.said(f'joint stiffness {joint}')
+    low, high = map(float, text.split('reachable ')[1].split(' to '))
+    pulls = []
     for share in (0.125, 0.875):
-        wish = np.array([low + share * (high - low), 0.0])
-        done, _ = arm.graph.set_parameter('controller', 'joint_stiffness', wish.tolist())
+        desired = low + share * (high - low)
+        done, _ = arm.graph.set_parameter('controller', 'joint_stiffness', [desired, 0.0])
         assert done
-        arm.graph.spin(3.0)
-        ends = []
-        for sign in (1.0, -1.0):
-            message = WrenchStamped()
-            force, torque = message.wrench.force, message.wrench.torque
-            force.x, force.y, force.z = sign * wrench[:3]
-            torque.x, torque.y, torque.z = sign * wrench[3:]
-            push.publish(message)
-            arm.graph.spin(1.5)
-            ends.append(np.mean([arm.posture()[0] for _ in range(10)]))
-        push.publish(WrenchStamped())
-        turned.append(ends[0] - ends[1])
-        weight = robot.kinematics.holding_torque(theta)
-        found = stiffness_command(robot, mae, theta, weight, wish, robot.tension.limit)
-        expected.append(push_deflection(robot.kinematics, theta, found.stiffness, wrench)[0])
-    assert turned[0] / turned[1] == pytest.approx(expected[0] / expected[1], rel=0.2)
+        planned = pytest.approx(desired, rel=0.01)
+        arm.graph.wait(lambda p=planned: posture.solution.stiffness.expected[0, 0] == p, 'the plan')
+        arm.goes_to([0.3, -0.8], within=0.2)
+        pulls.append(np.linalg.norm(posture.solution.tension))
+    assert pulls[1] > pulls[0] + 20.0  # the stiffer, the tenser
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e4, 0.0])[0]
     arm.says('clamped')
+    assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0])[0]
 
 
 def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm):
     arm.targets.publish(JointState(name=['elbow'], position=[-9.0]))
     arm.says('target clamped')
     arm.targets.publish(JointState(name=['knee'], position=[0.0]))
-    arm.says('unknown joint')
+    rejected = arm.controller.rejected
+    arm.graph.wait(lambda: rejected['target_joint_states: unknown joint'] == 1, 'the rejection')
+    assert arm.controller.core.posture.theta[1] == arm.robot.lower[1]
 
 
 def test_exploration_moves_the_arm_and_a_target_ends_it(arm):
@@ -118,11 +103,11 @@ def test_exploration_moves_the_arm_and_a_target_ends_it(arm):
     arm.goes_to(HERE)
 
 
-def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
+def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained):
     arm.target(HERE)
     arm.goes_to(HERE)
     publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    with open(trained_file, 'rb') as file:  # noqa: PTH123
+    with open(trained, 'rb') as file:  # noqa: PTH123
         publisher.publish(bytes_message(file.read()))
     before = len(arm.sent())
     arm.graph.wait(lambda: len(arm.sent()) > before + 100, 'commands')
@@ -151,5 +136,4 @@ def test_parameters_set_together_are_taken_all_or_none(arm):
     arm.goes_to(HERE)
     assert len(arm.sent('tension')) == 0
     arm.says('method')
-    said = {pair.key: pair.value for pair in arm.state().values}
-    assert said['method'] == 'proposed'
+    assert arm.state().values['method'] == 'proposed'

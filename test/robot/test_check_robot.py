@@ -247,6 +247,21 @@ def test_as_a_program_it_exits_1_without_a_traceback(tmp_path):
     assert 'Traceback' not in done.stderr
 
 
+def test_its_help_names_the_robots_and_loads_nothing_heavy():
+    code = """
+import sys
+from musculoskeletal_ae.tools.check_robot import main
+try:
+    main(['--help'])
+finally:
+    print(sorted({'numpy', 'pinocchio', 'matplotlib'} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith('[]\n')
+    for name in SHIPPED:
+        assert name in done.stdout
+
+
 def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, capsys):
     assert main(['arm26', '--plot', str(tmp_path / 'no' / 'such' / 'plot.png')]) == 1
     assert 'cannot be written' in capsys.readouterr().err

@@ -23,14 +23,14 @@ def test_batched_points_are_where_pinocchio_puts_them(robot):
     model = robot.description.model
     data = model.createData()
     points = robot.routes.points(theta)
-    for row, found in zip(theta, points, strict=True):
+    for row, placed in zip(theta, points, strict=True):
         pin.framesForwardKinematics(model, data, full_configuration(robot, row))
         expected = [
             data.oMf[model.getFrameId(link, pin.FrameType.BODY)].act(xyz)
             for route in robot.description.routes
             for link, xyz in route
         ]
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(placed, expected, atol=1e-12)
 
 
 def test_holding_torque_is_the_gradient_of_potential_energy(robot):

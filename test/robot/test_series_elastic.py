@@ -43,9 +43,9 @@ def test_a_wire_that_cannot_push_does_not_shorten():
 def test_the_fit_recovers_known_constants(force, rate, wire_stretch):
     tension, length = (a.ravel() for a in np.meshgrid([5, 20, 60, 150, 300, 500], [0.2, 0.4, 0.6]))
     elongation = constants(force, rate, wire_stretch).elongation(length, tension)
-    found = tool.fit_series_elastic(tension.astype(float), length, elongation)
+    fitted = tool.fit_series_elastic(tension.astype(float), length, elongation)
     for value, true in zip(
-        (found.force, found.rate, found.wire_stretch), (force, rate, wire_stretch), strict=True
+        (fitted.force, fitted.rate, fitted.wire_stretch), (force, rate, wire_stretch), strict=True
     ):
         np.testing.assert_allclose(value, true, rtol=1e-3)
 

@@ -50,11 +50,11 @@ def test_limits_may_differ_between_muscles():
 def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
     jacobian = np.array([[0.05, 0.0], [-0.05, 0.01], [0.0, -0.04]])
     torque = np.array([40.0, 0.5])
-    found = least_tension(jacobian, torque, LOW, HIGH)
-    np.testing.assert_allclose(found.missing_torque, torque + jacobian.T @ found.tension)
+    nearest = least_tension(jacobian, torque, LOW, HIGH)
+    np.testing.assert_allclose(nearest.missing_torque, torque + jacobian.T @ nearest.tension)
     for other in np.random.default_rng(0).uniform(LOW, HIGH, (200, 3)):
         assert (
-            np.linalg.norm(found.missing_torque)
+            np.linalg.norm(nearest.missing_torque)
             <= np.linalg.norm(torque + jacobian.T @ other) + 1e-6
         )
 
