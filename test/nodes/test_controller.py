@@ -19,8 +19,8 @@ HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
 
 @pytest.fixture
-def arm(graph, arm26, trained):
-    return ControlledArm(graph, arm26, trained)
+def arm(graph, arm26, trained_file):
+    return ControlledArm(graph, arm26, trained_file)
 
 
 def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
@@ -103,11 +103,11 @@ def test_exploration_moves_the_arm_and_a_target_ends_it(arm):
     arm.goes_to(HERE)
 
 
-def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained):
+def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
     arm.target(HERE)
     arm.goes_to(HERE)
     publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    with open(trained, 'rb') as file:  # noqa: PTH123
+    with open(trained_file, 'rb') as file:  # noqa: PTH123
         publisher.publish(bytes_message(file.read()))
     before = len(arm.sent())
     arm.graph.wait(lambda: len(arm.sent()) > before + 100, 'commands')

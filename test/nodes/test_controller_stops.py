@@ -17,11 +17,11 @@ HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
 
 @pytest.fixture
-def moving(graph, arm26, trained):
+def moving(graph, arm26, trained_file):
     """Return a function that starts an arm and sends it on its way."""
 
     def start(*processes, **hardware):
-        arm = ControlledArm(graph, arm26, trained, processes, **hardware)
+        arm = ControlledArm(graph, arm26, trained_file, processes, **hardware)
         arm.target(HERE)
         graph.wait(lambda: len(arm.sent()) > 30, 'commands')
         return arm
