@@ -171,7 +171,7 @@ class Learner:
         if update is not None:
             self._take(update)
         if self._state is not None:
-            self._state.poll(self.samples, self.checkpoint)
+            self._state.keep(self.samples, self.checkpoint, changed=False)
         if not self._to_publish or _lately(self._given, now):
             return None
         self._to_publish, self._given = False, now
@@ -264,9 +264,7 @@ class Learner:
         """
         if self._state is None:
             raise StateError("state_directory is '': nothing is kept; start with a directory")
-        self._state.keep(self.samples, self.checkpoint, at_once=True)
-        if self._state.trouble:
-            raise StateError(self._state.trouble)
+        self._state.save(self.samples, self.checkpoint)
         return self._state.directory
 
     def _keep(self) -> None:
