@@ -159,14 +159,15 @@ def test_a_process_that_cannot_be_started_is_started_later(process, initial, sta
 NODE = """
     import sys, time
     from pathlib import Path
+    from musculoskeletal_ae.learning.learner import Learner
     from musculoskeletal_ae.learning.training import TrainingProcess
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.robot.robot import Robot
 
     if __name__ == '__main__':
         robot = Robot.load('arm26')
-        process = TrainingProcess(robot, 'default')
-        process.begin(checkpoint.load(sys.argv[1], robot))
+        mae = checkpoint.load(sys.argv[1], robot)
+        process = Learner(robot, mae, training=TrainingProcess).training
         print(process.pid, 'torch' in sys.modules, flush=True)
         try:
             time.sleep(60.0)
