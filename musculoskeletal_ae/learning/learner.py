@@ -47,7 +47,7 @@ class Learner:
         enabled: Whether it learns.
         training: Where updates are made.
         updates: How many updates there were.
-        update: What came of the last one.
+        last_update: What came of the last one; None before.
         published: How many checkpoints `poll` has given out.
     """
 
@@ -89,7 +89,7 @@ class Learner:
         self._mae: Mae | None = None
         self.checkpoint: bytes | None = None
         self.enabled = True
-        self.update: Update | None = None
+        self.last_update: Update | None = None
         self.updates = self.published = 0
         self._pairing = Pairing(period)
         self._healthy = Reservoir(robot.muscle_count, seed, novelty)
@@ -190,7 +190,7 @@ class Learner:
 
     def _take(self, update: Update) -> None:
         """Use what came of an update."""
-        self.update, self.updates = update, self.updates + 1
+        self.last_update, self.updates = update, self.updates + 1
         # Its statistics may be of the arm before a muscle was changed.
         mae = uncalibrated(update.mae) if self._forgot or update.changed else update.mae
         self._statistics_hold |= is_calibrated(mae)
@@ -320,8 +320,8 @@ class Learner:
             values['state directory'] = str(self._state.directory)
             if self._state.not_used:
                 values['saved state not used'] = self._state.not_used
-        if self.update is not None:
-            values |= self._values_of(self.update)
+        if self.last_update is not None:
+            values |= self._values_of(self.last_update)
         return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}
 
     def _values_of(self, update: Update) -> dict[str, str]:
