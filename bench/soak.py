@@ -130,12 +130,12 @@ def main(argv: list[str] | None = None) -> int:
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
         stream = record(arm, mae, part, PART)
         for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
-            accepted, update = learner.samples.accepted, learner.update
+            accepted, update = learner.samples.accepted, learner.last_update
             messages += 1
             learner.step(messages * SAMPLE_TIME, theta, tension, length)
             training.samples += learner.samples.accepted - accepted
-            if learner.update is not None and learner.update is not update:
-                reopened += bool(learner.update.changed)
+            if learner.last_update is not None and learner.last_update is not update:
+                reopened += bool(learner.last_update.changed)
         now = PART * (part + 1)
         error = estimation_error(learner.mae, held_out, 10)
         if now >= SETTLED:

@@ -24,7 +24,7 @@ from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import Prior, fit_body
+from musculoskeletal_ae.learning.body_fit import fit_body
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -47,7 +47,7 @@ def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
         learner.step(n * SAMPLE_TIME, *values)
     seen, body = learner.samples.observations(), CorrectedBody(robot, seed=seed)
     for _ in range(FITS):
-        fit_body(body, seen, Prior())
+        fit_body(body, seen)
     holding = np.array([robot.kinematics.holding_torque(theta) for theta in seen.theta])
     true = Individual(robot, seed).muscle_jacobian(seen.theta)
     fitted = learned(robot, body).muscle_jacobian(seen.theta)

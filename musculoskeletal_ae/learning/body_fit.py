@@ -73,6 +73,7 @@ class Prior:
         return mean
 
 
+PRIOR = Prior()
 #: of a muscle that was replaced or re-wired, around what it was before
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
 
@@ -95,9 +96,8 @@ class Fit:
 def fit_body(
     body: CorrectedBody,
     seen: Observations,
-    prior: Prior,
+    prior: Prior = PRIOR,
     prior_mean: list[Array] | None = None,
-    rounds: int = ROUNDS,
 ) -> Fit:
     """Fit the parameters of a body in place.
 
@@ -108,7 +108,6 @@ def fit_body(
             was changed: what they said is where its new parameters are looked for.
         prior_mean: Parameters learned before, without the samples that they came from; they take
             the place of the geometric model.
-        rounds: Gauss–Newton steps.
     """
     poses = body.poses(seen.theta)
     parts = []
@@ -117,9 +116,9 @@ def fit_body(
         if prior_mean is not None:
             mean = prior_mean[m]
         if (~known).sum() >= LEAST_ANCHOR:
-            _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, rounds, m)
+            _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
-        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, prior.noise, rounds, m))
+        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, prior.noise, m))
     residual, noise, weight = zip(*parts, strict=True)
     return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
 
@@ -132,7 +131,6 @@ def _fit_muscle(
     mean: Array,
     spread: Array,
     least_noise: float,
-    rounds: int,
     m: int,
 ) -> tuple[Array, float, Array]:
     precision = 1.0 / spread**2
@@ -140,7 +138,7 @@ def _fit_muscle(
     noise, weight = FIRST_NOISE, known
     data = poses, seen.theta, seen.tension[:, m], seen.direction[:, m]
     length, jacobian = body.linearised(*data, m)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         at = body.parameters[m]
         target = seen.length[:, m] - length + jacobian @ at
         # The robust weights are iterated within one linearisation.
@@ -190,7 +188,7 @@ NETWORK_STATES = 400  # that a network is asked for
 NETWORK_ERROR = 0.001  # [m] by which its lengths may err
 
 
-def fit_to_network(body: CorrectedBody, mae: Mae, prior: Prior, seed: int = 0) -> None:
+def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
     """Fit a body in place to the lengths that a learned network restores.
 
     A checkpoint carries what was learned of an arm, but not the samples (`train --from-bag`,
@@ -200,7 +198,6 @@ def fit_to_network(body: CorrectedBody, mae: Mae, prior: Prior, seed: int = 0) -
     Args:
         body: Becomes the network's.
         mae: Learned on a real arm.
-        prior: How bodies differ from the geometric model.
         seed: Draws the states that are asked for.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
@@ -210,4 +207,4 @@ def fit_to_network(body: CorrectedBody, mae: Mae, prior: Prior, seed: int = 0) -
     lengths = mae.lengths(theta, tension)
     everything = np.ones(shape, dtype=bool)
     seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
-    fit_body(body, seen, replace(prior, noise=NETWORK_ERROR))
+    fit_body(body, seen, replace(PRIOR, noise=NETWORK_ERROR))

@@ -47,7 +47,7 @@ class Learner:
         enabled: Whether it learns.
         training: Where updates are made.
         updates: How many updates there were.
-        update: What came of the last one.
+        last_update: What came of the last one; None before.
         published: How many checkpoints `poll` has given out.
     """
 
@@ -89,7 +89,7 @@ class Learner:
         self._mae: Mae | None = None
         self.checkpoint: bytes | None = None
         self.enabled = True
-        self.update: Update | None = None
+        self.last_update: Update | None = None
         self.updates = self.published = 0
         self._pairing = Pairing(period)
         self._healthy = Reservoir(robot.muscle_count, seed, novelty)
@@ -171,7 +171,7 @@ class Learner:
         if update is not None:
             self._take(update)
         if self._state is not None:
-            self._state.poll(self.samples, self.checkpoint)
+            self._state.keep(self.samples, self.checkpoint, changed=False)
         if not self._to_publish or _lately(self._given, now):
             return None
         self._to_publish, self._given = False, now
@@ -190,7 +190,7 @@ class Learner:
 
     def _take(self, update: Update) -> None:
         """Use what came of an update."""
-        self.update, self.updates = update, self.updates + 1
+        self.last_update, self.updates = update, self.updates + 1
         # Its statistics may be of the arm before a muscle was changed.
         mae = uncalibrated(update.mae) if self._forgot or update.changed else update.mae
         self._statistics_hold |= is_calibrated(mae)
@@ -264,9 +264,7 @@ class Learner:
         """
         if self._state is None:
             raise StateError("state_directory is '': nothing is kept; start with a directory")
-        self._state.keep(self.samples, self.checkpoint, at_once=True)
-        if self._state.trouble:
-            raise StateError(self._state.trouble)
+        self._state.save(self.samples, self.checkpoint)
         return self._state.directory
 
     def _keep(self) -> None:
@@ -322,8 +320,8 @@ class Learner:
             values['state directory'] = str(self._state.directory)
             if self._state.not_used:
                 values['saved state not used'] = self._state.not_used
-        if self.update is not None:
-            values |= self._values_of(self.update)
+        if self.last_update is not None:
+            values |= self._values_of(self.last_update)
         return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}
 
     def _values_of(self, update: Update) -> dict[str, str]:

@@ -51,66 +51,56 @@ class RestDetector:
     def __init__(self, settings: RestSettings) -> None:
         """Start with an empty window."""
         self.settings = settings
-        self._window: deque[tuple[float, Array | None, Sample]] = deque(maxlen=MOST)
-        self._rest: list[Sample] = []
-        self._span = 0.0
-        self._time = 0.0
-        self._still = False
+        self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
+        self.reset()
 
     def reset(self) -> None:
         """Forget the window, as after a jump of the clock."""
         self._window.clear()
-        self._rest.clear()
-        self._span, self._time, self._still = 0.0, 0.0, False
+        self._rest: list[Sample] = []
+        self._span = self._time = 0.0
+        self._still = False
 
-    def step(self, reading: Sample, measured: bool, dt: float) -> Sample | None:
+    def step(self, reading: Sample, dt: float) -> Sample | None:
         """Take one reading; return the mean of a rest that ended or is long enough.
 
         Args:
-            reading: One message; its θ counts only if it was `measured`.
-            measured: Whether a θ belongs to this message.
+            reading: One message; its θ is NaN where none was measured.
             dt: Time since the message before [s].
         """
         self._time += dt
-        self._window.append((self._time, reading.theta if measured else None, reading))
+        self._window.append((self._time, reading))
         while self._time - self._window[0][0] > self.settings.window + 1e-9:
             self._window.popleft()
         was_still, self._still = self._still, self._is_still()
+        if not self._still and not was_still:
+            return None
         if self._still:
-            if not was_still:
-                self._rest = [r for _, theta, r in self._window if theta is not None]
-                self._span = self.settings.window
-            else:
-                self._span += dt
-                if measured:
-                    self._rest.append(reading)
+            new = [reading] if was_still else [reading for _, reading in self._window]
+            self._rest += filter(_measured, new)
+            self._span = self._span + dt if was_still else self.settings.window
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
-        elif not was_still:
-            return None
-        return self._finish()
-
-    def _finish(self) -> Sample | None:
-        if not self._rest:
-            return None
-        columns = (np.mean(column, axis=0) for column in zip(*self._rest, strict=True))
-        self._rest, self._span = [], 0.0
-        return Sample(*columns)
+        rest, self._rest, self._span = self._rest, [], 0.0
+        return Sample(*(np.mean(column, axis=0) for column in zip(*rest))) if rest else None
 
     def _is_still(self) -> bool:
         half = 0.5 * self.settings.window
         if self._time - self._window[0][0] < 0.9 * self.settings.window:
             return False
         middle = self._time - half
-        first = [(theta, r) for t, theta, r in self._window if t <= middle]
-        second = [(theta, r) for t, theta, r in self._window if t > middle]
-        angles = [np.array([a for a, _ in part if a is not None]) for part in (first, second)]
+        halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]
+        angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
         if min(map(len, angles)) < self.settings.least_readings:
             return False
-        lengths = [np.array([r.length for _, r in part]) for part in (first, second)]
+        lengths = [np.array([r.length for r in part]) for part in halves]
         return _unmoved(angles, self.settings.joint_rate * half) and _unmoved(
             lengths, self.settings.length_rate * half
         )
+
+
+def _measured(reading: Sample) -> bool:
+    return not math.isnan(reading.theta[0])
 
 
 def _unmoved(halves: list[Array], allowed: float) -> bool:
@@ -230,7 +220,7 @@ class RestCollector:
         direction = self._direction.step(length, dt)
         nothing = np.full(self._robot.joint_count, np.nan)
         reading = Sample(nothing if theta is None else theta, tension, length, direction)
-        rest = self._detector.step(reading, theta is not None, dt)
+        rest = self._detector.step(reading, dt)
         if self.anomaly or self._time < self._closed_until:
             if rest is not None:
                 self.rejected['anomaly'] += 1

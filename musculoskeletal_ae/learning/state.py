@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.learning import old_state
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
@@ -41,7 +42,7 @@ TABLES = (
     'CREATE TABLE IF NOT EXISTS network (checksum INTEGER NOT NULL, checkpoint BLOB NOT NULL)',
 )
 SAMPLES = 'SELECT number, record FROM sample ORDER BY number'
-HEAD = struct.Struct('<8sIQ')  # mark, checksum, number
+HEAD = struct.Struct('<8sI')  # mark, checksum
 MARK = b'MAEsampl'
 #: between two looks at the file, and two attempts to write what could not be written [s]
 LOOK, PAUSE = 0.5, 2.0
@@ -66,7 +67,8 @@ class State:
         self.not_used = self.trouble = ''
         self._file = self.directory / FILE
         self._robot = robot
-        self._names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
+        names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
+        self._seed = zlib.crc32(names.encode())  # of checksums: another robot's records do not fit
         self._connection: sqlite3.Connection | None = None
         self._next_look = 0.0
         try:
@@ -98,8 +100,15 @@ class State:
         self._opened = self._identity()
 
     def _identity(self) -> tuple[int, int]:
-        found = self._file.stat()
-        return found.st_dev, found.st_ino
+        status = self._file.stat()
+        return status.st_dev, status.st_ino
+
+    def close(self) -> None:
+        """Release the directory; all is on disk already."""
+        if self._connection is not None:
+            with suppress(sqlite3.Error):
+                self._connection.close()
+            self._connection = None
 
     # -- reading --------------------------------------------------------------------------------
 
@@ -149,84 +158,76 @@ class State:
             if said != 'ok':
                 raise sqlite3.DatabaseError(said)
         except (sqlite3.Error, TypeError, ValueError) as error:
-            problem, records = f'{self._file}: damaged ({error})', self._salvaged()
-        for record in records:
-            self._restore(record, samples)
+            problem = f'{self._file}: damaged ({error})'
+            whole = self._file.read_bytes()
+            places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
+            records = [whole[place : place + self._size] for place in places]
+        unpacked = filter(None, map(self._unpacked, records))
+        for number, sample, known in sorted(unpacked, key=lambda record: record[0]):
+            if number in samples.numbers:  # an older copy: what was forgotten stays so
+                samples.known[samples.numbers.index(number)] &= known
+            else:
+                samples.add(sample, known, number)
         if records and not samples:
             problem = f'{self._file}: made by a learner of other joints and muscles'
         return problem, data
 
-    def _salvaged(self) -> list[bytes]:
-        """Return what looks like a record of ours, wherever it is in the file."""
-        data, size = self._file.read_bytes(), HEAD.size + 8 * self._width
-        places = (match.start() for match in re.finditer(re.escape(MARK), data))
-        records = {data[place : place + size] for place in places}
-        return sorted(records, key=lambda record: HEAD.unpack_from(record.ljust(HEAD.size))[2])
-
     @property
-    def _width(self) -> int:
-        return self._robot.joint_count + 4 * self._robot.muscle_count
+    def _size(self) -> int:
+        return HEAD.size + 8 * (1 + self._robot.joint_count + 4 * self._robot.muscle_count)
 
-    def _restore(self, record: bytes, samples: SampleStore) -> None:
-        if len(record) != HEAD.size + 8 * self._width:
-            return
-        _, checksum, number = HEAD.unpack_from(record)
-        payload = record[HEAD.size :]
-        if checksum != self._checksum(number, payload):
-            return
+    def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
+        values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
+        return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
+
+    def _unpacked(self, record: bytes) -> tuple[int, Sample, Bools] | None:
+        values = record[HEAD.size :]
+        if len(record) != self._size:
+            return None
+        _, checksum = HEAD.unpack_from(record)
+        if checksum != zlib.crc32(values, self._seed):
+            return None
         joints, muscles = self._robot.joint_count, self._robot.muscle_count
-        *parts, known = np.split(np.frombuffer(payload), joints + muscles * np.arange(4))
-        if number in samples.numbers:  # an older copy, salvaged: what was forgotten stays so
-            samples.known[samples.numbers.index(number)] &= known > 0.5
-        else:
-            samples.add(Sample(*(part.copy() for part in parts)), known > 0.5, number)
+        ends = [1, *(1 + joints + muscles * np.arange(4))]
+        number, *parts, known = np.split(np.frombuffer(values).copy(), ends)
+        return int(number[0]), Sample(*parts), known > 0.5
 
     # -- writing --------------------------------------------------------------------------------
 
-    def _checksum(self, number: int, payload: bytes) -> int:
-        return zlib.crc32(number.to_bytes(8, 'little') + payload, zlib.crc32(self._names.encode()))
-
-    def _records(self, samples: SampleStore) -> dict[int, bytes]:
-        records = {}
-        for number, sample, known in zip(
-            samples.numbers, samples.samples, samples.known, strict=True
-        ):
-            payload = np.concatenate([*sample, known]).astype('<f8').tobytes()
-            head = HEAD.pack(MARK, self._checksum(number, payload), number)
-            records[number] = head + payload
-        return records
-
-    def keep(self, samples: SampleStore, checkpoint: bytes | None, at_once: bool = False) -> None:
+    def keep(self, samples: SampleStore, checkpoint: bytes | None, changed: bool = True) -> None:
         """Bring the disk in line with memory; it is on return, or there is `trouble`.
 
         Args:
             samples: All samples.
             checkpoint: The newest network; None for none.
-            at_once: In trouble too, not only some time after the last attempt.
+            changed: Whether there is something new; else it is enough to look now and then whether
+                the file is still there.
         """
-        if self.trouble and not at_once and time.monotonic() < self._next_look:
+        now = time.monotonic()
+        if now < self._next_look and (self.trouble or not changed):
             return
+        self._next_look = now + LOOK
         try:
             self._look()
             if self._connection is None:
                 self._open()
-            assert self._connection is not None
-            self._write(self._connection, samples, checkpoint)
+            if changed or self.trouble:
+                assert self._connection is not None
+                self._write(self._connection, samples, checkpoint)
             self.trouble = ''
         except (OSError, sqlite3.Error) as error:
             self._failed(error)
 
-    def poll(self, samples: SampleStore, checkpoint: bytes | None) -> None:
-        """Look now and then whether the file is still there; mend what is amiss."""
-        if time.monotonic() < self._next_look:
-            return
-        self._next_look = time.monotonic() + LOOK
-        try:
-            self._look()
-        except OSError as error:
-            self._failed(error)
+    def save(self, samples: SampleStore, checkpoint: bytes | None) -> None:
+        """Bring the disk in line at once.
+
+        Raises:
+            StateError: If that cannot be done.
+        """
+        self._next_look = 0.0
+        self.keep(samples, checkpoint)
         if self.trouble:
-            self.keep(samples, checkpoint)
+            raise StateError(self.trouble)
 
     def _look(self) -> None:
         if self._connection is not None and self._identity() != self._opened:
@@ -249,7 +250,13 @@ class State:
             connection.execute('BEGIN IMMEDIATE')
             for table in TABLES:
                 connection.execute(table)
-            wanted, stored = self._records(samples), dict(connection.execute(SAMPLES))
+            wanted = {
+                number: self._packed(number, sample, known)
+                for number, sample, known in zip(
+                    samples.numbers, samples.samples, samples.known, strict=True
+                )
+            }
+            stored = dict(connection.execute(SAMPLES))
             gone = [(n,) for n, record in stored.items() if wanted.get(n) != record]
             new = [(n, record) for n, record in wanted.items() if stored.get(n) != record]
             connection.executemany('DELETE FROM sample WHERE number = ?', gone)
@@ -298,13 +305,6 @@ class State:
         _sync(self.directory)
         if problem:
             self.not_used = f'{problem} (kept in {backup})'
-
-    def close(self) -> None:
-        """Release the directory; all is on disk already."""
-        if self._connection is not None:
-            with suppress(sqlite3.Error):
-                self._connection.close()
-            self._connection = None
 
 
 def _connect(file: Path) -> sqlite3.Connection:

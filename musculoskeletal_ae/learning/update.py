@@ -21,7 +21,7 @@ from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, Prior, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, fit_body, fit_to_network
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.training import Job, Update, history, learned_steps, newest_error
@@ -50,16 +50,15 @@ class BodyUpdater:
         body: As it was fitted last.
     """
 
-    def __init__(self, robot: Robot, mae: Mae, seed: int = 0, prior: Prior | None = None) -> None:
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network, and from the body that it knows if it has learned one."""
         self._robot, self._origin, self._mae = robot, mae, mae
-        self._prior = prior or Prior()
         self.body = CorrectedBody(robot, seed=seed)
         self._seed = seed
         #: what the network knew of the body, in the place of the geometric model
         self._prior_mean: list[Array] | None = None
         if learned_steps(mae):
-            fit_to_network(self.body, mae, self._prior, seed)
+            fit_to_network(self.body, mae, seed)
             self._prior_mean = list(self.body.parameters)
         self._prior_mean_confirmed = False
         self._trainer = Trainer(from_mae(mae), seed, learned_steps(mae))
@@ -71,7 +70,7 @@ class BodyUpdater:
         seen, robot = job.seen, self._robot
         error = newest_error(self._mae, seen)
         body = self.body = self._body_to_go_on_from(seen)
-        fit = fit_body(body, seen, self._prior, self._prior_mean)
+        fit = fit_body(body, seen, prior_mean=self._prior_mean)
         contradicted = contradicted_muscles(seen, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
         # the robust weights leave such samples out until they are the rule.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import Prior, fit_body
+from musculoskeletal_ae.learning.body_fit import fit_body
 from musculoskeletal_ae.learning.samples import Observations
 
 
@@ -45,18 +45,18 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):
     states = stage.states(300)
     nominal, body = CorrectedBody(arm26), CorrectedBody(arm26)
-    fit_body(body, stage.store(20).observations(), Prior())
+    fit_body(body, stage.store(20).observations())
     assert rms(body, *states) < rms(nominal, *states) / 3.0
 
 
 def test_bad_samples_do_not_poison_the_fit(arm26, stage):
     store = stage.store(60)
     clean = CorrectedBody(arm26)
-    fit_body(clean, store.observations(), Prior())
+    fit_body(clean, store.observations())
     for n in range(0, 60, 10):
         store.samples[n] = store.samples[n]._replace(length=store.samples[n].length + 0.05)
     poisoned = CorrectedBody(arm26)
-    fit = fit_body(poisoned, store.observations(), Prior())
+    fit = fit_body(poisoned, store.observations())
     states = stage.states(300)
     assert rms(poisoned, *states) < 1.5 * rms(clean, *states)
     assert (fit.weight[::10] < 0.1).all()
@@ -67,7 +67,7 @@ def test_samples_that_say_nothing_change_nothing(arm26, stage):
     nothing = Observations(*observations.__dict__.values())
     nothing.known[:] = False
     body = CorrectedBody(arm26)
-    fit_body(body, nothing, Prior())
+    fit_body(body, nothing)
     states = stage.states(50)
     np.testing.assert_allclose(
         body.lengths(states[0], states[1], np.zeros((50, 6)))[0],
@@ -79,7 +79,7 @@ def test_samples_that_say_nothing_change_nothing(arm26, stage):
 def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_know(arm26, stage):
     store = stage.store(60)
     body = CorrectedBody(arm26)
-    fit_body(body, store.observations(), Prior())
+    fit_body(body, store.observations())
     before = [p.copy() for p in body.parameters]
     states = stage.states(100)
     (known,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
@@ -88,7 +88,7 @@ def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_k
         sample = stage.sample()
         shift = 0.01 * (np.arange(6) == 2)
         store.add(sample._replace(length=sample.length + shift))
-    fit_body(body, store.observations(), Prior())
+    fit_body(body, store.observations())
     offset = body.layouts[2].offset
     assert abs(body.parameters[2][offset] - before[2][offset] - 0.01) < 0.001
     (found,) = body.lengths(states[0], states[1], np.zeros((100, 6)))

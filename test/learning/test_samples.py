@@ -22,14 +22,15 @@ from musculoskeletal_ae.learning.samples import Sample, SampleStore
 DT = 0.01
 
 
-def reading(theta, length, tension=50.0):
-    return Sample(np.full(2, theta), np.full(6, tension), np.full(6, length), np.zeros(6))
+def reading(theta, length):
+    return Sample(np.full(2, theta), np.full(6, 50.0), np.full(6, length), np.zeros(6))
 
 
 def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=lambda _: True):
     found = []
     for n in range(round(seconds / DT)):
-        rest = detector.step(reading(theta(n * DT), length(n * DT)), measured(n), DT)
+        angle = theta(n * DT) if measured(n) else np.nan
+        rest = detector.step(reading(angle, length(n * DT)), DT)
         if rest is not None:
             found.append(rest)
     return found

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -104,13 +105,37 @@ def test_pauses_between_processes_grow(process, initial, monkeypatch):
     assert pauses == pytest.approx([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0, 60.0], abs=0.5)
 
 
-@pytest.mark.parametrize('nonsense', [b'no checkpoint', (b'no checkpoint', 0.0), None, 'text'])
-def test_an_answer_that_cannot_be_taken_ends_the_process(
-    process, initial, stage, monkeypatch, nonsense
-):
+class Nonsense:
+    """A connection to a process that answers nonsense."""
+
+    def __init__(self, answer) -> None:
+        self.answer = answer
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def send(self, _):
+        pass
+
+    def recv(self):
+        return self.answer
+
+
+@pytest.mark.parametrize('answer', [b'no checkpoint', (b'no checkpoint', 0.0, 0.0), None, 'text'])
+def test_nonsense_is_no_answer(arm26, initial, answer):
+    jobs, answers = queue.SimpleQueue(), queue.SimpleQueue()
+    jobs.put('a job')
+    training._talk(Nonsense(answer), None, initial, arm26, jobs, answers)
+    assert isinstance(answers.get_nowait(), str)
+
+
+def test_an_answer_that_cannot_be_taken_ends_the_process(process, initial, stage, monkeypatch):
     process.begin(initial)
     with monkeypatch.context() as patch:
-        patch.setattr(training.Connection, 'recv', lambda _: nonsense)
+        patch.setattr(training.Connection, 'recv', lambda _: None)
         process.submit(job(stage.store(3), steps=1))
         assert answer(process) is None
     assert 'died' in process.trouble
@@ -134,14 +159,15 @@ def test_a_process_that_cannot_be_started_is_started_later(process, initial, sta
 NODE = """
     import sys, time
     from pathlib import Path
+    from musculoskeletal_ae.learning.learner import Learner
     from musculoskeletal_ae.learning.training import TrainingProcess
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.robot.robot import Robot
 
     if __name__ == '__main__':
         robot = Robot.load('arm26')
-        process = TrainingProcess(robot, 'default')
-        process.begin(checkpoint.load(sys.argv[1], robot))
+        mae = checkpoint.load(sys.argv[1], robot)
+        process = Learner(robot, mae, training=TrainingProcess).training
         print(process.pid, 'torch' in sys.modules, flush=True)
         try:
             time.sleep(60.0)
