@@ -157,7 +157,7 @@ def test_a_process_that_cannot_be_started_is_started_later(process, initial, sta
 
 
 NODE = """
-    import sys, time
+    import signal, sys, time
     from pathlib import Path
     from musculoskeletal_ae.learning.learner import Learner
     from musculoskeletal_ae.learning.training import TrainingProcess
@@ -165,12 +165,15 @@ NODE = """
     from musculoskeletal_ae.robot.robot import Robot
 
     if __name__ == '__main__':
+        # A shell's background jobs are born with it ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         robot = Robot.load('arm26')
         mae = checkpoint.load(sys.argv[1], robot)
         process = Learner(robot, mae, training=TrainingProcess).training
-        print(process.pid, 'torch' in sys.modules, flush=True)
         try:
-            time.sleep(60.0)
+            print(process.pid, 'torch' in sys.modules, flush=True)
+            while True:
+                time.sleep(0.1)
         except KeyboardInterrupt:
             time.sleep(2.0)
             print(process._process.is_alive(), flush=True)
