@@ -40,9 +40,13 @@ def bringup(environment, *arguments):
 
 
 def left_behind(run):
-    """Return the commands that still run in the session of a bring-up, one a line."""
-    command = ['ps', '-ww', '-s', str(run.process.pid), '-o', 'pid=,args=']
-    return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    """Return the commands that still run in the session of a bring-up, one a line.
+
+    Not those that have ended: an orphan waits a moment until the system takes note of its end.
+    """
+    command = ['ps', '-ww', '-s', str(run.process.pid), '-o', 'stat=,pid=,args=']
+    lines = subprocess.run(command, capture_output=True, text=True).stdout.splitlines()
+    return '\n'.join(line.split(maxsplit=1)[1] for line in lines if not line.startswith('Z'))
 
 
 def statuses(output):
