@@ -106,6 +106,15 @@ class Stack(NamedTuple):
 
         return x @ last + last_bias, pullback
 
+    def tangent(self, x: Array, tangent: Array) -> tuple[Array, Array]:
+        """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
+        for i, (weight, bias) in enumerate(self.layers):
+            x, tangent = x @ weight + bias, tangent @ weight
+            if i < len(self.layers) - 1:
+                x, slope = self.activation.with_slope(x)
+                tangent = tangent * slope[..., None, :]
+        return x, tangent
+
 
 @dataclass(frozen=True, eq=False)
 class Mae:
@@ -254,12 +263,10 @@ class Mae:
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
-        _, pullback = self.lengths_with_pullback(theta, tension)
-        muscles = len(self.muscles)
-        # One gradient per muscle, along an axis in front.
-        each = np.eye(muscles).reshape(muscles, *(1,) * (theta.ndim - 1), muscles)
-        rows = pullback(np.broadcast_to(each, (muscles, *theta.shape[:-1], muscles)))
-        return np.moveaxis(rows, 0, -2)
+        x = np.concatenate((theta, tension), axis=-1)
+        turn = np.eye(theta.shape[-1], x.shape[-1])  # each joint by itself
+        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
+        return self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ①, shape (..., M, D).
