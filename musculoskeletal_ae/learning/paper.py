@@ -16,10 +16,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
-from musculoskeletal_ae.learning.training import Job, Update, history, newest_error
+from musculoskeletal_ae.learning.training import Job, Update
+from musculoskeletal_ae.learning.update import Updater
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.network import from_mae, to_mae
+from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import loss, one_thread
 from musculoskeletal_ae.mae.units import scale_vector
@@ -31,14 +31,12 @@ EPOCHS = 10  # C_epoch
 DATA = 10  # C_data
 
 
-class PaperUpdater:
+class PaperUpdater(Updater):
     """Learns as printed, on samples in their own units, by Adam of the initial training."""
-
-    body = None
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network."""
-        self._robot, self._origin, self._mae = robot, mae, mae
+        super().__init__(robot, mae)
         self._network = from_mae(mae)
         self._optimiser = Optimiser(self._network, PAPER.training.step_size, muon=False)
         self._rng = np.random.default_rng([seed, 0x9A])
@@ -46,8 +44,7 @@ class PaperUpdater:
 
     def update(self, job: Job) -> Update:
         """Learn one newest sample among stored ones; `job.steps` is the paper's own here."""
-        robot, seen = self._robot, job.seen
-        error = newest_error(self._mae, seen)
+        robot, seen, error = self._robot, job.seen, self._newest_error(job.seen)
         values = np.concatenate([seen.theta, seen.tension, seen.length], axis=1)
         values = values * scale_vector(robot.joint_count, robot.muscle_count)
         # The print knows no changed muscle: a sample that says nothing about one is none.
@@ -66,14 +63,6 @@ class PaperUpdater:
                 self._optimiser.step(1.0)
                 losses.append(value.item())
         self._steps += len(losses)
-        mae = to_mae(
-            self._network,
-            robot.joints,
-            robot.muscles,
-            self._origin.preset,
-            history(self._origin, len(seen), 'paper', self._steps),
-        )
-        before = self._mae if job.statistics_hold else uncalibrated(self._mae)
-        self._mae = recalibrated(mae, before.anomaly, job.healthy, len(seen))
+        mae = self._published(self._network, 'paper', self._steps, job)
         last = float(np.mean(losses[-BATCHES:])) if losses else np.nan
-        return Update(self._mae, last, error, np.empty(0))
+        return Update(mae, last, error, np.empty(0))

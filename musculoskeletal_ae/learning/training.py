@@ -11,7 +11,6 @@ import math
 import multiprocessing
 import os
 import queue
-import re
 import signal
 import threading
 import time
@@ -21,9 +20,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol
-
-import numpy as np
+from typing import TYPE_CHECKING, NamedTuple
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
@@ -35,10 +32,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CorrectedBody
-
-#: between how the network was made and what it learned since, in `Mae.training`
-LEARNED = '; learned online: '
-NEWEST = 20  # samples that tell how good the estimates are
+    from musculoskeletal_ae.learning.update import Updater
 
 
 class Job(NamedTuple):
@@ -81,17 +75,6 @@ class Update(NamedTuple):
     seconds: float = 0.0
 
 
-class Updater(Protocol):
-    """A way of learning; keeps network and optimiser from update to update."""
-
-    @property
-    def body(self) -> CorrectedBody | None:
-        """The corrected body as it was fitted last; None where none is."""
-
-    def update(self, job: Job) -> Update:
-        """Learn a little; bounded time for a bounded store."""
-
-
 def make_updater(robot: Robot, mae: Mae, preset: str, seed: int = 0) -> Updater:
     """Return the way of learning that a preset names.
 
@@ -105,25 +88,6 @@ def make_updater(robot: Robot, mae: Mae, preset: str, seed: int = 0) -> Updater:
     from musculoskeletal_ae.learning.paper import PaperUpdater
 
     return PaperUpdater(robot, mae, seed)
-
-
-def newest_error(mae: Mae, seen: Observations) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ over the newest samples [rad]."""
-    newest = slice(-NEWEST, None)
-    estimate = mae.estimate(seen.tension[newest], seen.length[newest]).theta
-    return float(np.linalg.norm(estimate - seen.theta[newest], axis=1).mean())
-
-
-def history(mae: Mae, samples: int, preset: str, steps: int) -> str:
-    """Return how a network was made and what it learned since; `learned_steps` reads it."""
-    origin = mae.training.split(LEARNED)[0]
-    return f'{origin}{LEARNED}{samples} samples at rest, preset {preset}, {steps} steps'
-
-
-def learned_steps(mae: Mae) -> int:
-    """Return how many steps of preset `default` a network has learned on a real arm, or 0."""
-    said = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
-    return int(said[1]) if said else 0
 
 
 class Training:

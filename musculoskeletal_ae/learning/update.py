@@ -13,6 +13,8 @@ needs many, and gets them from the body.
 from __future__ import annotations
 
 import copy
+import re
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +26,7 @@ from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, fit_body, fit_to_network
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.training import Job, Update, history, learned_steps, newest_error
+from musculoskeletal_ae.learning.training import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
@@ -43,16 +45,61 @@ IN_A_ROW = 4
 LEAST_CHANGE, LEAST_BEFORE = 0.004, 8
 
 
-class BodyUpdater:
-    """Learns by the corrected body.
+#: between how the network was made and what it learned since, in `Mae.training`
+LEARNED = '; learned online: '
+NEWEST = 20  # samples that tell how good the estimates are
+
+
+class Updater(ABC):
+    """A way of learning online; keeps network and optimiser from update to update.
 
     Attributes:
-        body: As it was fitted last.
+        body: The corrected body as it was fitted last; None where none is.
     """
+
+    body: CorrectedBody | None = None
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        """Go on from a network."""
+        self._robot, self._origin, self._mae = robot, mae, mae
+
+    @abstractmethod
+    def update(self, job: Job) -> Update:
+        """Learn a little; bounded time for a bounded store."""
+
+    def _newest_error(self, seen: Observations) -> float:
+        """Return the mean of ‖θ_est − θ‖₂ over the newest samples [rad]."""
+        newest = slice(-NEWEST, None)
+        estimate = self._mae.estimate(seen.tension[newest], seen.length[newest]).theta
+        return float(np.linalg.norm(estimate - seen.theta[newest], axis=1).mean())
+
+    def _published(self, network: Network, preset: str, steps: int, job: Job) -> Mae:
+        """Return the network that runs, with its statistics, and with what it has learned."""
+        origin, samples = self._origin, len(job.seen)
+        history = (
+            f'{origin.training.split(LEARNED)[0]}{LEARNED}'
+            f'{samples} samples at rest, preset {preset}, {steps} steps'
+        )
+        mae = to_mae(network, origin.joints, origin.muscles, origin.preset, history)
+        before = self._mae if job.statistics_hold else uncalibrated(self._mae)
+        self._mae = recalibrated(mae, before.anomaly, job.healthy, samples)
+        return self._mae
+
+
+def learned_steps(mae: Mae) -> int:
+    """Return how many steps of preset `default` a network has learned on a real arm, or 0."""
+    said = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
+    return int(said[1]) if said else 0
+
+
+class BodyUpdater(Updater):
+    """Learns by the corrected body."""
+
+    body: CorrectedBody
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network, and from the body that it knows if it has learned one."""
-        self._robot, self._origin, self._mae = robot, mae, mae
+        super().__init__(robot, mae)
         self.body = CorrectedBody(robot, seed=seed)
         self._seed = seed
         #: what the network knew of the body, in the place of the geometric model
@@ -66,9 +113,8 @@ class BodyUpdater:
         self._statistics_held = True
 
     def update(self, job: Job) -> Update:
-        """Learn a little; bounded time for a bounded store."""
-        seen, robot = job.seen, self._robot
-        error = newest_error(self._mae, seen)
+        """Learn a little."""
+        seen, error = job.seen, self._newest_error(job.seen)
         body = self.body = self._body_to_go_on_from(seen)
         fit = fit_body(body, seen, prior_mean=self._prior_mean)
         contradicted = contradicted_muscles(seen, fit)
@@ -82,17 +128,8 @@ class BodyUpdater:
         data = synthetic_samples(body, fit.noise, count, self._rng)
         self._mix_in_real(data, body, seen, fit)
         loss = self._trainer.train(data, job.steps)
-        mae = to_mae(
-            self._trainer.network,
-            robot.joints,
-            robot.muscles,
-            self._origin.preset,
-            history(self._origin, len(seen), 'default', self._trainer.steps),
-        )
-        before = self._mae if job.statistics_hold else uncalibrated(self._mae)
-        self._mae = recalibrated(mae, before.anomaly, job.healthy, len(seen))
         return Update(
-            self._mae,
+            self._published(self._trainer.network, 'default', self._trainer.steps, job),
             loss,
             error,
             fit.noise,

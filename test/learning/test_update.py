@@ -8,8 +8,8 @@ import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.paper import PaperUpdater
-from musculoskeletal_ae.learning.training import Training, learned_steps, make_updater
-from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.learning.training import Training, make_updater
+from musculoskeletal_ae.learning.update import BodyUpdater, learned_steps
 from musculoskeletal_ae.presets import PAPER
 
 from .conftest import Stage, drawn_body, job
