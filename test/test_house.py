@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules that hold for the whole repository, and the linters of a sourced Jazzy where it has them."""
+"""Rules of the whole repository, and the linters of a sourced Jazzy where it has them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_every_document_that_code_cites_is_in_the_repository() -> None:
     assert not missing
 
 
-# -- the linters of ROS 2, which the wheels lack -----------------------------------------------------
+# -- the linters of ROS 2, which the wheels lack ---------------------------------------------------
 
 
 def test_ament_flake8() -> None:
