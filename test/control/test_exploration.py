@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from robots import write_robot
@@ -16,8 +18,7 @@ BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
 
 
 def steps(seed, count):
-    exploration = Exploration(ROBOT, seed)
-    return [exploration.next_step() for _ in range(count)]
+    return list(islice(Exploration(ROBOT, seed), count))
 
 
 def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
@@ -54,4 +55,4 @@ def test_a_seed_gives_its_own_stream_again():
 def test_an_arm_that_holds_no_posture_is_refused_with_a_remedy(tmp_path):
     robot = Robot.load(write_robot(tmp_path, tension={'bias': 30.0, 'limit': 30.001}))
     with pytest.raises(RobotDescriptionError, match='run check_robot'):
-        Exploration(robot, 0).next_step()
+        next(iter(Exploration(robot, 0)))
