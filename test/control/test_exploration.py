@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.exploration import Exploration, holdable_postures
+from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
 
 ROBOT = Robot.load('arm26')
 BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
@@ -42,6 +44,16 @@ def test_every_posture_can_be_held_and_lies_within_the_joint_limits():
         assert ((step.tension >= BIAS - 1e-6) & (step.tension <= LIMIT + 1e-6)).all()
         held = -ROBOT.routes.muscle_jacobian(step.theta).T @ step.tension
         np.testing.assert_allclose(held, ROBOT.kinematics.holding_torque(step.theta), atol=1e-6)
+
+
+def test_holdable_postures_are_held_by_their_tensions_on_another_body_too():
+    individual = Individual(ROBOT, 1)
+    postures = ROBOT.random_postures(50, np.random.default_rng(0))
+    for theta, tension in holdable_postures(ROBOT, postures, 5, individual.muscle_jacobian):
+        exerted = -individual.muscle_jacobian(theta[None])[0].T @ tension
+        np.testing.assert_allclose(exerted, ROBOT.kinematics.holding_torque(theta), atol=1e-6)
+        assert ((tension > BIAS - 1e-6) & (tension < LIMIT + 1e-6)).all()
+        holding_tension(ROBOT, theta)  # the nominal body holds it as well
 
 
 def test_a_seed_gives_its_own_stream_again():
