@@ -34,7 +34,7 @@ def read(path: Path, robot: Robot) -> Pairs:
     pairs = streams.pairs()
     if not len(pairs.time):
         problem = 'holds no joint_states and muscle_states that belong together'
-        raise BagError(path, None, problem, 'record both topics of this robot')
+        raise BagError(path, problem, 'record both topics of this robot')
     return pairs
 
 
