@@ -105,14 +105,14 @@ def _contents(bag: Bag) -> list[str]:
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
     summarised = all(file.summarised for file in bag.files)
     checked = all(file.checked for file in bag.files)
+    backward = sum(file.backward for file in bag.files) or 'no'
     summary = 'as in the summary' if summarised else 'no summary to compare with'
     metadata = 'as in' if bag.metadata and not bag.unfinished else 'no final'
     lines = [
         f'{bag.path}: {bag.message_count} messages, {length}',
         f'counts: {summary}, {metadata} metadata.yaml',
         f'checksums: {"of everything" if checked else "none, or not of everything"}',
-        f'order: {sum(file.backward for file in bag.files) or "no"} messages in the file are '
-        'earlier than the one before',
+        f'order: {backward} messages in the file are earlier than the one before',
         '',
         f'{"topic":<44} {"messages":>9} {"Hz":>9} {"gap s":>8}  type',
     ]

@@ -111,7 +111,7 @@ class McapFile:
         return file
 
     def messages(self, block: Block) -> Iterator[BagMessage]:
-        """Yield the messages of a block in their order; a BagError says that the file has changed."""
+        """Yield the messages of a block in their order; a BagError says that it has changed."""
         try:
             with open_regular(self.path, _unreadable) as stream:
                 stream.seek(block.offset)
@@ -223,7 +223,7 @@ def _records(
         if opcode not in legal:
             raise ValueError(f'record {opcode:#04x} does not belong here')
         if length > LARGEST:
-            raise ValueError(f'a record claims {length} bytes, which exceeds {LARGEST}')
+            raise ValueError(f'a record claims {length} bytes, which exceeds the limit {LARGEST}')
         if begin > size:
             return
         data = head + stream.read(length)
@@ -232,10 +232,11 @@ def _records(
 
 
 def _records_in(data: bytes, legal: Collection[int]) -> Iterator[mcap.McapRecord]:
-    end = 0
+    stop = 0
     for end, _, record in _records(BytesIO(data), 0, len(data), legal):
+        stop = end
         yield record
-    if end != len(data):
+    if stop != len(data):
         raise ValueError('a record reaches beyond the end')
 
 
@@ -285,4 +286,4 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
 
 
 def _unreadable(file: Path, problem: str) -> BagError:
-    return BagError(file, problem, 'choose another file')
+    return BagError(file, problem, 'name another bag directory or .mcap')

@@ -8,7 +8,7 @@ The classes name and order its entries as rosbag2 does.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ FILE = 'metadata.yaml'
 VERSION = 9
 REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yaml'
 
-Qos = dict[str, Any]  # a profile as rosbag2 writes it in version 9
+Qos = Mapping[str, Any]  # a profile as rosbag2 writes it in version 9
 
 _MARK = 'musculoskeletal_ae_unfinished'
 _NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
@@ -55,6 +55,13 @@ class TopicCount(Struct):
     message_count: int
 
 
+class _BagFile(Struct):
+    path: str
+    starting_time: _Time
+    duration: _Duration
+    message_count: int
+
+
 class Metadata(Struct, kw_only=True):
     """What metadata.yaml says."""
 
@@ -77,7 +84,7 @@ class Metadata(Struct, kw_only=True):
         return not (isinstance(self.custom_data, dict) and _MARK in self.custom_data)
 
 
-class _File(Struct):
+class _Document(Struct):
     rosbag2_bagfile_information: Metadata
 
 
@@ -122,21 +129,22 @@ def write_metadata(
         finished: Whether the recording was ended.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
-    span = {'starting_time': _Time(start), 'duration': _Duration(end - start)}
+    starting_time, duration = _Time(start), _Duration(end - start)
     count = sum(topic.message_count for topic in topics)
     metadata = Metadata(
         version=VERSION,
         storage_identifier='mcap',
-        **span,
+        duration=duration,
+        starting_time=starting_time,
         message_count=count,
         topics_with_message_count=topics,
         relative_file_paths=[name],
-        files=[{'path': name, **span, 'message_count': count}],
+        files=[_BagFile(name, starting_time, duration, count)],
         custom_data=None if finished else {_MARK: 'true'},
     )
     new = directory / f'{FILE}.new'
     with new.open('w', encoding='utf-8') as stream:
-        stream.write(_yaml(_File(metadata)))
+        stream.write(_yaml(_Document(metadata)))
         if finished:
             stream.flush()
             os.fsync(stream.fileno())
@@ -149,7 +157,7 @@ def read_metadata(directory: Path) -> Metadata | None:
     if not os.path.lexists(file):
         return None
     try:
-        metadata = convert(read_yaml(file, _unusable), _File).rosbag2_bagfile_information
+        metadata = convert(read_yaml(file, _unusable), _Document).rosbag2_bagfile_information
         _check(metadata)
     except ValueError as error:
         raise _unusable(file, str(error)) from error

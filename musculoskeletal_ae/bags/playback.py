@@ -10,7 +10,8 @@ import math
 from collections.abc import Collection, Iterator
 from itertools import chain
 
-from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.mcap_file import BagMessage
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
 

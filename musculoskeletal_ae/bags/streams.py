@@ -109,8 +109,8 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         if stream.problem and not stream.values:
             problem = f'no message of {topic} fits the robot ({stream.problem})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
-    series = [
+    joints, states, lengths, tensions = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
-    ]
-    return Streams(*series, rejected)
+    )
+    return Streams(joints, states, lengths, tensions, rejected)

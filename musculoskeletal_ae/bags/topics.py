@@ -91,8 +91,9 @@ def select(
     else:
         names = _relative_names(bag, namespace)
     has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
-    relevant = {(DEFAULT,): SENT, (ALL,): list(TOPICS)}.get(tuple(wanted))
-    if relevant:
+    selections = {DEFAULT: SENT, ALL: list(TOPICS)}
+    if len(wanted) == 1 and wanted[0] in selections:
+        relevant = selections[wanted[0]]
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
             problem = f'has no topic to replay by default; {has}'
