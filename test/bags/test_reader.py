@@ -91,7 +91,7 @@ def test_the_fuzzer_starts_from_bags_that_are_read_in_full(tmp_path, content):
 
 
 def test_what_does_not_exist_is_named_so(tmp_path):
-    with pytest.raises(BagError, match='nothing: cannot be read: No such file .*name another bag'):
+    with pytest.raises(BagError, match=r'nothing: cannot be read: No such file .*name another bag'):
         Bag.open(tmp_path / 'nothing')
     with pytest.raises(BagError, match=r'neither metadata.yaml nor an mcap file'):
         Bag.open(tmp_path)
