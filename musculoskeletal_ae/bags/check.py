@@ -38,12 +38,10 @@ class BagCheck:
 
 
 def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
-    """Read a recording from end to end, every message included, and report.
+    """Read a recording (a directory or a .mcap) from end to end, every message, and report.
 
-    Args:
-        path: A directory or a bare .mcap.
-        robot: Shipped name or directory; None says which of the shipped robots it fits.
-        namespace: The one that is meant where the bag has several.
+    Without a robot (shipped name or directory) the report says which of the shipped ones fit; the
+    namespace is the one that is meant where the bag has several.
     """
     check = BagCheck()
     try:
@@ -54,15 +52,15 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
-    fits: list[str] = []
-    for name in shipped_robots() if robot is None else [robot]:
-        faults, rejected = _fit(bag, name, namespace)
-        if robot is not None:
-            check.faults += faults
-        if not faults:
-            check.lines += [] if fits else [f'rejected {n}: {why}' for why, n in rejected.items()]
-            fits.append(name)
-    if fits or robot is None:
+    results = {
+        name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
+    }
+    fits = [name for name, (faults, _) in results.items() if not faults]
+    if robot:
+        check.faults += results[robot][0]
+    if fits:
+        check.lines += [f'rejected {n}: {why}' for why, n in results[fits[0]][1].items()]
+    if fits or not robot:
         check.lines.append(f'fits: {", ".join(fits) or "none of the shipped robots (see --robot)"}')
     return check
 
@@ -82,11 +80,11 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     theta = pairs.theta[rows].clip(robot.lower, robot.upper)
     length, tension = pairs.length[rows], pairs.tension[rows]
     moved = length.std(axis=0) > _LEAST_MOTION
-    errors = np.empty((robot.muscle_count, robot.muscle_count))
-    for i in range(robot.muscle_count):
-        # The tension of the column stretches whichever muscle it is.
-        alike = np.repeat(tension[:, i : i + 1], robot.muscle_count, axis=1)
-        errors[i] = (length[:, i : i + 1] - robot.muscle_lengths(theta, alike)).std(axis=0)
+    columns = range(robot.muscle_count)
+    # The tension of the column stretches whichever muscle it is.
+    alike = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
+    modelled = [robot.muscle_lengths(theta, stretching) for stretching in alike]
+    errors = np.array([(length[:, [i]] - modelled[i]).std(axis=0) for i in columns])
     _, best = linear_sum_assignment(errors)
     return [
         (robot.muscles[i], robot.muscles[j])
@@ -137,8 +135,8 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], Counter
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'nothing says whether it fits {name}: no joint_states or muscle_states is in it'
         return [problem], streams.rejected
-    problem = f'the order of muscles is not that of {name}'
-    misplaced = misplaced_muscles(streams.pairs(), robot)
-    return [
-        f'{problem}: {muscle} behaves like {like}' for muscle, like in misplaced
-    ], streams.rejected
+    misplaced = [
+        f'the order of muscles is not that of {name}: {muscle} behaves like {like}'
+        for muscle, like in misplaced_muscles(streams.pairs(), robot)
+    ]
+    return misplaced, streams.rejected

@@ -38,11 +38,7 @@ def type_hash(type_name: str) -> str:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Return the message in serialized bytes.
-
-    Raises:
-        ValueError: If the bytes are not a message of that type.
-    """
+    """Return the message in serialized bytes; a ValueError says that they are none of the type."""
     try:
         return TYPESTORE.deserialize_cdr(data, type_name)
     # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes

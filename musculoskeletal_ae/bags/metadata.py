@@ -38,7 +38,7 @@ class _Time(Struct):
     nanoseconds_since_epoch: int
 
 
-class TopicMetadata(Struct):
+class Topic(Struct):
     """A topic."""
 
     name: str  # absolute
@@ -51,7 +51,7 @@ class TopicMetadata(Struct):
 class TopicCount(Struct):
     """A topic and its number of messages."""
 
-    topic_metadata: TopicMetadata
+    topic_metadata: Topic
     message_count: int
 
 
@@ -121,12 +121,8 @@ def write_metadata(
 ) -> None:
     """Write metadata.yaml in one step: a reader sees the old one or the new one.
 
-    Args:
-        directory: Of the bag.
-        name: Of the one mcap file in it.
-        topics: What the file holds.
-        times: Earliest and latest log time [ns]; empty without messages.
-        finished: Whether the recording was ended.
+    `name` is that of the one mcap file; `times` its earliest and latest log time [ns], [] without
+    messages.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
     starting_time, duration = _Time(start), _Duration(end - start)
@@ -159,9 +155,9 @@ def read_metadata(directory: Path) -> Metadata | None:
     try:
         metadata = convert(read_yaml(file, _unusable), _Document).rosbag2_bagfile_information
         _check(metadata)
+        return metadata
     except ValueError as error:
         raise _unusable(file, str(error)) from error
-    return metadata
 
 
 def _check(metadata: Metadata) -> None:

@@ -20,11 +20,7 @@ LONGEST_LAG = 1.0  # [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
-    """Return from when to when [ns, recorded] a bag is played: for `duration` [s] from `start` [s].
-
-    Raises:
-        BagError: If the bag is shorter than that.
-    """
+    """Return from when to when [ns, recorded] a bag is played: `duration` [s] from `start` [s]."""
     length = (bag.end - bag.start) / 1e9
     if start > length:
         raise BagError(bag.path, f'is {length:.3f} s long', 'give a smaller --start')
@@ -35,11 +31,8 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
     """Yield what is published from start to stop [ns, recorded].
 
-    What was latched before the start comes first, as it would reach a late joiner. Messages that
-    cannot be decoded end the replay: they do not reach the nodes.
-
-    Raises:
-        BagError: At such a message, or if the file has changed.
+    What was latched before the start comes first, as it would reach a late joiner. A message that
+    cannot be decoded ends the replay with a BagError: it does not reach the nodes.
     """
     held: dict[str, BagMessage] = {}
     if start > bag.start:
@@ -83,9 +76,8 @@ class Timeline:
 
     def resume(self, now: float) -> None:
         """Go on from where it stands."""
-        if self.paused:
-            self._steady = now
-            self.paused = False
+        self._recorded, self._steady = self.recorded(now), now
+        self.paused = False
 
     def catch_up(self, recorded: int, now: float) -> None:
         """Go on from `recorded` if it should have been published long ago."""

@@ -41,12 +41,9 @@ class Bag:
     def open(cls, path: str | Path, unfinished: bool = False) -> Bag:
         """Read a rosbag2 directory or a bare .mcap from end to end.
 
-        Args:
-            path: Of the directory or file.
-            unfinished: Take also what a killed recorder left, up to the last complete record.
-
         Raises:
-            UnfinishedBagError: If it was not ended and that is not allowed.
+            UnfinishedBagError: If it was not ended; `unfinished` allows that and takes what a
+                killed recorder left, up to the last complete record.
             BagError: If it is damaged or not what it says.
         """
         bag = cls(Path(path))
@@ -78,15 +75,10 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages by log time; equal times keep the order of the files.
+        """Yield messages on topics (None: all) from start to stop [ns, log time], both included.
 
-        Args:
-            topics: Recorded names; None for all.
-            start: Log times from here [ns].
-            stop: Log times up to here, included [ns].
-
-        Raises:
-            BagError: If a file has changed, or is so far out of order that memory would not do.
+        They come by log time; equal times keep the order of the files. A BagError says that a file
+        has changed, or is so far out of order that memory would not do.
         """
         wanted = self.topics.keys() if topics is None else set(topics)
         blocks = [

@@ -14,18 +14,11 @@ from musculoskeletal_ae.exceptions import BagError
 
 
 def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None]:
-    """Write all complete messages of a bag into a finished one.
+    """Write all complete messages of an unfinished bag, directory or .mcap, into a finished one.
 
-    Args:
-        path: An unfinished bag: a directory or a bare .mcap.
-        out: The new directory. None: a directory is replaced, and the original kept beside it as
-            `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`.
-
-    Returns:
-        The finished bag, its number of messages, and where the original is now if it was moved.
-
-    Raises:
-        BagError: If the bag is damaged otherwise, or is finished already.
+    Without a new directory `out`, a directory is replaced, and the original kept beside it as
+    `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`. Returned are the finished bag, its
+    number of messages, and where the original is now if it was moved.
     """
     bag, finished = _open(path)
     if finished and out is None:

@@ -80,8 +80,7 @@ class _Stream:
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
-    Raises:
-        BagError: If no message of a topic fits the robot, or the bag is damaged.
+    A BagError says that no message of a topic fits the robot, or that the bag is damaged.
     """
     muscles = robot.muscle_count
     streams = {

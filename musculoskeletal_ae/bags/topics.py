@@ -56,12 +56,8 @@ SENT = [name for name, topic in TOPICS.items() if topic.sent]
 def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    Args:
-        bag: An opened bag.
-        namespace: The one that is meant where the bag has several.
-
-    Raises:
-        BagError: If there are several, or a topic has a type other than the interface's.
+    `namespace` is the one that is meant where the bag has several; a BagError asks for it, or says
+    that a topic has a type other than the interface's.
     """
     names = _relative_names(bag, namespace)
     ours = {relative: name for name, relative in names.items() if relative in TOPICS}
@@ -81,9 +77,6 @@ def select(
             the interface), or relative or recorded names; these may be foreign to the interface.
         namespace: The one that is meant where the bag has several.
         keep_names: Publish under the recorded names.
-
-    Raises:
-        BagError: If nothing is left, or a wanted topic is not there or cannot be used.
     """
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.
@@ -91,9 +84,8 @@ def select(
     else:
         names = _relative_names(bag, namespace)
     has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
-    selections = {DEFAULT: SENT, ALL: list(TOPICS)}
-    if len(wanted) == 1 and wanted[0] in selections:
-        relevant = selections[wanted[0]]
+    if list(wanted) in ([DEFAULT], [ALL]):
+        relevant = SENT if wanted[0] == DEFAULT else TOPICS
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
             problem = f'has no topic to replay by default; {has}'
@@ -113,11 +105,11 @@ def latched_topics(bag: Bag) -> set[str]:
 
     Those of the interface are latched even if the recorder took no note of it.
     """
+    ours = {name for name, topic in TOPICS.items() if topic.latched}
     return {
         name
         for name, topic in bag.topics.items()
-        if 'transient_local' in topic.qos
-        or TOPICS.get(interface_name(name), Topic(topic.type)).latched
+        if 'transient_local' in topic.qos or interface_name(name) in ours
     }
 
 

@@ -11,15 +11,8 @@ from pathlib import Path
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
-from musculoskeletal_ae.bags import message_types
+from musculoskeletal_ae.bags import message_types, metadata
 from musculoskeletal_ae.bags.mcap_file import NO_SCHEMA
-from musculoskeletal_ae.bags.metadata import (
-    Qos,
-    TopicCount,
-    TopicMetadata,
-    qos_text,
-    write_metadata,
-)
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
@@ -37,7 +30,7 @@ class BagWriter:
         """Create the directory; one that exists must be empty, else there is a BagError."""
         self.directory = Path(directory)
         self._name = f'{self.directory.resolve().name}_0.mcap'
-        self._topics: dict[int, TopicMetadata] = {}
+        self._topics: dict[int, metadata.Topic] = {}
         self._schemas: dict[str, int] = {}
         self._pending: list[tuple[int, int, int, bytes]] = []
         self._pending_size = 0
@@ -59,7 +52,7 @@ class BagWriter:
         self._write_metadata(finished=False)
 
     def add_topic(
-        self, name: str, type_name: str, qos: Sequence[Qos], schema: Schema = NO_SCHEMA
+        self, name: str, type_name: str, qos: Sequence[metadata.Qos], schema: Schema = NO_SCHEMA
     ) -> int:
         """Add a topic by its absolute name and return its number.
 
@@ -71,9 +64,9 @@ class BagWriter:
             encoding, text = message_types.ENCODING, message_types.definition(type_name).encode()
         if type_name not in self._schemas:
             self._schemas[type_name] = self._mcap.register_schema(type_name, encoding, text)
-        extra = {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': type_hash}
+        extra = {'offered_qos_profiles': metadata.qos_text(qos), 'topic_type_hash': type_hash}
         number = self._mcap.register_channel(name, 'cdr', self._schemas[type_name], extra)
-        self._topics[number] = TopicMetadata(name, type_name, 'cdr', qos, type_hash)
+        self._topics[number] = metadata.Topic(name, type_name, 'cdr', qos, type_hash)
         self._write_metadata(finished=False)
         return number
 
@@ -124,9 +117,9 @@ class BagWriter:
     def _write_metadata(self, finished: bool) -> None:
         # Counts come with the end: until then readers go by what is in the mcap file.
         counts, times = (self._counts, self._times) if finished else (Counter[int](), [])
-        topics = [TopicCount(topic, counts[number]) for number, topic in self._topics.items()]
+        topics = [metadata.TopicCount(topic, counts[n]) for n, topic in self._topics.items()]
         with self._writing():
-            write_metadata(self.directory, self._name, topics, times, finished)
+            metadata.write_metadata(self.directory, self._name, topics, times, finished)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
