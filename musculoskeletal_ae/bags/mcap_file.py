@@ -12,6 +12,7 @@ import os
 import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -171,12 +172,12 @@ class McapFile:
         if self.ended and not footer:
             raise ValueError('a record reaches beyond the end')
         if self.ended and statistics:
-            read = {number: topic.message_count for number, topic in self.channels.items()}
-            said, total = statistics.channel_message_counts, sum(read.values())
-            differ = [number for number, count in said.items() if count != read.get(number, 0)]
-            if statistics.message_count != total or differ:
-                problem = f'counts {statistics.message_count} messages, {total} were read'
-                raise ValueError(f'the summary {problem}; channels that differ: {differ}')
+            read = Counter({number: topic.message_count for number, topic in self.channels.items()})
+            said = statistics.channel_message_counts
+            differ = [number for number, count in said.items() if count != read[number]]
+            if statistics.message_count != read.total() or differ:
+                problem = f'counts {statistics.message_count} messages, {read.total()} were read'
+                raise ValueError(f'the summary {problem}; channels that differ: {differ[:20]}')
             self.summarised = True
 
     def _add(self, message: mcap.Message, end: int, chunk: bool) -> None:

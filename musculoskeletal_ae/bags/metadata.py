@@ -55,13 +55,6 @@ class TopicCount(Struct):
     message_count: int
 
 
-class _BagFile(Struct):
-    path: str
-    starting_time: _Time
-    duration: _Duration
-    message_count: int
-
-
 class Metadata(Struct, kw_only=True):
     """What metadata.yaml says."""
 
@@ -125,17 +118,17 @@ def write_metadata(
     messages.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
-    starting_time, duration = _Time(start), _Duration(end - start)
+    time, span = _Time(start), _Duration(end - start)
     count = sum(topic.message_count for topic in topics)
     metadata = Metadata(
         version=VERSION,
         storage_identifier='mcap',
-        duration=duration,
-        starting_time=starting_time,
+        duration=span,
+        starting_time=time,
         message_count=count,
         topics_with_message_count=topics,
         relative_file_paths=[name],
-        files=[_BagFile(name, starting_time, duration, count)],
+        files=[{'path': name, 'starting_time': time, 'duration': span, 'message_count': count}],
         custom_data=None if finished else {_MARK: 'true'},
     )
     new = directory / f'{FILE}.new'
