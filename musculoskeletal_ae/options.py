@@ -145,11 +145,9 @@ class Parser(argparse.ArgumentParser):
         """Add `--seed`; the text says what it is the random seed of."""
         self.add_argument('--seed', type=seed, default=0, help=f'random seed {text}')
 
-    def add_seeds(self, default: tuple[int, ...] | None = (0,)) -> None:
+    def add_seeds(self, default: tuple[int, ...] | None, text: str = 'individual arms') -> None:
         """Add `--seeds`, the individual arms."""
-        self.add_argument(
-            '--seeds', type=seeds, default=default, metavar='N,…', help='individual arms'
-        )
+        self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
         """Add `--minutes` of robot time; the text says what happens in them."""
