@@ -40,7 +40,7 @@ class BringupStatus(Shell):
         self.listen(JointState, 'joint_states', self._measured, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        self.listen(Bool, 'anomaly_detected', self._detected, LATCHED)
+        self.listen(Bool, 'anomaly_detected', lambda m: setattr(self, 'detected', m.data), LATCHED)
         self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
         self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
@@ -52,9 +52,6 @@ class BringupStatus(Shell):
         if self.theta is not None:
             estimate = read_posture(message, self.robot.joints)
             self.errors.append(float(np.linalg.norm(estimate - self.theta)))
-
-    def _detected(self, message: Bool) -> None:
-        self.detected = message.data
 
     def _count_checkpoint(self, _: UInt8MultiArray) -> None:
         self.checkpoints += 1
@@ -72,10 +69,9 @@ class BringupStatus(Shell):
 
     def _print(self) -> None:
         now = time.monotonic()
-        if self.started is None:
-            if not self.anomalies:
-                return
-            self.started = now
+        if self.started is None and not self.anomalies:
+            return
+        self.started = self.started or now
         error, anomaly = (
             np.mean(values) if values else math.nan for values in (self.errors, self.anomalies)
         )

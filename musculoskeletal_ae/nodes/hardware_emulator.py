@@ -11,8 +11,7 @@ from functools import partial
 from typing import Any
 
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from std_msgs.msg import Float64MultiArray
+from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -20,7 +19,6 @@ from musculoskeletal_ae.nodes.arm import Arm
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.validity import read_array, read_wrench
 
 # After a pause (a debugger, a suspended machine) the arm goes on instead of catching up.
 LONGEST_STEP = 0.1  # [s]
@@ -31,7 +29,7 @@ class HardwareEmulator(Arm):
 
     def __init__(self, **options: Any) -> None:
         """Declare topics and start the arm; options are those of Node."""
-        super().__init__('hardware_emulator', **options)
+        super().__init__('hardware_emulator', lambda wrench: self.arm.set_wrench(wrench), **options)
         self.arm = EmulatedArm(self.robot, self.parameter('seed'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
@@ -42,30 +40,18 @@ class HardwareEmulator(Arm):
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)
         self.follow_parameter('marker_rate', partial(setattr, self, 'marker_rate'))
-        self.advertise('', joints=self.parameter('joint_sensors'), description=True)
+        self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._follow_length, RELIABLE)
-        self.listen(Float64MultiArray, 'muscle_tension_command', self._follow_tension, RELIABLE)
-        self.listen(WrenchStamped, 'hardware_emulator/external_wrench', self._push, RELIABLE)
-        self.create_service(Trigger, 'hardware_emulator/reset', self._reset)
+        self.follow_commands('length', self.arm.command_length)
+        self.follow_commands('tension', self.arm.command_tension)
+        self.serve(Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
         self.create_timer(1.0 / self.rate, self._tick)
 
-    def _follow_length(self, message: Float64MultiArray) -> None:
-        self.arm.command_length(read_array(message, 1, self.robot.muscle_count))
-
-    def _follow_tension(self, message: Float64MultiArray) -> None:
-        self.arm.command_tension(read_array(message, 1, self.robot.muscle_count))
-
-    def _push(self, message: WrenchStamped) -> None:
-        self.arm.set_wrench(read_wrench(message, self.robot.root_link))
-
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        response.success = True
-        response.message = 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
-        return response
+        return 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -74,8 +60,8 @@ class HardwareEmulator(Arm):
         whole = int(elapsed * 1000.0) / 1000.0
         self.remainder = elapsed - whole
         self.arm.step(whole)
-        reading = self.reading = self.arm.sense()
-        self.publish_state(reading.theta, reading.length, reading.tension, reading.temperature)
+        self.reading = self.arm.sense()
+        self.publish_state(*self.reading)
         if self.marker_rate > 0.0 and now >= self.pose_due:
             self.pose_due = max(self.pose_due + 1.0 / self.marker_rate, now)
             self._publish_pose()

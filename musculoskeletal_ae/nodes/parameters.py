@@ -27,6 +27,7 @@ from musculoskeletal_ae.parameters import (
 )
 
 SHARED = {'robot': ROBOT, 'rate': RATE}
+NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 #: by node, then by name
 PARAMETERS: dict[str, dict[str, Parameter]] = {
@@ -38,9 +39,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **parameters_of(ControlSettings),
     },
     'estimator': {
-        **SHARED,
-        'checkpoint': CHECKPOINT,
-        'preset': PRESET,
+        **NETWORK,
         'anomaly_threshold': Parameter(
             0.0,
             'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
@@ -55,27 +54,18 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(
-            (0.0,),
-            'error of the length sensors, one for all or one each',
-            'm',
-            settable=True,
+            (0.0,), 'error of the length sensors, one for all or one each', 'm', settable=True
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
         'marker_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
         'command_timeout': Parameter(
-            0.5,
-            'without a command for this long the modules go safe',
-            's',
-            (0.01, 60.0),
-            settable=True,
+            0.5, 'time without a command until the modules go safe', 's', (0.01, 60), settable=True
         ),
     },
     'sim': {
-        **SHARED,
-        'checkpoint': CHECKPOINT,
-        'preset': PRESET,
+        **NETWORK,
         'as_robot': Parameter(False, 'publish joint_states and muscle_states instead of sim/…'),
     },
     'learner': {

@@ -7,9 +7,7 @@ import ast
 import sys
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -34,26 +32,15 @@ def reason(error: Exception) -> str:
     return ' '.join(str(error).split(', at /')[0].split())
 
 
-def _refuse(error: object) -> NoReturn:
-    print(f'error: {error}', file=sys.stderr)
-    sys.exit(1)
-
-
-def help_of(node: str) -> str:
-    """Return what `--help` of a node says, without importing the node, which takes a second."""
-    spec = find_spec(f'musculoskeletal_ae.nodes.{node}')
-    assert spec is not None and spec.origin is not None
-    told = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding='utf-8')))
-    return f'{told}\n\n{help_text(node)}'
-
-
 def run(name: str) -> None:
     """Run one node on a single-threaded executor until it is asked to stop.
 
     What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
     """
     if {'--help', '-h'} & set(sys.argv[1:]):
-        print(help_of(name))
+        # Not by importing the node, which takes a second.
+        source = Path(__file__).with_name(f'{name}.py').read_text(encoding='utf-8')
+        print(ast.get_docstring(ast.parse(source)), help_text(name), sep='\n\n')
         return
     node: Node | None = None
     try:
@@ -66,12 +53,12 @@ def run(name: str) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except MusculoskeletalError as error:
-        _refuse(error)
+        sys.exit(f'error: {error}')
     except PARAMETER_ERRORS as error:
-        _refuse(reason(error))
+        sys.exit(f'error: {reason(error)}')
     except rclpy_implementation.RCLError as error:
         if node is None:
-            _refuse(reason(error))
+            sys.exit(f'error: {reason(error)}')
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
             raise

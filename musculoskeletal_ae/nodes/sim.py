@@ -9,12 +9,11 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Arm
@@ -23,7 +22,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array, read_joints, read_wrench
+from musculoskeletal_ae.validity import read_joints
 
 TEMPERATURE = 25.0  # [°C]
 # After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
@@ -35,16 +34,15 @@ class Sim(Arm):
 
     def __init__(self, **options: Any) -> None:
         """Declare topics; options are those of Node."""
-        super().__init__('sim', **options)
+        super().__init__('sim', partial(setattr, self, 'wrench'), **options)
         as_robot = self.parameter('as_robot')
-        self.advertise('' if as_robot else 'sim/', joints=True, description=as_robot)
+        self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._follow, RELIABLE)
-        self.listen(WrenchStamped, 'sim/external_wrench', self._push, RELIABLE)
+        self.follow_commands('length', partial(setattr, self, 'command'))
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -57,12 +55,6 @@ class Sim(Arm):
         else:
             self.arm.use(mae)
 
-    def _follow(self, message: Float64MultiArray) -> None:
-        self.command = read_array(message, 1, self.robot.muscle_count)
-
-    def _push(self, message: WrenchStamped) -> None:
-        self.wrench = read_wrench(message, self.robot.root_link)
-
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)
         if message.name or message.position:
@@ -74,10 +66,9 @@ class Sim(Arm):
     def _tick(self) -> None:
         now = self.get_clock().now()
         elapsed = min((now - self.ticked).nanoseconds * 1e-9, LONGEST_STEP)
-        self.ticked = now
-        if self.arm is None or elapsed <= 0.0:
+        self.ticked, arm = now, self.arm
+        if arm is None or elapsed <= 0.0:
             return
-        arm = self.arm
         arm.command, arm.wrench, arm.fixed = self.command[None], self.wrench[None], self.fixed[None]
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
@@ -85,9 +76,8 @@ class Sim(Arm):
 
     def lines(self) -> list[Line]:
         """Return the simulated arm as lines."""
-        if self.arm is None:
-            return []
-        return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
+        state = self.arm and self.arm.state
+        return draw_arm(self.robot, state.theta[0], state.tension[0]) if state else []
 
     def clock_jumped_back(self) -> None:
         """Count time from here; the arm stays as it is."""
@@ -95,6 +85,5 @@ class Sim(Arm):
 
     def report(self) -> Report:
         """Return what /diagnostics shows."""
-        if self.arm is None:
-            return Report('warn', 'waiting for a checkpoint', {})
-        return self.arm.report()
+        waiting = Report('warn', 'waiting for a checkpoint', {})
+        return waiting if self.arm is None else self.arm.report()
