@@ -49,11 +49,12 @@ def motion(robot: Robot, mae: Mae, stream: int, duration: float) -> Iterator[tup
     that holds the posture on the geometric model stands in for it, so that every command is
     `first`'s.
     """
-    exploration, planned = Exploration(robot, stream), 0.0
-    while planned < duration - 1e-9:
-        step = exploration.next_step()
+    planned = 0.0
+    for step in Exploration(robot, stream):
         yield first_command(robot, mae, step.theta, step.tension), step.duration
         planned += step.duration
+        if planned >= duration - 1e-9:
+            return
 
 
 def record(
