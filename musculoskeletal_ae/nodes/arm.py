@@ -30,19 +30,17 @@ MARKER_RATE = 10.0  # [Hz]
 class Arm(Shell):
     """A node that stands for an arm."""
 
-    def __init__(self, name: str, push: Callable[[Array], object], **options: Any) -> None:
-        """Advertise NAME/markers, and give `push` what comes on NAME/external_wrench.
-
-        That is force [N] and torque [N·m] (6,) in axes of the root link; options are those of Node.
-        """
+    def __init__(self, name: str, **options: Any) -> None:
+        """Advertise NAME/markers; options are those of Node."""
         super().__init__(name, **options)
+        self._arm = name
         self._markers = self.create_publisher(MarkerArray, f'{name}/markers', RELIABLE)
         self.create_timer(1.0 / MARKER_RATE, self._publish_markers)
 
-        def pushed(message: WrenchStamped) -> None:
-            push(read_wrench(message, self.robot.root_link))
-
-        self.listen(WrenchStamped, f'{name}/external_wrench', pushed, RELIABLE)
+    def follow_wrench(self, follow: Callable[[Array], object]) -> None:
+        """Give `follow` what comes on NAME/external_wrench, (6,) [N, N·m] in root link axes."""
+        topic, frame = f'{self._arm}/external_wrench', self.robot.root_link
+        self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
         """Advertise the states below a prefix; the description is the robot's own to publish."""

@@ -19,11 +19,11 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
+from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_pose
+from musculoskeletal_ae.validity import read_pose
 
 
 class Estimator(Shell):
@@ -43,17 +43,17 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.follow_checkpoints(self.core.use)
-        self.listen(Float64MultiArray, 'muscle_states', self._estimate, SENSOR)
+        self.follow_muscle_states(self._estimate)
         for kind in ('length', 'tension'):
-            self.follow_commands(kind, partial(self._commanded, kind))
+            self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
-        self.serve(Trigger, 'estimator/reset', self._reset)
+        serve(self, Trigger, 'estimator/reset', self._reset)
 
     def _commanded(self, kind: str, command: Array) -> None:
         self.core.commanded(time.monotonic(), **{kind: command})
 
-    def _estimate(self, message: Float64MultiArray) -> None:
-        length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
+    def _estimate(self, states: Array) -> None:
+        length, tension, _ = states
         clock = self.get_clock().now()
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, time.monotonic())
         if estimate is None:

@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.nodes.arm import Arm
+from musculoskeletal_ae.nodes.messages import serve
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -29,7 +30,7 @@ class HardwareEmulator(Arm):
 
     def __init__(self, **options: Any) -> None:
         """Declare topics and start the arm; options are those of Node."""
-        super().__init__('hardware_emulator', lambda wrench: self.arm.set_wrench(wrench), **options)
+        super().__init__('hardware_emulator', **options)
         self.arm = EmulatedArm(self.robot, self.parameter('seed'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
@@ -42,9 +43,10 @@ class HardwareEmulator(Arm):
         self.follow_parameter('marker_rate', partial(setattr, self, 'marker_rate'))
         self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
-        self.follow_commands('length', self.arm.command_length)
-        self.follow_commands('tension', self.arm.command_tension)
-        self.serve(Trigger, 'hardware_emulator/reset', self._reset)
+        self.follow_muscles('muscle_length_command', self.arm.command_length)
+        self.follow_muscles('muscle_tension_command', self.arm.command_tension)
+        self.follow_wrench(self.arm.set_wrench)
+        serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
         self.create_timer(1.0 / self.rate, self._tick)
 
@@ -60,8 +62,8 @@ class HardwareEmulator(Arm):
         whole = int(elapsed * 1000.0) / 1000.0
         self.remainder = elapsed - whole
         self.arm.step(whole)
-        self.reading = self.arm.sense()
-        self.publish_state(*self.reading)
+        reading = self.reading = self.arm.sense()
+        self.publish_state(reading.theta, reading.length, reading.tension, reading.temperature)
         if self.marker_rate > 0.0 and now >= self.pose_due:
             self.pose_due = max(self.pose_due + 1.0 / self.marker_rate, now)
             self._publish_pose()

@@ -16,6 +16,8 @@ from collections import Counter
 from dataclasses import replace
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
+from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
     PRESET,
@@ -88,17 +90,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'state_directory': Parameter(
             'auto', 'of samples and network (auto: below XDG_STATE_HOME; empty: keep nothing)'
         ),
-        'rest_time': Parameter(0.3, 'how long the arm has to be still', 's', (0.0, 10.0)),
-        'rest_joint_rate': Parameter(0.02, 'fastest joint of a resting arm', 'rad/s', (0.0, 1.0)),
-        'rest_length_rate': Parameter(0.002, 'fastest muscle of a resting arm', 'm/s', (0.0, 1.0)),
-        'new_joint_distance': Parameter(
-            0.05, 'least distance of a new sample in one joint', 'rad', (0.0, 3.0)
-        ),
-        'new_tension_distance': Parameter(
-            10.0, 'least distance of a new sample in one tension', 'N', (0.0, 500.0)
-        ),
+        **parameters_of(LearningSettings),
         'update_steps': Parameter(
-            100, 'mini-batches of one update, preset default', '', (1, 100_000)
+            STEPS, 'mini-batches of one update, preset default', '', (1, 100_000)
         ),
     },
     'bringup_status': {

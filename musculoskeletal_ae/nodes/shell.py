@@ -20,6 +20,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
@@ -27,12 +28,12 @@ from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -146,7 +147,7 @@ class Shell(Node):
     # -- messages -------------------------------------------------------------------------------
 
     def listen(
-        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
         """Subscribe; a message that breaks a rule, or comes twice or late, is counted and dropped.
 
@@ -157,28 +158,25 @@ class Shell(Node):
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
         self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
-    def follow_commands(self, kind: str, follow: Callable[[Array], object]) -> None:
-        """Give `follow` what comes on muscle_KIND_command: 'length' [m] or 'tension' [N], (M,)."""
+    def follow_muscles(
+        self,
+        topic: str,
+        follow: Callable[[Array], object],
+        rows: int = 1,
+        qos: QoSProfile = RELIABLE,
+    ) -> None:
+        """Give `follow` what comes on a topic with a value for each muscle, (M,) or (rows, M)."""
+        muscles = self.robot.muscle_count
+        self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-        def read(message: Float64MultiArray) -> None:
-            follow(read_array(message, 1, self.robot.muscle_count))
+    def follow_muscle_states(self, follow: Callable[[Array], object]) -> None:
+        """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M)."""
+        self.follow_muscles('muscle_states', follow, len(QUANTITIES), SENSOR)
 
-        self.listen(Float64MultiArray, f'muscle_{kind}_command', read, RELIABLE)
-
-    def serve(self, kind: Any, service: str, work: Callable[[Any], str]) -> None:
-        """Offer a Trigger or SetBool service: `work` takes the request and says what it did.
-
-        It raises a `MusculoskeletalError` to refuse.
-        """
-
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                response.success, response.message = True, work(request)
-            except MusculoskeletalError as error:
-                response.success, response.message = False, str(error)
-            return response
-
-        self.create_service(kind, service, answer)
+    def follow_posture(self, topic: str, follow: Callable[[Array], object]) -> None:
+        """Give `follow` the θ [rad] (D,) that comes on a topic of joint states."""
+        joints = self.robot.joints
+        self.listen(JointState, topic, lambda m: follow(read_posture(m, joints)), SENSOR)
 
     # -- diagnostics ----------------------------------------------------------------------------
 

@@ -34,7 +34,7 @@ class Sim(Arm):
 
     def __init__(self, **options: Any) -> None:
         """Declare topics; options are those of Node."""
-        super().__init__('sim', partial(setattr, self, 'wrench'), **options)
+        super().__init__('sim', **options)
         as_robot = self.parameter('as_robot')
         self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
@@ -42,7 +42,8 @@ class Sim(Arm):
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
-        self.follow_commands('length', partial(setattr, self, 'command'))
+        self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
+        self.follow_wrench(partial(setattr, self, 'wrench'))
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -66,9 +67,10 @@ class Sim(Arm):
     def _tick(self) -> None:
         now = self.get_clock().now()
         elapsed = min((now - self.ticked).nanoseconds * 1e-9, LONGEST_STEP)
-        self.ticked, arm = now, self.arm
-        if arm is None or elapsed <= 0.0:
+        self.ticked = now
+        if self.arm is None or elapsed <= 0.0:
             return
+        arm = self.arm
         arm.command, arm.wrench, arm.fixed = self.command[None], self.wrench[None], self.fixed[None]
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
@@ -76,8 +78,9 @@ class Sim(Arm):
 
     def lines(self) -> list[Line]:
         """Return the simulated arm as lines."""
-        state = self.arm and self.arm.state
-        return draw_arm(self.robot, state.theta[0], state.tension[0]) if state else []
+        if self.arm is None:
+            return []
+        return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
 
     def clock_jumped_back(self) -> None:
         """Count time from here; the arm stays as it is."""
@@ -85,5 +88,6 @@ class Sim(Arm):
 
     def report(self) -> Report:
         """Return what /diagnostics shows."""
-        waiting = Report('warn', 'waiting for a checkpoint', {})
-        return waiting if self.arm is None else self.arm.report()
+        if self.arm is None:
+            return Report('warn', 'waiting for a checkpoint', {})
+        return self.arm.report()
