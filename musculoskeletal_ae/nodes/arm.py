@@ -25,6 +25,8 @@ from musculoskeletal_ae.robot.drawing import Line
 from musculoskeletal_ae.validity import read_wrench
 
 MARKER_RATE = 10.0  # [Hz]
+# After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
+LONGEST_STEP = 0.1  # [s]
 
 
 class Arm(Shell):

@@ -15,14 +15,11 @@ from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.nodes.arm import Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
 from musculoskeletal_ae.nodes.messages import serve
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-
-# After a pause (a debugger, a suspended machine) the arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
 
 
 class HardwareEmulator(Arm):

@@ -119,8 +119,8 @@ def parse(arguments: list[str]) -> Namespace:
 
 def _topics(text: str) -> list[str]:
     listed = names(text)
-    if unknown := set(listed) - TOPICS.keys():
-        raise ArgumentTypeError(f'{min(unknown)!r} is none of {", ".join(TOPICS)}')
+    if unknown := [name for name in listed if name not in TOPICS]:
+        raise ArgumentTypeError(f'{unknown[0]!r} is none of {", ".join(TOPICS)}')
     return listed
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.arm import Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -25,8 +25,6 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.validity import read_joints
 
 TEMPERATURE = 25.0  # [°C]
-# After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
 
 
 class Sim(Arm):
