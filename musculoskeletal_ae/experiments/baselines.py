@@ -22,25 +22,19 @@ STREAM_STRIDE = 10
 
 
 def baseline_errors(
-    robot: Robot, samples: Rests, stream: Recording, held_out: Recording
+    robot: Robot, rests: Rests, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error on the held-out motion before and after learning [rad].
 
-    Least squares on the geometric model, without weights, has nothing to learn.
-
-    Args:
-        robot: The geometric model, from which all of them start.
-        samples: What the autoencoder learned from.
-        stream: The whole exploration.
-        held_out: The motion to judge by.
+    All start from the geometric model. Least squares on it, without weights, has nothing to learn.
     """
-    part = slice(None, None, STREAM_STRIDE)
-    moving = Rests(stream.theta_sensor[part], stream.tension[part], stream.length[part])
+    part = stream.part(np.s_[::STREAM_STRIDE])
+    moving = Rests(part.theta_sensor, part.tension, part.length)
     error = nominal(robot, tension_noise=0.0).error(held_out)
     table = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
     for kind in (PolynomialFilter, TableSearch):
         before = _error(kind(robot), held_out)
-        for data, name in ((samples, kind.name), (moving, f'{kind.name}, whole stream')):
+        for data, name in ((rests, kind.name), (moving, f'{kind.name}, whole stream')):
             taught = kind(robot)
             if len(data.theta):
                 taught.learn(*data)
@@ -48,11 +42,9 @@ def baseline_errors(
     return table
 
 
-def _error(baseline: PolynomialFilter | TableSearch, recording: Recording) -> float:
-    estimate = baseline.estimate(recording.tension, recording.length)
-    if not np.isfinite(estimate).all():
-        raise FloatingPointError(f'{baseline.name} diverged')
-    return mean_error(estimate, recording.theta)
+def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> float:
+    estimate = baseline.estimate(held_out.tension, held_out.length)
+    return mean_error(estimate, held_out.theta)
 
 
 def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
@@ -62,8 +54,7 @@ def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)
-    compensated: Array = length + robot.series_elastic.elongation(absolute + elongation, tension)
-    return compensated
+    return length + robot.series_elastic.elongation(absolute + elongation, tension)
 
 
 class PolynomialFilter:
@@ -97,14 +88,12 @@ class PolynomialFilter:
 
     def _scaled(self, theta: Array) -> Array:
         low, high = self._robot.lower, self._robot.upper
-        scaled: Array = (2.0 * theta - low - high) / (high - low)
-        return scaled
+        return (2.0 * theta - low - high) / (high - low)
 
     def _monomials(self, theta: Array) -> Array:
         """Return the monomials of θ (N, D), shape (N, K)."""
         table = self._scaled(theta)[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
-        monomials: Array = table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
-        return monomials
+        return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
         """Fit the mapping to samples (N, D), (N, M), (N, M), its own coefficients as the prior."""
@@ -183,5 +172,4 @@ class TableSearch:
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M)."""
         row = self._lengths.query(unstretched(self._robot, tension, length))[1]
-        nearest: Array = self._theta[row]
-        return nearest
+        return self._theta[row]
