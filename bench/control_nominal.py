@@ -18,10 +18,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.control import holdable_postures
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, exit_status
@@ -52,8 +52,8 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
     arm = nominal_arm(robot)
     rows: dict[str, list[tuple[float, float, float]]] = {}
     bias, limit = np.full(robot.muscle_count, robot.tension.bias), robot.tension.limit
-    rng = np.random.default_rng(5)
-    for theta, least in holdable_postures(robot, arm.individual, count, rng):
+    postures = robot.random_postures(TRIES, np.random.default_rng(5))
+    for theta, least in holdable_postures(robot, postures, count):
         torque = robot.kinematics.holding_torque(theta)
         bound = robot.muscle_lengths(theta, least) + methods.msc_compensation(robot, least)
 
@@ -104,9 +104,9 @@ def stiffness_ratios(
     """
     arm = arm or nominal_arm(robot)
     ratios = []
-    rng = np.random.default_rng(8)
-    postures = holdable_postures(robot, arm.individual, count, rng)
-    for n, (theta, _) in enumerate(postures):
+    postures = robot.random_postures(TRIES, np.random.default_rng(8))
+    held = holdable_postures(robot, postures, count, arm.individual.muscle_jacobian)
+    for n, (theta, _) in enumerate(held):
         joint = n % robot.joint_count
         torque = robot.kinematics.holding_torque(theta)
         desired = np.zeros(robot.joint_count)
@@ -143,9 +143,9 @@ def _pushed(arm: EmulatedArm, theta: Array, length: Array, wrench: Array) -> Arr
 def torque_errors(robot: Robot, mae: Mae, count: int) -> Array:
     """Return ‖−Gᵀ T − τ‖ / ‖τ‖ with the true G, for random postures and efforts, (N,)."""
     errors = []
-    rng = np.random.default_rng(9)
-    individual, limits = Individual(robot, 0, NOMINAL), robot.tension
-    for theta, least in holdable_postures(robot, individual, count, rng):
+    rng, limits = np.random.default_rng(9), robot.tension
+    postures = robot.random_postures(TRIES, rng)
+    for theta, least in holdable_postures(robot, postures, count):
         effort = rng.normal(0.0, TORQUE_SPREAD, robot.joint_count)
         torque = robot.kinematics.holding_torque(theta) + effort
         jacobian = mae.muscle_jacobian(theta, least)

@@ -44,15 +44,12 @@ NOTICEABLE = 0.05  # [rad]
 def random_commands(robot: Robot, count: int, seed: int) -> Array:
     """Return l_target [m] (count, M) of random postures that can be held, at random tensions."""
     rng = np.random.default_rng(seed)
-    low, high = robot.tension.bias, robot.tension.limit
     commands: list[Array] = []
     while len(commands) < count:
         theta = robot.random_postures(1, rng)[0]
-        jacobian = robot.routes.muscle_jacobian(theta)
-        torque = robot.kinematics.holding_torque(theta)
-        desired = rng.uniform(low, 0.6 * high)
+        desired = rng.uniform(robot.tension.bias, 0.6 * robot.tension.limit)
         try:
-            tension = holding_tension(jacobian, torque, low, high, desired)
+            tension = holding_tension(robot, theta, desired)
         except InfeasibleError:
             continue
         commands.append(robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension))
@@ -172,10 +169,7 @@ def responses(robot: Robot, mae: Mae, preset: str) -> list[Response]:
     """Return the answers of the geometric model as a body, and of the simulator."""
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[robot.joints.index(FLEXED)] = FLEXION
-    jacobian = robot.routes.muscle_jacobian(theta)
-    torque = robot.kinematics.holding_torque(theta)
-    limits = robot.tension
-    tension = holding_tension(jacobian, torque, limits.bias, limits.limit, 2.0 * limits.bias)
+    tension = holding_tension(robot, theta, 2.0 * robot.tension.bias)
     command = robot.muscle_lengths(theta, tension) + msc_compensation(robot, tension)
     simulated = Simulation(robot, mae, preset)
     simulated.start_from(theta[None])

@@ -87,7 +87,7 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
         ),
         Row(
             'decode and gradient by z',
-            lambda: mae.decode_pullback(z)[1](gradient),
+            lambda: mae.decode_scaled.with_pullback(z)[1](gradient),
             lambda: _eager_gradient(eager, latent),
         ),
         Row('muscle Jacobian G from ①', lambda: mae.muscle_jacobian(theta, tension)),

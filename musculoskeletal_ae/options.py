@@ -177,12 +177,26 @@ class Parser(argparse.ArgumentParser):
             '--out', type=Path, metavar=metavar, default=default, required=required, help=text
         )
 
-    def add_plot(self, text: str, default: str | None = None) -> None:
-        """Add `--plot`, a picture; where `default` names one, also `--no-plot`."""
-        shown = text if default is None else f'{text} (default: {default})'
+    def add_plot(self, text: str, default: str) -> None:
+        """Add `--plot`, a picture that `save_plot` saves, and `--no-plot`."""
+        shown = f'{text} (default: {default})'
         self.add_argument('--plot', type=Path, metavar='FILE.png', help=shown)
-        if default is not None:
-            self.add_argument('--no-plot', action='store_true', help='write no plot')
+        self.add_argument('--no-plot', action='store_true', help='write no plot')
+
+
+def save_plot(args: argparse.Namespace, default: str, save: Callable[[Path], None]) -> None:
+    """Save the plot that `add_plot` offers, and say where; `default` is its name in full.
+
+    Raises:
+        MusculoskeletalError: If it cannot be written.
+    """
+    if not args.no_plot:
+        file = args.plot or Path(default)
+        try:
+            save(file)
+        except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
+            raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
+        print(f'plot: {file}')
 
 
 def exit_status(

@@ -25,23 +25,14 @@ UNBOUNDED = 2**63 - 1  # the greatest whole number that a ROS parameter holds
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value that a user may choose.
+    """A value that a user may choose."""
 
-    Attributes:
-        default: Its default, which also says its type; a tuple for a list of numbers or names.
-        meaning: What it is, in a phrase.
-        unit: Of its value, such as 'rad/s'.
-        within: Least and greatest legal value of a number.
-        legal: The words that it may be; empty for any.
-        settable: Whether it may be set while a node runs; else it is read once, at the start.
-    """
-
-    default: Any
-    meaning: str
-    unit: str = ''
-    within: tuple[float, float] | None = None
-    legal: tuple[str, ...] = ()
-    settable: bool = False
+    default: Any  # also says its type; a tuple for a list of numbers or names
+    meaning: str  # in a phrase
+    unit: str = ''  # such as 'rad/s'
+    within: tuple[float, float] | None = None  # least and greatest legal value of a number
+    legal: tuple[str, ...] = ()  # the words that it may be; empty for any
+    settable: bool = False  # while a node runs; else it is read once, at the start
 
     @property
     def description(self) -> str:
@@ -65,9 +56,9 @@ class Parameter:
         """Whether it is a list of numbers."""
         return isinstance(self.default, tuple) and not isinstance(self.default[0], str)
 
-    def field(self, **options: Any) -> Any:
-        """Return the dataclass field that this parameter sets; options override those of it."""
-        return field(**{'default': self.default, 'metadata': {'parameter': self}, **options})
+    def field(self) -> Any:
+        """Return the dataclass field that this parameter sets."""
+        return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
         """Return a value as it is used: lists as tuples, without empty names.
@@ -77,22 +68,20 @@ class Parameter:
         """
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
-        if not isinstance(self.default, tuple):
-            return value
-        if not self.is_number_list:
-            return tuple(name for name in value if name)
-        try:
-            numbers = tuple(float(number) for number in value)
-        except (TypeError, ValueError):
-            numbers = (math.nan,)
-        if not all(map(math.isfinite, numbers)):
-            raise MusculoskeletalError(f'{value!r}; legal: a list of finite numbers')
-        return numbers
+        if self.is_number_list:
+            try:
+                numbers = tuple(map(float, value))
+            except (TypeError, ValueError):
+                numbers = (math.nan,)
+            if not all(map(math.isfinite, numbers)):
+                raise MusculoskeletalError(f'{value!r}; legal: a list of finite numbers')
+            return numbers
+        return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
 
 
 def parameters_of(settings: type) -> dict[str, Parameter]:
     """Return the parameters of a settings dataclass by name."""
-    return {f.name: f.metadata['parameter'] for f in fields(settings) if 'parameter' in f.metadata}
+    return {f.name: f.metadata['parameter'] for f in fields(settings)}
 
 
 ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')

@@ -14,69 +14,39 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Shape of a network.
+    """Shape of a network."""
 
-    Attributes:
-        hidden: Units of the encoder's hidden layers; the decoder has them in reverse.
-        activation: After every layer but the latent and the last one, which are linear.
-        standardise: Subtract the mean of the training data and divide by its spread at the input,
-            and the other way round at the output.
-    """
-
-    hidden: tuple[int, ...]
-    activation: str
-    standardise: bool
+    hidden: tuple[int, ...]  # units of the encoder's hidden layers; the decoder's are the reverse
+    activation: str  # after every layer but the latent and the last one, which are linear
+    standardise: bool  # centre inputs and divide by their spread in training; undone at the output
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a network is trained on the geometric model.
+    """How a network is trained on the geometric model."""
 
-    Attributes:
-        steps: Mini-batches in all.
-        batch: Samples in a mini-batch.
-        samples: Samples drawn from the geometric model, then shuffled epoch by epoch.
-        optimiser: 'adam' or 'muon'.
-        step_size: Adam's; with Muon that of the biases.
-        annealed: Raise the step size over the first twentieth, then lower it to zero by a cosine.
-        every_mask: Enter each sample by all three masks instead of one at random.
-        weights: w_θ, w_T, w_l.
-        standard_norms: Take each norm in units of the spread of the data.
-        slope_weight: w_G of the slope ∂l/∂θ through ①; needs samples in twins.
-    """
-
-    steps: int
-    batch: int
-    samples: int
-    optimiser: str
-    step_size: float
-    annealed: bool
-    every_mask: bool
-    weights: tuple[float, float, float]
-    standard_norms: bool
-    slope_weight: float = 0.0
+    steps: int  # mini-batches in all
+    batch: int  # samples in a mini-batch
+    samples: int  # drawn from the geometric model, then shuffled epoch by epoch
+    optimiser: str  # 'adam' or 'muon'
+    step_size: float  # Adam's; with Muon that of the biases
+    annealed: bool  # raised over the first twentieth, then lowered to zero by a cosine
+    every_mask: bool  # enter each sample by all three masks instead of one at random
+    weights: tuple[float, float, float]  # w_θ, w_T, w_l
+    standard_norms: bool  # take each norm in units of the spread of the data
+    slope_weight: float = 0.0  # w_G of the slope ∂l/∂θ through ①; needs samples in twins
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Everything in which two presets differ.
-
-    Attributes:
-        name: Of the parameter `preset`.
-        network: Shape of the network.
-        training: Initial training.
-        corrected_body: Learn online by fitting the corrected body; else on the samples alone.
-        least_samples: From how many samples on it learns online.
-        equilibrium: Control and simulate by the balance of torques, solved; else by the printed
-            descent in the latent space.
-    """
+    """Everything in which two presets differ."""
 
     name: str
     network: NetworkSettings
-    training: TrainingSettings
-    corrected_body: bool
-    least_samples: int
-    equilibrium: bool
+    training: TrainingSettings  # initial training
+    corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
+    least_samples: int  # from how many samples on it learns online
+    equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
 
 
 DEFAULT = Preset(

@@ -16,38 +16,23 @@ from collections.abc import Mapping
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.posture import PostureControl
-from musculoskeletal_ae.control.safety import (
-    LENGTH,
-    TENSION,
-    Command,
-    Muscles,
-    SafetyFilter,
-    thermal_limit,
-    unchanging,
-)
+from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
+NOTABLE = 0.05  # [N·m] of missing torque
 
 
 class Controller:
-    """Steps everything between a target and a command. Times are of one steady clock [s].
-
-    Attributes:
-        settings: What the user chose.
-        posture: Length commands.
-        torque: Tension commands.
-        safety: The latch and the limits.
-        limit: Tension limit of each muscle, lowered by heat [N], shape (M,).
-        clamped: Joints whose target lay beyond the limits.
-        stepped_at: When it was stepped last [s].
-    """
+    """Steps everything between a target and a command. Times are of one steady clock [s]."""
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
@@ -55,8 +40,9 @@ class Controller:
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
+        #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
-        self.clamped: tuple[str, ...] = ()
+        self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
         self._mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = Exploration(robot, seed)
@@ -94,7 +80,7 @@ class Controller:
         self._muscles, self._muscles_at = muscles, now
         self.safety.muscles(muscles)
         highest = self.settings.temperature_limit
-        self.limit = thermal_limit(self._robot, muscles.temperature, highest)
+        self.limit = safety.thermal_limit(self._robot, muscles.temperature, highest)
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated_joint_states [rad], shape (D,)."""
@@ -116,11 +102,8 @@ class Controller:
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
         if kept is None and len(joints) < robot.joint_count:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
-        theta = np.zeros(robot.joint_count) if kept is None else kept.copy()
-        effort = self.posture.effort.copy()
-        for i, name in enumerate(robot.joints):
-            if name in joints:
-                theta[i], effort[i] = joints[name]
+        before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
+        theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         inside = np.clip(theta, robot.lower, robot.upper)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
         self._starts |= self.posture.exploring
@@ -133,8 +116,7 @@ class Controller:
         if wanted and self.safety.cause:
             return f'stopped: {self.safety.cause}'
         if wanted != self.posture.exploring:
-            self._exploration.begin_cycle()
-            self.posture.explore(self._exploration if wanted else None)
+            self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts = True
         return ''
@@ -148,7 +130,7 @@ class Controller:
         """Clear a stop and go on to the last target; return why not, or ''."""
         cause = self.present_cause(now)
         if not cause and self.safety.cause:
-            self.safety.reset()
+            self.safety.cause = ''
             self._starts = True
         return cause
 
@@ -166,7 +148,52 @@ class Controller:
                 return f'{what} older than {self.settings.max_age:g} s'
         return ''
 
+    def report(self, now: float) -> Report:
+        """Say what control is doing and what is in its way."""
+        chosen, posture, robot = self.settings, self.posture, self._robot
+        solution, missing = posture.solution, np.zeros(0)
+        values, warnings = {'method': chosen.method, 'preset': chosen.preset}, []
+        if self.clamped:
+            values['target clamped at'] = ', '.join(self.clamped)
+            warnings.append('target clamped to the joint limits')
+        if solution is not None:
+            missing = solution.missing_torque
+        if solution is not None and solution.stiffness is not None:
+            expected, *reachable = solution.stiffness
+            desired = chosen.desired_stiffness(robot.joint_count)
+            for row in zip(robot.joints, desired, expected.diagonal(), *reachable):
+                name, wanted, planned, low, high = row
+                text = f'{planned:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'
+                if wanted > 0.0 and not low <= wanted <= high:
+                    text += f', desired {wanted:.2f} clamped'
+                values[f'joint stiffness {name}'] = text
+        if posture.effort.any() and chosen.method in ('geometric', 'first', 'second'):
+            warnings.append(f'method {chosen.method} exerts no effort')
+        if self._in_tension:
+            missing = self.torque.missing_torque
+        if np.abs(missing).max(initial=0.0) > NOTABLE:
+            lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
+            values['missing torque'] = ', '.join(lacks)
+            warnings.append('the target needs more torque than the muscles have')
+        hot = {n: t for n, t in zip(robot.muscles, self.limit) if t < robot.tension.max}
+        if hot:
+            values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
+            warnings.append(f'hot: {", ".join(hot)}')
+        doing = 'no target' if posture.theta is None else 'holding'
+        doing = 'exploring' if posture.exploring else doing
+        if self.safety.cause:
+            return Report('error', f'stopped: {self.safety.cause}', values)
+        if waiting := self.present_cause(now):
+            return Report('warn', f'waiting: {waiting}', values)
+        if warnings:
+            return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
+        return Report('ok', doing, values)
+
     # -- time -----------------------------------------------------------------------------------
+
+    @property
+    def _in_tension(self) -> bool:
+        return self.settings.method == 'tension' and not self.posture.exploring
 
     def step(self, now: float) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded."""
@@ -190,14 +217,13 @@ class Controller:
         mae, muscles, estimate = self._mae, self._muscles, self._estimate
         # No present cause: all are there.
         assert mae is not None and muscles is not None and estimate is not None
-        posture = self.posture
-        in_tension = self.settings.method == 'tension' and not posture.exploring
+        posture, in_tension = self.posture, self._in_tension
         if self._starts:
             self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
-                command = unchanging(self._robot, kind, muscles)
+                command = safety.unchanging(self._robot, kind, muscles)
             (self.torque if in_tension else posture).start_from(command.value)
         planned = np.minimum(self.limit, self._robot.tension.limit)
         if not in_tension:
@@ -206,5 +232,4 @@ class Controller:
         if posture.theta is None:
             return None
         target, effort = posture.theta, posture.effort
-        tension = self.torque.step(mae, estimate, target, effort, planned, dt)
-        return Command(TENSION, tension)
+        return Command(TENSION, self.torque.step(mae, estimate, target, effort, planned, dt))

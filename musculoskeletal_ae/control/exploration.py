@@ -12,6 +12,8 @@ hold with tensions in [T_bias, T_limit].
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -28,64 +30,54 @@ TRIES = 1000
 
 
 class Step(NamedTuple):
-    """One step of the exploration.
+    """One step of the exploration."""
 
-    Attributes:
-        method: 'first' or 'second'.
-        theta: θ_target [rad], shape (D,).
-        tension: T_const [N] of `first`, shape (M,); `second` takes the tension of the moment, and
-            this is what the geometric model expects it to be.
-        duration: [s].
-    """
-
-    method: str
-    theta: Array
+    method: str  # 'first' or 'second'
+    theta: Array  # θ_target [rad], (D,)
+    # T_const [N] of `first`, (M,); of `second`, which takes the tension of the moment, what the
+    # geometric model expects that to be
     tension: Array
-    duration: float
+    duration: float  # [s]
 
 
 class Exploration:
-    """An endless, reproducible stream of exploration steps."""
+    """A reproducible stream of steps; iterating again goes on with it at a new posture."""
 
     def __init__(self, robot: Robot, seed: int) -> None:
-        """Explore `robot`; the stream is the seed's."""
-        self._robot = robot
-        self._rng = np.random.default_rng([seed, 0xE8])
-        self._pending: list[Step] = []
+        self._robot, self._rng = robot, np.random.default_rng([seed, 0xE8])
 
-    def begin_cycle(self) -> None:
-        """Go on with a new posture, as after a pause; the stream itself goes on."""
-        self._pending = []
+    def __iter__(self) -> Iterator[Step]:
+        robot, rng, limits = self._robot, self._rng, self._robot.tension
+        bias = np.full(robot.muscle_count, limits.bias)
+        while True:
+            postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
+            ((theta, holding),) = holdable_postures(robot, postures, 1)
+            constant = rng.uniform(limits.bias, limits.limit, robot.muscle_count)
+            yield Step('first', theta, bias, DURATIONS[0])
+            yield Step('second', theta, holding, DURATIONS[1])
+            yield Step('first', theta, constant, DURATIONS[2])
 
-    def next_step(self) -> Step:
-        """Return the next of the three steps; a new random posture starts each cycle."""
-        if not self._pending:
-            self._pending = self._cycle()
-        return self._pending.pop(0)
 
-    def _cycle(self) -> list[Step]:
-        robot, tension = self._robot, self._robot.tension
-        theta, holding = self._holdable_posture()
-        bias = np.full(robot.muscle_count, tension.bias)
-        constant = self._rng.uniform(tension.bias, tension.limit, robot.muscle_count)
-        return [
-            Step('first', theta, bias, DURATIONS[0]),
-            Step('second', theta, holding, DURATIONS[1]),
-            Step('first', theta, constant, DURATIONS[2]),
-        ]
+def holdable_postures(
+    robot: Robot, postures: Iterable[Array], count: int, *others: Callable[[Array], Array]
+) -> list[tuple[Array, Array]]:
+    """Return the first of random θ (D,) that can be held, each with the least T [N] (M,).
 
-    def _holdable_posture(self) -> tuple[Array, Array]:
-        """Return a random posture and the least tension that holds it."""
-        robot, tension = self._robot, self._robot.tension
-        for _ in range(TRIES):
-            theta = robot.random_postures(1, self._rng)[0]
-            jacobian = robot.routes.muscle_jacobian(theta)
-            torque = robot.kinematics.holding_torque(theta)
-            try:
-                return theta, holding_tension(jacobian, torque, tension.bias, tension.limit, 0.0)
-            except InfeasibleError:
-                continue
-        raise RobotDescriptionError(
-            f'{robot.description.directory}: none of {TRIES} random postures can be held with '
-            f'tensions in [{tension.bias:g}, {tension.limit:g}] N; run check_robot'
-        )
+    They can be held with the nominal G and with every other, given as for `muscle_hessian`; T is
+    that of the last one.
+
+    Raises:
+        RobotDescriptionError: If there are not so many.
+    """
+    held: list[tuple[Array, Array]] = []
+    for theta in postures:
+        with suppress(InfeasibleError):
+            for muscle_jacobian in (robot.routes.muscle_jacobian, *others):
+                tension = holding_tension(robot, theta, jacobian=muscle_jacobian(theta[None])[0])
+            held.append((theta, tension))
+        if len(held) == count:
+            return held
+    raise RobotDescriptionError(
+        f'{robot.description.directory}: only {len(held)} of {TRIES} random postures can be held '
+        f'with tensions in [{robot.tension.bias:g}, {robot.tension.limit:g}] N; run check_robot'
+    )

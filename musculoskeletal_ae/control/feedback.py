@@ -31,18 +31,12 @@ SETTLING = 0.5  # [s] after a movement until the arm is taken for resting
 
 
 class RestFeedback:
-    """The corrections of one target.
-
-    Attributes:
-        correction: c [rad], shape (D,).
-        relief: r [m], shape (M,).
-    """
+    """The corrections c [rad] (D,) and r [m] (M,) of one target, `correction` and `relief`."""
 
     def __init__(self, robot: Robot) -> None:
-        """Start without a correction."""
         self._robot = robot
         self.reset()
-        self._rested = 0.0
+        self.moving()
 
     def reset(self) -> None:
         """Forget the corrections: a new target."""
@@ -56,15 +50,10 @@ class RestFeedback:
     def step(
         self, error: Array, jacobian: Array, tension: Array, limit: Array, gain: float, dt: float
     ) -> bool:
-        """Integrate if the arm rests; return whether it does.
+        """Integrate over dt [s] if the arm rests; return whether it does.
 
-        Args:
-            error: θ_target − θ_estimated [rad], shape (D,).
-            jacobian: G at the target [m/rad], shape (M, D).
-            tension: T measured [N], shape (M,).
-            limit: Highest tension planned for each muscle [N], shape (M,).
-            gain: [1/s]; 0 for no feedback.
-            dt: Time since the step before [s].
+        Of θ_target − θ_estimated [rad] (D,), G at the target (M, D), and T measured and the highest
+        planned [N] (M,); a gain [1/s] of 0 is no feedback.
         """
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
@@ -80,5 +69,5 @@ class RestFeedback:
 
     def shift(self, mae: Mae, theta: Array, tension: Array) -> Array:
         """Return what the corrections add to the lengths at (θ_target, T) [m], shape (M,)."""
-        shifted: Array = mae.lengths(theta + self.correction, tension)
+        shifted = mae.lengths(theta + self.correction, tension)
         return shifted - mae.lengths(theta, tension) + self.relief

@@ -42,39 +42,25 @@ SOLVES = 2
 
 
 class JointStiffness(NamedTuple):
-    """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad].
+    """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad]."""
 
-    Attributes:
-        expected: K_θ, shape (D, D).
-        lowest: Least K_jj, each joint alone, shape (D,).
-        highest: Greatest ones, shape (D,).
-    """
-
-    expected: Array
-    lowest: Array
-    highest: Array
+    expected: Array  # K_θ, (D, D)
+    lowest: Array  # least K_jj, each joint alone, (D,)
+    highest: Array  # greatest ones, (D,)
 
 
 class Solution(NamedTuple):
-    """A command and what it is expected to bring.
+    """A command and what it is expected to bring."""
 
-    Attributes:
-        length: l_target [m], shape (M,).
-        tension: T [N], shape (M,).
-        missing_torque: Torque that no tension within its limits gives [N·m], shape (D,).
-        stiffness: Of the method `stiffness` alone.
-    """
-
-    length: Array
-    tension: Array
-    missing_torque: Array
-    stiffness: JointStiffness | None = None
+    length: Array  # l_target [m], (M,)
+    tension: Array  # T [N], (M,)
+    missing_torque: Array  # torque that no tension within its limits gives [N·m], (D,)
+    stiffness: JointStiffness | None = None  # of the method `stiffness` alone
 
 
 def msc_compensation(robot: Robot, tension: Array) -> Array:
     """Return l_comp(T) [m], shape (..., M); zero at T_bias, negative above it."""
-    compensation: Array = -(tension - robot.tension.bias) / robot.stiffness
-    return compensation
+    return -(tension - robot.tension.bias) / robot.stiffness
 
 
 def geometric_command(robot: Robot, theta: Array) -> Array:
@@ -93,13 +79,8 @@ def proposed(
 ) -> Solution:
     """Return the command of `proposed`, preset `default`.
 
-    Args:
-        robot: For limits and K_stiff.
-        mae: The network.
-        theta: θ_target [rad], shape (D,).
-        torque: τ_target = g(θ_target) + effort [N·m], shape (D,).
-        tension: T_current [N], shape (M,), where the search starts.
-        limit: Highest tension planned [N], scalar or shape (M,).
+    For θ_target [rad] (D,) and τ_target = g(θ_target) + effort [N·m] (D,); the search starts at
+    T_current [N] (M,) and plans no tension above the limit [N], scalar or (M,).
     """
     bias = robot.tension.bias
     exertion = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))

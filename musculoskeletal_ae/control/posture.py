@@ -14,18 +14,20 @@ under `proposed`, `feedback` corrects what friction leaves, and sheds tension th
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
-from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
+from musculoskeletal_ae.control.exploration import RAMP_SHARE, Step
 from musculoskeletal_ae.control.feedback import RestFeedback
 from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 PEAK = 1.5  # fastest over mean speed of a ramp
@@ -33,26 +35,13 @@ REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solvi
 
 
 class Ramp:
-    """A smooth way from one command to another.
-
-    Attributes:
-        duration: Time it takes [s].
-        done: Whether it has ended.
-    """
+    """A smooth way from one command to another, both of shape (M,)."""
 
     def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
-        """Plan the way.
-
-        Args:
-            start: Command of the moment, shape (M,).
-            goal: Command to reach, shape (M,).
-            duration: Time it should take [s]; stretched until no entry is faster than the limit.
-            rate_limit: Fastest change of an entry [1/s].
-        """
-        self._start, self._goal = start.copy(), goal
+        """Plan to take `duration` [s], or longer so that no entry exceeds its rate limit [1/s]."""
+        self._start, self._goal, self._elapsed = start.copy(), goal, 0.0
         farthest = float(np.abs(goal - start).max())
         self.duration = max(duration, PEAK * farthest / rate_limit)
-        self._elapsed = 0.0
 
     @property
     def done(self) -> bool:
@@ -63,8 +52,7 @@ class Ramp:
         """Return the command dt seconds on."""
         self._elapsed += dt
         u = 1.0 if self.done else self._elapsed / self.duration
-        command: Array = self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
-        return command
+        return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
 
 
 class Goal(NamedTuple):
@@ -76,33 +64,24 @@ class Goal(NamedTuple):
 
 
 class PostureControl:
-    """Commands muscle lengths towards target postures.
-
-    Attributes:
-        settings: What the user chose; used from the next goal on.
-        theta: θ_target [rad], shape (D,), or None before the first target.
-        effort: Joint torque beyond holding the arm's weight [N·m], shape (D,).
-        solution: Command of the last goal and what it is expected to bring, or None.
-        feedback: Corrections at rest.
-    """
+    """Commands muscle lengths towards target postures."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Control `robot`."""
-        self._robot, self.settings = robot, settings
-        self._mae: Mae | None = None
-        self.theta: Array | None = None
-        self.effort: Array = np.zeros(robot.joint_count)
-        self.solution: Solution | None = None
+        self._robot = robot
+        self.settings = settings  # used from the next goal on
+        self.theta: Array | None = None  # θ_target [rad], (D,); None before the first target
+        self.effort: Array = np.zeros(robot.joint_count)  # torque beyond holding the weight [N·m]
+        self.solution: Solution | None = None  # of the last goal
         self.feedback = RestFeedback(robot)
-        self._exploration: Exploration | None = None
+        self._mae: Mae | None = None
+        self._exploration: Iterator[Step] | None = None
         self._goals: list[Goal] = []
-        self._method = ''
-        self._remaining = 0.0
+        self._method, self._remaining = '', 0.0
         self._tension: Array = np.full(robot.muscle_count, robot.tension.bias)
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
-        self._jacobian: Array | None = None
+        self._jacobian: Array | None = None  # G at the solution, once it is needed
 
     @property
     def exploring(self) -> bool:
@@ -114,7 +93,7 @@ class PostureControl:
         self._mae = mae
         self._solve_again()
 
-    def explore(self, exploration: Exploration | None) -> None:
+    def explore(self, exploration: Iterator[Step] | None) -> None:
         """Follow a stream of random targets, or end that (None) and hold."""
         self._exploration = exploration
         self._goals, self._remaining = [], 0.0
@@ -129,8 +108,8 @@ class PostureControl:
         """Go to the target by the method that is set now, from the command of the moment."""
         if self.theta is None or self.exploring:
             return
-        chosen, tension = self.settings, self._robot.tension
-        constant = np.clip(chosen.constant_tension, tension.bias, tension.limit)
+        chosen, limits = self.settings, self._robot.tension
+        constant = np.clip(chosen.constant_tension, limits.bias, limits.limit)
         first = Goal('first', chosen.first_duration, np.full(self._robot.muscle_count, constant))
         self._goals = {
             'first': [first],
@@ -145,13 +124,9 @@ class PostureControl:
         self.start()
 
     def step(self, tension: Array, theta: Array, limit: Array, dt: float) -> Array | None:
-        """Return the command [m] (M,) of this moment, or None while there is no target.
+        """Return the command [m] (M,), dt [s] after the last, or None while there is no target.
 
-        Args:
-            tension: Measured [N], shape (M,).
-            theta: Estimated [rad], shape (D,).
-            limit: Highest tension planned for each muscle [N], shape (M,).
-            dt: Time since the step before [s].
+        T is measured, θ estimated, and `limit` the highest tension planned for each muscle [N].
         """
         self._remaining -= dt
         if np.abs(limit - self._limit).max() > REPLAN and self._remaining <= 0.0:
@@ -170,7 +145,7 @@ class PostureControl:
     @property
     def _corrects(self) -> bool:
         # A chosen stiffness must not fade under a push, and preset `paper` is as printed.
-        return self._method == 'proposed' and self.settings.by_balance
+        return self._method == 'proposed' and PRESETS[self.settings.preset].equilibrium
 
     def _solve_again(self) -> None:
         if self._ramp is not None and not self._goals and not self.exploring:
@@ -180,16 +155,17 @@ class PostureControl:
 
     def _next_goal(self, tension: Array, limit: Array) -> None:
         if self._exploration is not None and not self._goals:
-            planned = self._exploration.next_step()
-            self.theta = planned.theta
-            constant = planned.tension if planned.method == 'first' else None
-            self._goals = [Goal(planned.method, planned.duration, constant)]
+            step = next(self._exploration)
+            self.theta = step.theta
+            constant = step.tension if step.method == 'first' else None
+            self._goals = [Goal(step.method, step.duration, constant)]
         if not self._goals or self._mae is None or self.theta is None:
             return
         self._method, duration, constant = self._goals.pop(0)
         self._tension = tension if constant is None else constant
         self._limit = limit
-        self.solution = self._solve(self._mae, self.theta, limit)
+        self.solution = self._jacobian = None
+        self.solution = self._solve(self._mae, self.theta)
         goal = self.solution.length
         if self._corrects:
             goal = goal + self.feedback.shift(self._mae, self.theta, self.solution.tension)
@@ -197,10 +173,8 @@ class PostureControl:
         self._remaining = max(duration, self._ramp.duration)
         self.feedback.moving()
 
-    def _solve(self, mae: Mae, theta: Array, limit: Array) -> Solution:
-        robot, tension = self._robot, self._tension
-        self.solution = self._jacobian = None
-        nothing = np.zeros(robot.joint_count)
+    def _solve(self, mae: Mae, theta: Array) -> Solution:
+        robot, tension, nothing = self._robot, self._tension, np.zeros(self._robot.joint_count)
         if self._method == 'geometric':
             bias = np.full(robot.muscle_count, robot.tension.bias)
             return Solution(methods.geometric_command(robot, theta), bias, nothing)
@@ -209,9 +183,9 @@ class PostureControl:
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':
             desired = np.array(self.settings.desired_stiffness(robot.joint_count))
-            return stiffness_command(robot, mae, theta, torque, desired, limit)
-        if self.settings.by_balance:
-            return methods.proposed(robot, mae, theta, torque, tension, limit)
+            return stiffness_command(robot, mae, theta, torque, desired, self._limit)
+        if PRESETS[self.settings.preset].equilibrium:
+            return methods.proposed(robot, mae, theta, torque, tension, self._limit)
         return methods.proposed_paper(robot, mae, theta, torque, tension)
 
     def _correct(self, tension: Array, theta: Array, dt: float) -> None:

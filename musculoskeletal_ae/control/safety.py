@@ -56,8 +56,7 @@ def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
     """
     share = np.clip((highest - temperature) / COOLING_BAND, 0.0, 1.0)
     smooth = share * share * (3.0 - 2.0 * share)
-    limit: Array = robot.tension.bias + smooth * (robot.tension.max - robot.tension.bias)
-    return limit
+    return robot.tension.bias + smooth * (robot.tension.max - robot.tension.bias)
 
 
 def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:
@@ -69,25 +68,17 @@ def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:
 
 
 class SafetyFilter:
-    """Latched stop and limits of the commands.
-
-    Attributes:
-        settings: What the user chose.
-        cause: Why the arm was stopped, or ''.
-        command: Last command that left, or None.
-    """
+    """Latched stop and limits of the commands."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Guard `robot`."""
         self._robot, self.settings = robot, settings
-        self.cause = ''
-        self.command: Command | None = None
+        self.cause = ''  # why the arm was stopped; '' ends it
+        self.command: Command | None = None  # the last one that left
         self._held = 0.0
         self._muscles: Muscles | None = None
         self._lengths: deque[Array] = deque(maxlen=3)
         postures = robot.random_postures(200, np.random.default_rng(0))
-        longest = robot.routes.relative_lengths(postures).max(axis=0)
-        self._longest: Array = longest + LENGTH_MARGIN
+        self._longest = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
 
     def muscles(self, muscles: Muscles) -> None:
         """Take new muscle_states."""
@@ -99,20 +90,13 @@ class SafetyFilter:
         if not self.cause:
             self.cause, self._held = cause, 0.0
 
-    def reset(self) -> None:
-        """Clear the stop."""
-        self.cause = ''
-
     def step(
         self, desired: Command | None, limit: Array, dt: float, fresh: bool = True
     ) -> Command | None:
         """Return the command that may leave, or None if nothing was ever commanded.
 
-        Args:
-            desired: What control wants; None to keep the last command.
-            limit: Tension limit of each muscle [N], shape (M,).
-            dt: Time since the step before [s].
-            fresh: Whether the last muscle_states still say where the muscles are.
+        It follows the desired one, or keeps the last (None), within the tension limits [N] (M,),
+        dt [s] after the last one; fresh muscle_states still say where the muscles are.
         """
         muscles, desired = self._muscles, desired or self.command
         if muscles is None or desired is None:
@@ -127,19 +111,18 @@ class SafetyFilter:
             self.command = self._released(self.command, muscles, dt, fresh)
         return self.command
 
-    def _rate(self, kind: str) -> float:
+    def _most_change(self, kind: str, dt: float) -> float:
         rate = self.settings.rate_limit
-        return rate if kind == LENGTH else rate * self._robot.stiffness
+        return (rate if kind == LENGTH else rate * self._robot.stiffness) * dt
 
     def _limited(self, desired: Command, muscles: Muscles, limit: Array, dt: float) -> Command:
-        kind, robot = desired.kind, self._robot
-        before = self.command
+        (kind, value), robot, before = desired, self._robot, self.command
         if before is None or before.kind != kind:
             before = unchanging(robot, kind, muscles)
             if kind == LENGTH:
                 before = Command(kind, np.minimum(before.value, self._longest))
-        change = self._rate(kind) * dt
-        value = before.value + np.clip(desired.value - before.value, -change, change)
+        change = self._most_change(kind, dt)
+        value = before.value + np.clip(value - before.value, -change, change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
         length = np.minimum(np.median(self._lengths, axis=0), self._longest)
@@ -150,10 +133,9 @@ class SafetyFilter:
         if self._held <= self.settings.hold_time:
             return command
         kind, value = command
-        change = self._rate(kind) * dt
+        change = self._most_change(kind, dt)
         if kind == TENSION:
-            bias = self._robot.tension.bias
-            return Command(kind, np.maximum(bias, value - change))
+            return Command(kind, np.maximum(self._robot.tension.bias, value - change))
         # At the measured length MSC pulls with T_bias only; where that is not known, out to the
         # longest the muscle can be.
         end = muscles.length if fresh else np.maximum(muscles.length, self._longest)

@@ -9,60 +9,54 @@ from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, Parameter
-from musculoskeletal_ae.presets import PRESETS
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 
 
-def _number(default: float, meaning: str, unit: str, low: float, high: float) -> Any:
-    return Parameter(default, meaning, unit, (low, high), settable=True).field()
+def _set(
+    default: Any, meaning: str, unit: str = '', *within: float, legal: tuple[str, ...] = ()
+) -> Any:
+    low_high = (within[0], within[1]) if within else None
+    return Parameter(default, meaning, unit, low_high, legal, settable=True).field()
 
 
 @dataclass(frozen=True)
 class Settings:
     """Settings of control; `Controller.configure` takes changed ones."""
 
-    method: str = Parameter(
-        'proposed', 'how a target posture becomes a command', legal=METHODS, settable=True
-    ).field()
+    method: str = _set('proposed', 'how a target posture becomes a command', legal=METHODS)
     preset: str = replace(PRESET, settable=True).field()
-    joint_stiffness: tuple[float, ...] = Parameter(
+    joint_stiffness: tuple[float, ...] = _set(
         (0.0,),
         'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
         'N·m/rad',
-        settable=True,
-    ).field()
-    first_duration: float = _number(5.0, 'movement duration', 's', 0.1, 60.0)
-    second_duration: float = _number(
+    )
+    first_duration: float = _set(5.0, 'movement duration', 's', 0.1, 60.0)
+    second_duration: float = _set(
         2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
     )
-    constant_tension: float = _number(
+    constant_tension: float = _set(
         0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
-    rate_limit: float = _number(
+    rate_limit: float = _set(
         0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
     )
-    position_gain: float = _number(
+    position_gain: float = _set(
         10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
     )
-    velocity_gain: float = _number(
+    velocity_gain: float = _set(
         0.5, 'damping torque, method `tension` (0: none)', 'N·m·s/rad', 0.0, 20.0
     )
-    feedback_gain: float = _number(
+    feedback_gain: float = _set(
         0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
     )
-    max_age: float = _number(
+    max_age: float = _set(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
     )
-    hold_time: float = _number(0.5, 'how long a stop holds the last command', 's', 0.0, 60.0)
-    temperature_limit: float = _number(
+    hold_time: float = _set(0.5, 'how long a stop holds the last command', 's', 0.0, 60.0)
+    temperature_limit: float = _set(
         85.0, 'a module this hot pulls with T_bias only', '°C', 40.0, 200.0
     )
-
-    @property
-    def by_balance(self) -> bool:
-        """Whether `proposed` solves the balance of torques, instead of the printed descent."""
-        return PRESETS[self.preset].equilibrium
 
     def desired_stiffness(self, joints: int) -> tuple[float, ...]:
         """Return `joint_stiffness` for so many joints; nothing, or a single 0, is all as they come.

@@ -37,19 +37,12 @@ STEP = 0.05
 
 
 class StiffnessModel(NamedTuple):
-    """Joint stiffness around one posture, as the MAE sees it.
+    """Joint stiffness around one posture, as the MAE sees it."""
 
-    Attributes:
-        jacobian: G [m/rad], shape (M, D).
-        hessian: ∂²l/∂θ² [m/rad²], shape (M, D, D).
-        compliance: ∂L_e/∂T [m/N] as polynomials of T, highest power first, shape (3, M).
-        module: K_stiff [N/m].
-    """
-
-    jacobian: Array
-    hessian: Array
-    compliance: Array
-    module: float
+    jacobian: Array  # G [m/rad], (M, D)
+    hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
+    compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
+    module: float  # K_stiff [N/m]
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
@@ -61,7 +54,7 @@ class StiffnessModel(NamedTuple):
         levels = np.linspace(robot.tension.bias, robot.tension.limit, LEVELS)
         tensions = np.tile(levels[:, None], robot.muscle_count)
         lengths = mae.lengths(np.tile(theta, (LEVELS, 1)), tensions)
-        cubic: Array = np.polyfit(levels, -lengths, 3)  # (4, M)
+        cubic = np.polyfit(levels, -lengths, 3)  # (4, M)
         return cls(
             jacobian=mae.muscle_jacobian(theta, tension),
             hessian=robot_stiffness.muscle_hessian(jacobian, theta, STEP),
@@ -86,8 +79,7 @@ class StiffnessModel(NamedTuple):
     def slope(self, tension: Array) -> Array:
         """Return ∂K_jj/∂T_i [N·m/rad/N] at T (M,), shape (D, M)."""
         _, bend = self.muscle_stiffness(tension)
-        slope: Array = (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
-        return slope
+        return (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
 
 
 def stiffness_command(
@@ -95,14 +87,8 @@ def stiffness_command(
 ) -> Solution:
     """Return the command whose joint stiffness is as near as possible to the desired one.
 
-    Args:
-        robot: For limits and K_stiff.
-        mae: The network.
-        theta: θ_target [rad], shape (D,).
-        torque: τ_target = g(θ_target) + effort [N·m], shape (D,).
-        desired: Diagonal entries [N·m/rad], shape (D,); 0 for as it comes. What lies beyond the
-            reachable range of its joint is taken as the end of that range.
-        limit: Highest tension planned [N], scalar or shape (M,).
+    Desired are diagonal entries [N·m/rad] (D,); 0 for as it comes, and what lies beyond the
+    reachable range of its joint is taken as the end of that range. Others as for `proposed`.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
@@ -120,7 +106,6 @@ def stiffness_command(
             start = programme.nearest(tension)
         except InfeasibleError:
             break
-        # Each joint alone.
         lowest, highest = (
             np.array([_extreme(model, programme, start, j, sign) for j in range(len(theta))])
             for sign in (-1.0, 1.0)
@@ -134,11 +119,10 @@ def stiffness_command(
 
 
 def _approach(
-    model: StiffnessModel, programme: TensionProgramme, start: Array, desired: Array
+    model: StiffnessModel, programme: TensionProgramme, tension: Array, desired: Array
 ) -> Array:
     """Gauss–Newton on the desired entries; the others are as they come."""
-    chosen = desired > 0.0
-    tension = start
+    chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):
         slope = model.slope(tension)[chosen]
         short = (desired - np.diag(model.joint_stiffness(tension)))[chosen]
@@ -149,14 +133,14 @@ def _approach(
 
 
 def _extreme(
-    model: StiffnessModel, programme: TensionProgramme, start: Array, joint: int, sign: float
+    model: StiffnessModel, programme: TensionProgramme, tension: Array, joint: int, sign: float
 ) -> float:
     """Climb to the corner that the slope points to, as far as it improves (Frank and Wolfe)."""
 
     def value(tension: Array) -> float:
         return sign * float(model.joint_stiffness(tension)[joint, joint])
 
-    best, tension = value(start), start
+    best = value(tension)
     for _ in range(ITERATIONS):
         slope = sign * model.slope(tension)[joint]
         corner = programme.nearest(tension + FAR / max(float(np.abs(slope).max()), 1e-12) * slope)

@@ -23,16 +23,11 @@ SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is 
 
 
 class TorqueControl:
-    """Tensions for a torque, moment by moment.
-
-    Attributes:
-        settings: What the user chose.
-        missing_torque: What the tensions of the last step do not deliver [N·m], shape (D,).
-    """
+    """Tensions for a torque, moment by moment."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        """Control `robot`."""
         self._robot, self.settings = robot, settings
+        #: what the tensions of the last step do not deliver [N·m], (D,)
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self.start_from(np.full(robot.muscle_count, robot.tension.bias))
 
@@ -44,31 +39,22 @@ class TorqueControl:
     def step(
         self, mae: Mae, theta: Array, target: Array, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Return the tensions to command [N], shape (M,).
+        """Return the tensions to command [N], at most `limit` (M,), dt [s] after the last ones.
 
-        Args:
-            mae: The network.
-            theta: Estimated posture [rad], shape (D,).
-            target: θ_target [rad], shape (D,).
-            effort: Torque beyond holding the weight [N·m], shape (D,).
-            limit: Highest tension of each muscle [N], shape (M,).
-            dt: Time since the step before [s].
+        θ is estimated, the target and it [rad] (D,); effort is torque beyond the weight [N·m] (D,).
         """
+        chosen, robot = self.settings, self._robot
         before = theta if self._smooth is None else self._smooth
-        smooth = before + dt / (dt + SMOOTHING) * (theta - before)
-        self._smooth = smooth
+        self._smooth = smooth = before + dt / (dt + SMOOTHING) * (theta - before)
         velocity = (theta - smooth) / SMOOTHING
-        chosen = self.settings
-        torque = self._robot.kinematics.holding_torque(smooth) + effort
+        torque = robot.kinematics.holding_torque(smooth) + effort
         torque = torque + chosen.position_gain * (target - smooth)
         torque = torque - chosen.velocity_gain * velocity
         jacobian = mae.muscle_jacobian(smooth, self._command)
-        bias = self._robot.tension.bias
-        tension, self.missing_torque = least_tension(jacobian, torque, bias, limit)
+        tension, self.missing_torque = least_tension(jacobian, torque, robot.tension.bias, limit)
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
         change = tension - self._command
-        fastest = self._robot.stiffness * chosen.rate_limit * dt
-        self._command = self._command + change * min(
-            1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9)
-        )
+        fastest = robot.stiffness * chosen.rate_limit * dt
+        share = min(1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9))
+        self._command = self._command + change * share
         return self._command.copy()

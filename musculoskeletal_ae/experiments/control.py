@@ -23,11 +23,11 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
@@ -56,7 +56,6 @@ METHODS = {
 APPROACHES = 5  # θ_eval, and starts for each
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
 DURATION = 8.0  # [s]
-TRIES = 1000  # of finding postures that can be held
 
 
 def approach(arm: EmulatedArm, mae: Mae, settings: Settings, start: Array, theta: Array) -> None:
@@ -86,33 +85,6 @@ def approach(arm: EmulatedArm, mae: Mae, settings: Settings, start: Array, theta
         raise MusculoskeletalError(f'control stopped: {core.safety.cause}')
 
 
-def least_holding_tension(robot: Robot, jacobian: Array, theta: Array) -> Array:
-    """Return the least T [N] (M,) that holds θ with G of shape (M, D); see `holding_tension`."""
-    torque = robot.kinematics.holding_torque(theta)
-    return holding_tension(jacobian, torque, robot.tension.bias, robot.tension.limit, 0.0)
-
-
-def holdable_postures(
-    robot: Robot, individual: Individual, count: int, rng: np.random.Generator
-) -> list[tuple[Array, Array]]:
-    """Return random (θ, least T) that both the model and the true body can hold.
-
-    Raises:
-        MusculoskeletalError: If hardly any posture can be held.
-    """
-    held: list[tuple[Array, Array]] = []
-    for theta in robot.random_postures(TRIES, rng):
-        try:
-            least_holding_tension(robot, robot.routes.muscle_jacobian(theta), theta)
-            true = individual.muscle_jacobian(theta[None])[0]
-            held.append((theta, least_holding_tension(robot, true, theta)))
-        except InfeasibleError:
-            continue
-        if len(held) == count:
-            return held
-    raise MusculoskeletalError(f'only {len(held)} of {TRIES} postures can be held')
-
-
 class Approaches(NamedTuple):
     """Where P targets, each from S starts, left an arm; dictionaries are by method."""
 
@@ -131,7 +103,8 @@ def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: in
     The seed draws targets and starts; networks are by preset.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
-    held = holdable_postures(robot, arm.individual, count, rng)
+    postures = robot.random_postures(TRIES, rng)
+    held = holdable_postures(robot, postures, count, arm.individual.muscle_jacobian)
     offset = {name: np.empty((count, count, robot.joint_count)) for name in METHODS}
     tension, there = ({name: np.empty((count, count)) for name in METHODS} for _ in range(2))
     for p, (theta, _) in enumerate(held):
@@ -149,7 +122,7 @@ def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: in
 def _bound(arm: EmulatedArm) -> float:
     jacobian = arm.individual.muscle_jacobian(arm.theta[None])[0]
     try:
-        return float(np.linalg.norm(least_holding_tension(arm.robot, jacobian, arm.theta)))
+        return float(np.linalg.norm(holding_tension(arm.robot, arm.theta, jacobian=jacobian)))
     except InfeasibleError:
         return float('nan')
 

@@ -58,12 +58,12 @@ def record(
         duration: How long [s], rounded up to whole steps of the exploration.
         script: What happens to the arm on the way.
     """
-    exploration, planned = Exploration(arm.robot, stream), 0.0
-    rows: list[tuple[Array, ...]] = []
+    planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts where the arm is, so that it does not jump.
     command = arm.sense().length
-    while planned < duration - 1e-9:
-        step = exploration.next_step()
+    for step in Exploration(arm.robot, stream):
+        if planned >= duration - 1e-9:
+            break
         start, goal = command, first_command(arm.robot, mae, step.theta, step.tension)
         planned += step.duration
         for tick in range(round(step.duration / SAMPLE_TIME)):

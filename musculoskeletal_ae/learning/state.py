@@ -37,10 +37,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 FILE = 'learner.sqlite'
-TABLES = (
-    'CREATE TABLE IF NOT EXISTS sample (number INTEGER PRIMARY KEY, record BLOB NOT NULL)',
-    'CREATE TABLE IF NOT EXISTS network (checksum INTEGER NOT NULL, checkpoint BLOB NOT NULL)',
-)
+TABLES = {
+    ('CREATE TABLE sample (number INTEGER PRIMARY KEY, record BLOB NOT NULL)',),
+    ('CREATE TABLE network (checksum INTEGER NOT NULL, checkpoint BLOB NOT NULL)',),
+}
+MADE = 'SELECT sql FROM sqlite_master'
 SAMPLES = 'SELECT number, record FROM sample ORDER BY number'
 HEAD = struct.Struct('<8sI')  # mark, checksum
 MARK = b'MAEsampl'
@@ -75,24 +76,33 @@ class State:
             self._open()
             for unfinished in self.directory.glob('backup-*.tmp'):
                 shutil.rmtree(unfinished, ignore_errors=True)
-        except (OSError, ValueError, sqlite3.OperationalError) as error:
-            problem, remedy = f'cannot be written ({error})', "a directory that can, or ''"
+        except (OSError, ValueError, sqlite3.Error) as error:
+            name = f'state_directory {str(directory)!r}'
             if 'locked' in str(error):
-                problem, remedy = 'is used by another learner', 'each its own, or stop the other'
-            elif self._empty():
+                raise StateError(
+                    f'{name} is used by another learner; give each its own, or stop the other'
+                ) from error
+            if not self._writable():
+                raise StateError(
+                    f"{name} cannot be written ({error}); give a directory that can, or ''"
+                ) from error
+            if self._empty():
                 self._failed(error)  # with a full disk, a new learner goes on and says so
-                return
-            raise StateError(
-                f'state_directory {str(directory)!r} {problem}; give {remedy}'
-            ) from error
-        except sqlite3.DatabaseError:
-            pass  # no database: `load` says so
+            # Else it is damaged: `load` sees what can be used.
+
+    def _writable(self) -> bool:
+        try:
+            return all(os.access(path, os.W_OK) for path in (self.directory, self._file))
+        except ValueError:  # a name that no file can have
+            return False
 
     def _empty(self) -> bool:
-        try:
-            return self._file.stat().st_size == 0
-        except (OSError, ValueError):
-            return False
+        return self._file.stat().st_size == 0
+
+    def _files(self) -> list[Path]:
+        return [
+            file for file in (self._file, self._file.with_name(f'{FILE}-journal')) if file.exists()
+        ]
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -133,7 +143,7 @@ class State:
                 except CheckpointError as error:
                     problem = problem or f'the saved network: {error}'
             if problem and not old:
-                self._put_away([self._file], problem)
+                self._put_away(self._files(), problem)
             # With a full disk the learner goes on with what was read, and says so.
             self.keep(samples, None if mae is None else data)
             if old and not self.trouble:
@@ -155,7 +165,7 @@ class State:
                     problem = f'{self._file}: the saved network is damaged'
             records = [record for _, record in self._connection.execute(SAMPLES)]
             ((said,),) = self._connection.execute('PRAGMA integrity_check(1)')
-            if said != 'ok':
+            if said != 'ok' or set(self._connection.execute(MADE)) != TABLES:
                 raise sqlite3.DatabaseError(said)
         except (sqlite3.Error, TypeError, ValueError) as error:
             problem = f'{self._file}: damaged ({error})'
@@ -180,11 +190,10 @@ class State:
         values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
         return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
 
-    def _unpacked(self, record: bytes) -> tuple[int, Sample, Bools] | None:
-        values = record[HEAD.size :]
-        if len(record) != self._size:
+    def _unpacked(self, record: object) -> tuple[int, Sample, Bools] | None:
+        if not isinstance(record, bytes) or len(record) != self._size:
             return None
-        _, checksum = HEAD.unpack_from(record)
+        values, (_, checksum) = record[HEAD.size :], HEAD.unpack_from(record)
         if checksum != zlib.crc32(values, self._seed):
             return None
         joints, muscles = self._robot.joint_count, self._robot.muscle_count
@@ -241,14 +250,14 @@ class State:
         self._next_look = time.monotonic() + PAUSE
         if type(error) is sqlite3.DatabaseError:  # the file itself is damaged
             with suppress(OSError):
-                self._put_away([self._file], str(error))
+                self._put_away(self._files(), str(error))
 
     def _write(
         self, connection: sqlite3.Connection, samples: SampleStore, checkpoint: bytes | None
     ) -> None:
         with connection:  # commits, or rolls back
             connection.execute('BEGIN IMMEDIATE')
-            for table in TABLES:
+            for (table,) in TABLES - set(connection.execute(MADE)):
                 connection.execute(table)
             wanted = {
                 number: self._packed(number, sample, known)

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import tempfile
-from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,15 +32,14 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 FORMAT_VERSION = 1
-# A hundred times the shipped arms' networks.
-MAX_BYTES = 64 * 1024 * 1024
+MAX_BYTES = 64 * 1024 * 1024  # a hundred times the shipped arms' networks
 MAX_HEADER_BYTES = 1024 * 1024
 # A weight or spread beyond these is no trained network, and could overflow where they are folded.
 LARGEST = 1e9
 SMALLEST_STD = 1e-9
 SMALLEST_EIGENVALUE = 1e-12  # of the largest one
-#: beyond what a trained network restores of a posture at rest: rad, N, m
-ABSURD = (100.0, 1e5, 100.0)
+#: beyond what a trained network says of a posture at rest: θ [rad], T [N], l [m], G [m/rad]
+ABSURD = (100.0, 1e5, 100.0, 1e5)
 REMEDY = 'use another checkpoint, or make one with `train`'
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
@@ -92,10 +91,9 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         values = len(self.joints) + 2 * len(self.muscles)
         shapes: dict[str, tuple[int, ...]] = {'mean': (values,), 'std': (values,)}
         depth = len(self.layer_sizes) // 2
-        for i, (into, out) in enumerate(zip(self.layer_sizes, self.layer_sizes[1:], strict=False)):
+        for i, (into, out) in enumerate(pairwise(self.layer_sizes)):
             name = f'encoder.{i}' if i < depth else f'decoder.{i - depth}'
-            shapes[f'{name}.weight'] = (out, into)
-            shapes[f'{name}.bias'] = (out,)
+            shapes |= {f'{name}.weight': (out, into), f'{name}.bias': (out,)}
         if self.anomaly_calibrated is not None:
             muscles = 2 * len(self.muscles)
             shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
@@ -132,98 +130,48 @@ def to_bytes(mae: Mae) -> bytes:
 
 
 def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoint') -> Mae:
-    """Return the network of safetensors bytes, checked.
-
-    Args:
-        data: What `to_bytes` made.
-        robot: The robot it has to fit: same joints and muscles in the same order.
-        source: What to call the bytes in a message, such as the file's name.
+    """Return the network of safetensors bytes, checked; messages call them `source`.
 
     Raises:
-        CheckpointError: If anything is wrong; the message says what.
+        CheckpointError: If anything is wrong, or it does not fit the robot: not the same joints and
+            muscles in the same order, or values that cannot be computed with.
     """
     try:
-        mae = _mae(data, robot)
+        header, meta = _parsed(data)
+        mae = _mae(meta, _tensors(data, header, meta))
+        if robot is not None:
+            _check_fit(mae, robot)
     except CheckpointError as error:
         raise CheckpointError(f'{source}: {error}; {REMEDY}') from error.__cause__
     return mae
 
 
-def _mae(data: bytes, robot: Robot | None) -> Mae:
-    header = _header(data)
-    meta = _metadata(header.pop('__metadata__', None))
-    for what, ours, theirs in (
-        ('joints', meta.joints, meta.joints if robot is None else robot.joints),
-        ('muscles', meta.muscles, meta.muscles if robot is None else robot.muscles),
-    ):
-        if ours != theirs:
-            raise CheckpointError(
-                f'made for {what} {", ".join(ours)}; '
-                f'this robot has {", ".join(theirs)}, in this order'
-            )
-    tensors = _tensors(data, header, meta)
-
-    def stack(name: str) -> tuple[Layer, ...]:
-        depth = range(len(meta.layer_sizes) // 2)
-        return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in depth)
-
-    anomaly = None
-    if meta.anomaly_calibrated is not None:
-        anomaly = AnomalyStatistics(
-            tensors['anomaly.mean'],
-            tensors['anomaly.covariance'],
-            meta.anomaly_calibrated,
-            meta.anomaly_samples,
-            meta.anomaly_thresholds,
-        )
-    mae = Mae(
-        joints=meta.joints,
-        muscles=meta.muscles,
-        preset=meta.preset,
-        activation=meta.activation,
-        encoder=stack('encoder'),
-        decoder=stack('decoder'),
-        mean=tensors['mean'],
-        std=tensors['std'],
-        version=meta.version,
-        training=meta.training,
-        anomaly=anomaly,
-    )
-    if robot is not None and not _restores_something(mae, robot):
-        raise CheckpointError('does not restore a posture at rest to finite, sensible values')
-    return mae
-
-
-def _header(data: bytes) -> dict[str, Any]:
+def _parsed(data: bytes) -> tuple[dict[str, Any], Metadata]:
+    """Return what the header says of each tensor, and the metadata."""
     if len(data) > MAX_BYTES:
         raise CheckpointError(f'{len(data)} bytes; at most {MAX_BYTES} are legal')
     size = int.from_bytes(data[:8], 'little')
-    if len(data) < 8 or not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
+    if not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
         raise CheckpointError(
             f'{len(data)} bytes with a header of {size} bytes are not safetensors '
             f'(a header has 2 to {MAX_HEADER_BYTES} bytes and lies inside the file)'
         )
     header = _json(data[8 : 8 + size], 'header')
-    if not isinstance(header, dict):
-        raise CheckpointError('header is not a JSON object')
-    return header
-
-
-def _metadata(entries: Any) -> Metadata:
+    entries = header.pop('__metadata__', None) if isinstance(header, dict) else None
     if not isinstance(entries, dict):
         raise CheckpointError('no metadata; this is not a checkpoint of musculoskeletal_ae')
     # Before all else: a newer format may differ in everything that is checked below.
     version = _json(entries.get('format_version'), 'format_version')
     if version is True or version != FORMAT_VERSION:
         raise CheckpointError(
-            f'format_version {_short(version)}; this program reads {FORMAT_VERSION}'
+            f'format_version {version!r:.100}; this program reads {FORMAT_VERSION}'
         )
     values = {key: _json(text, key) for key, text in entries.items()}
     try:
-        return msgspec.convert(values, Metadata)
+        return header, msgspec.convert(values, Metadata)
     except msgspec.ValidationError as error:
         place = re.search(r'`\$\.(\w+)', str(error))
-        value = f': {_short(values[place[1]])}' if place else ''
+        value = f': {values[place[1]]!r:.100}' if place else ''
         raise CheckpointError(f'metadata: {error}{value}') from error
 
 
@@ -233,12 +181,7 @@ def _json(text: Any, what: str) -> Any:
     try:
         return msgspec.json.decode(text)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise CheckpointError(f'{what} is not valid JSON ({error}): {_short(text)}') from error
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 100 else f'{text[:100]}…'
+        raise CheckpointError(f'{what} is not valid JSON ({error}): {text!r:.100}') from error
 
 
 def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, Array]:
@@ -258,14 +201,12 @@ def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, A
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f'not valid safetensors ({error})') from error
     for name, value in tensors.items():
-        if not np.isfinite(value).all() or np.abs(value).max(initial=0.0) > LARGEST:
+        if not (np.abs(value) <= LARGEST).all():
             raise CheckpointError(
                 f'tensor {name} holds a value that is not finite or beyond ±{LARGEST:g}'
             )
-    if tensors['std'].min() < SMALLEST_STD:
-        raise CheckpointError(
-            f'tensor std holds {tensors["std"].min():g}; at least {SMALLEST_STD:g} is legal'
-        )
+    if (least := tensors['std'].min()) < SMALLEST_STD:
+        raise CheckpointError(f'tensor std holds {least:g}; at least {SMALLEST_STD:g} is legal')
     if 'anomaly.covariance' in tensors:
         _check_covariance(tensors['anomaly.covariance'])
     return tensors
@@ -286,15 +227,51 @@ def _check_covariance(covariance: Array) -> None:
         )
 
 
-def _restores_something(mae: Mae, robot: Robot) -> bool:
-    """Return whether the network's answer for the middle posture can be computed with."""
+def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
+    def stack(name: str) -> tuple[Layer, ...]:
+        depth = range(len(meta.layer_sizes) // 2)
+        return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in depth)
+
+    anomaly = None
+    if meta.anomaly_calibrated is not None:
+        anomaly = AnomalyStatistics(
+            tensors['anomaly.mean'],
+            tensors['anomaly.covariance'],
+            meta.anomaly_calibrated,
+            meta.anomaly_samples,
+            meta.anomaly_thresholds,
+        )
+    return Mae(
+        joints=meta.joints,
+        muscles=meta.muscles,
+        preset=meta.preset,
+        activation=meta.activation,
+        encoder=stack('encoder'),
+        decoder=stack('decoder'),
+        mean=tensors['mean'],
+        std=tensors['std'],
+        version=meta.version,
+        training=meta.training,
+        anomaly=anomaly,
+    )
+
+
+def _check_fit(mae: Mae, robot: Robot) -> None:
+    """Refuse other names, and a network whose answer for the middle posture is no use."""
+    for what in ('joints', 'muscles'):
+        ours, theirs = getattr(mae, what), getattr(robot, what)
+        if ours != theirs:
+            raise CheckpointError(
+                f'made for {what} {", ".join(ours)}; '
+                f'this robot has {", ".join(theirs)}, in this order'
+            )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)
     with np.errstate(all='ignore'):
         state = mae.estimate(tension, robot.muscle_lengths(theta, tension))
-        jacobian = mae.muscle_jacobian(theta, tension)
-        sensible = [np.abs(part).max() <= most for part, most in zip(state, ABSURD, strict=True)]
-        return all(sensible) and bool(np.abs(jacobian).max() <= max(ABSURD))
+        answers = (*state, mae.muscle_jacobian(theta, tension))
+        if not all(np.abs(part).max() <= most for part, most in zip(answers, ABSURD, strict=True)):
+            raise CheckpointError('does not restore a posture at rest to finite, sensible values')
 
 
 def save(mae: Mae, path: str | Path) -> None:
@@ -313,8 +290,7 @@ def save(mae: Mae, path: str | Path) -> None:
             os.fsync(file.fileno())
         Path(temporary).replace(path)
     except BaseException:
-        with suppress(OSError):
-            Path(temporary).unlink()
+        Path(temporary).unlink(missing_ok=True)
         raise
     # The new name survives a power cut only once the directory is on disk too.
     directory = os.open(path.parent, os.O_RDONLY)

@@ -23,25 +23,19 @@ TINY = 1e-12
 
 
 class Term(NamedTuple):
-    """One norm of the loss: weight · ‖matrix @ y − target‖₂.
+    """One norm of the loss, acting on scaled (θ, T, l)."""
 
-    Attributes:
-        weight: w_k.
-        matrix: A_k, shape (rows, D+2M), acts on scaled (θ, T, l).
-        target: b_k, shape (rows,).
-    """
-
-    weight: float
-    matrix: Array
-    target: Array
+    weight: float  # w_k
+    matrix: Array  # A_k, (rows, D+2M)
+    target: Array  # b_k, (rows,)
 
 
 class StepSearch(NamedTuple):
-    """Constants of the descent: γ_max, N (the paper's C_batch) and C (its C_epoch)."""
+    """Constants of the descent."""
 
-    largest_step: float
-    candidates: int
-    epochs: int
+    largest_step: float  # γ_max
+    candidates: int  # N, the paper's C_batch
+    epochs: int  # C, its C_epoch
 
 
 class Loss:
@@ -80,7 +74,7 @@ def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Ar
     # γ = 0 is a candidate, so that the loss never rises.
     steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]
     for _ in range(search.epochs):
-        y, pullback = mae.decode_pullback(z)
+        y, pullback = mae.decode_scaled.with_pullback(z)
         gradient = pullback(loss.gradient(y))
         candidates = z - steps * (gradient / (np.sqrt(gradient @ gradient) + TINY))
         z = candidates[np.argmin(loss(mae.decode_scaled(candidates)))]

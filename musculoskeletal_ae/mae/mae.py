@@ -31,11 +31,6 @@ class Activation(NamedTuple):
     with_slope: Callable[[Array], tuple[Array, Array]]
 
 
-def _tanh(x: Array) -> Array:
-    result: Array = np.tanh(x, out=x)
-    return result
-
-
 def _tanh_slope(x: Array) -> tuple[Array, Array]:
     h = np.tanh(x, out=x)
     slope = h * h
@@ -65,7 +60,7 @@ def _silu_slope(x: Array) -> tuple[Array, Array]:
 
 
 ACTIVATIONS = {
-    'tanh': Activation(_tanh, _tanh_slope),
+    'tanh': Activation(lambda x: np.tanh(x, out=x), _tanh_slope),
     'silu': Activation(_silu, _silu_slope),
 }
 
@@ -83,9 +78,7 @@ class Stack(NamedTuple):
             x += bias
             x = self.activation.value(x)
         weight, bias = self.layers[-1]
-        x = x @ weight
-        x += bias
-        return x
+        return x @ weight + bias
 
     def with_pullback(self, x: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return the output and the function that maps a gradient by it to one by x."""
@@ -118,37 +111,24 @@ class Stack(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mae:
-    """A trained network and what a checkpoint says of it.
+    """A trained network and what a checkpoint says of it."""
 
-    Attributes:
-        joints: Names of the D joints, in the order of θ.
-        muscles: Names of the M muscles, in the order of T and l.
-        preset: 'paper' or 'default'.
-        activation: 'tanh' or 'silu'.
-        encoder: (weight (out, in), bias (out,)) of each layer, in scaled, standardised units.
-        decoder: The same for the decoder.
-        mean: What scaled (θ, T, l) are centred by, shape (D+2M,).
-        std: What they are divided by, shape (D+2M,).
-        version: Counts up with every checkpoint the learner publishes.
-        training: How it was trained, for people to read.
-        anomaly: Residuals of healthy data, or None.
-    """
-
-    joints: tuple[str, ...]
-    muscles: tuple[str, ...]
+    joints: tuple[str, ...]  # D names, in the order of θ
+    muscles: tuple[str, ...]  # M names, in the order of T and l
     preset: str
     activation: str
-    encoder: tuple[Layer, ...]
+    encoder: tuple[Layer, ...]  # weight (out, in), bias (out,); in scaled, standardised units
     decoder: tuple[Layer, ...]
-    mean: Array
-    std: Array
-    version: int = 0
-    training: str = ''
-    anomaly: AnomalyStatistics | None = None
+    mean: Array  # what scaled (θ, T, l) are centred by, (D+2M,)
+    std: Array  # what they are divided by, (D+2M,)
+    version: int = 0  # counts up with every checkpoint the learner publishes
+    training: str = ''  # how it was trained, for people to read
+    anomaly: AnomalyStatistics | None = None  # residuals of healthy data
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
-    _leave_scaled: Stack = field(init=False, repr=False)
     _leave_length: Stack = field(init=False, repr=False)
+    #: z (..., D+M) to (θ, T, l) in the paper's scaled units, one array (..., D+2M)
+    decode_scaled: Stack = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Freeze the arrays and fold units, standardisation and masks into the layers."""
@@ -172,21 +152,21 @@ class Mae:
         *rest, (last, last_bias) = decoder
         before = tuple(_transposed(*layer) for layer in rest)
         weight, bias = last * std[:, None], last_bias * std + mean
-        si = weight / scale[:, None], bias / scale
-        values = {
-            'mean': mean,
-            'std': std,
-            'encoder': encoder,
-            'decoder': decoder,
-            '_enter': enter,
-            '_leave_scaled': Stack((*before, _transposed(weight, bias)), activation),
-            '_leave': Stack((*before, _transposed(*si)), activation),
-            '_leave_length': Stack(
-                (*before, _transposed(*(part[-muscles:] for part in si))), activation
-            ),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        si_weight, si_bias = weight / scale[:, None], bias / scale
+
+        def leave(weight: Array, bias: Array) -> Stack:
+            return Stack((*before, _transposed(weight, bias)), activation)
+
+        vars(self).update(  # frozen: no other way in
+            mean=mean,
+            std=std,
+            encoder=encoder,
+            decoder=decoder,
+            _enter=enter,
+            _leave=leave(si_weight, si_bias),
+            _leave_length=leave(si_weight[-muscles:], si_bias[-muscles:]),
+            decode_scaled=leave(weight, bias),
+        )
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
@@ -201,19 +181,13 @@ class Mae:
         tension: Array | None = None,
         length: Array | None = None,
     ) -> Array:
-        """Return z of shape (..., D+M) from the two quantities the mask lets in, in SI units.
+        """Return z (..., D+M) from θ [rad] (..., D), T [N] (..., M) and l [m] (..., M).
 
-        Args:
-            mask: Which two of the three enter; the third is ignored and may be None.
-            theta: θ [rad], shape (..., D).
-            tension: T [N], shape (..., M).
-            length: l [m], shape (..., M).
-
-        Raises:
-            ValueError: If one of the two is missing.
+        Only the two that the mask lets in are used, and the third may be None; if one of the two is
+        missing, it is a ValueError.
         """
-        given = [v for v, m in zip((theta, tension, length), mask.value, strict=True) if m]
-        one, two = given
+        given = (theta, tension, length)
+        one, two = (part for part, seen in zip(given, mask.value, strict=True) if seen)
         if one is None or two is None:
             raise ValueError(f'mask {mask.name} needs both of its two quantities')
         return self._enter[mask](np.concatenate((one, two), axis=-1))
@@ -222,23 +196,7 @@ class Mae:
         """Return (θ, T, l) in SI units from z of shape (..., D+M)."""
         joints, muscles = len(self.joints), len(self.muscles)
         values = self._leave(z)
-        return State(
-            values[..., :joints],
-            values[..., joints : joints + muscles],
-            values[..., joints + muscles :],
-        )
-
-    def decode_scaled(self, z: Array) -> Array:
-        """Return (θ, T, l) in the paper's scaled units, one array (..., D+2M)."""
-        return self._leave_scaled(z)
-
-    def decode_pullback(self, z: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return y = decode_scaled(z) and the function that maps dL/dy to dL/dz.
-
-        Args:
-            z: Latent, shape (..., D+M). dL/dy has shape (..., D+2M), dL/dz that of z.
-        """
-        return self._leave_scaled.with_pullback(z)
+        return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
 
     def estimate(self, tension: Array, length: Array) -> State:
         """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation")."""
@@ -269,28 +227,21 @@ class Mae:
         return self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
-        """Return G as the paper takes it, by forward difference of ①, shape (..., M, D).
-
-        Args:
-            theta: θ [rad], shape (..., D).
-            tension: T [N], shape (..., M).
-            step: Δθ [rad]; the paper does not print its size.
-        """
+        """Return G as the paper takes it, by forward difference of ① (it does not print Δθ)."""
         joints = len(self.joints)
         offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
         postures = theta[..., None, :] + offsets  # (..., D+1, D)
         shape = (*postures.shape[:-1], len(self.muscles))
         lengths = self.lengths(postures, np.broadcast_to(tension[..., None, :], shape))
-        difference = (lengths[..., 1:, :] - lengths[..., :1, :]) / step
-        jacobian: Array = difference.swapaxes(-1, -2)
-        return jacobian
+        difference: Array = (lengths[..., 1:, :] - lengths[..., :1, :]) / step
+        return difference.swapaxes(-1, -2)
 
 
 def _frozen(array: Array) -> Array:
-    copy = np.array(array, dtype=np.float64)
+    copy = np.array(array, dtype=np.float64, order='C')
     copy.setflags(write=False)
     return copy
 
 
 def _transposed(weight: Array, bias: Array) -> Layer:
-    return _frozen(np.ascontiguousarray(weight.T)), _frozen(bias)
+    return _frozen(weight.T), _frozen(bias)

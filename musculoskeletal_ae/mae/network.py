@@ -33,15 +33,7 @@ class Network(nn.Module):
     def __init__(
         self, joints: int, muscles: int, settings: NetworkSettings, mean: Array, std: Array
     ) -> None:
-        """Create a network with torch's default random weights.
-
-        Args:
-            joints: D.
-            muscles: M.
-            settings: Hidden layers and activation.
-            mean: What the scaled (θ, T, l) are centred by, shape (D+2M,).
-            std: What they are divided by, shape (D+2M,).
-        """
+        """Start from torch's random weights; (θ, T, l) are centred by mean, divided by std."""
         super().__init__()
         self.joints, self.muscles, self.settings = joints, muscles, settings
         values, latent = joints + 2 * muscles, joints + muscles
@@ -50,11 +42,9 @@ class Network(nn.Module):
         self.encoder, self.decoder = self._stack(encoder), self._stack(decoder)
         self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
         self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
-        entries = np.stack([visible(mask, joints, muscles) for mask in Mask])
-        flags = np.array([mask.value for mask in Mask])
         # One row per mask: which entries pass, then the three mask inputs themselves.
-        rows = np.concatenate([entries, flags], axis=1)
-        self.register_buffer('rows', torch.as_tensor(rows, dtype=torch.float32))
+        rows = np.array([[*visible(mask, joints, muscles), *mask.value] for mask in Mask])
+        self.register_buffer('rows', torch.tensor(rows, dtype=torch.float32))
 
     def encode(self, values: Tensor, mask: Tensor) -> Tensor:
         """Return z: scaled (θ, T, l) of shape (N, D+2M), mask indices (N,) into `Mask`."""
@@ -62,13 +52,11 @@ class Network(nn.Module):
         rows = self.rows[mask]  # (N, D+2M+3)
         width = standard.shape[-1]
         x = torch.cat([standard * rows[:, :width], rows[:, width:]], dim=-1)  # (N, D+2M+3)
-        z: Tensor = self.encoder(x)  # (N, D+M)
-        return z
+        return self.encoder(x)  # (N, D+M)
 
     def decode_standard(self, z: Tensor) -> Tensor:
         """Return the output before mean and spread are put back, shape (N, D+2M)."""
-        values: Tensor = self.decoder(z)
-        return values
+        return self.decoder(z)
 
     def decode(self, z: Tensor) -> Tensor:
         """Return scaled (θ, T, l), shape (N, D+2M)."""
@@ -92,7 +80,6 @@ def to_mae(
     muscles: tuple[str, ...],
     preset: str,
     training: str,
-    version: int = 0,
 ) -> Mae:
     """Return the numpy network that runs, with float64 copies of a trained network's weights."""
 
@@ -111,7 +98,6 @@ def to_mae(
         decoder=stack(network.decoder),
         mean=array(network.mean),
         std=array(network.std),
-        version=version,
         training=training,
     )
 

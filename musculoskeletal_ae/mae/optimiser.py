@@ -41,13 +41,7 @@ class Optimiser:
     """Steps all parameters of a network."""
 
     def __init__(self, network: nn.Module, step_size: float, muon: bool) -> None:
-        """Start with empty momenta.
-
-        Args:
-            network: What is trained.
-            step_size: Adam's.
-            muon: Step the weight matrices by Muon instead.
-        """
+        """Start with empty momenta; the step size is Adam's, matrices are left to it or to Muon."""
         parameters = list(network.parameters())
         self._matrices = [p for p in parameters if muon and p.ndim == 2]
         self._momenta = [torch.zeros_like(p) for p in self._matrices]

@@ -39,29 +39,19 @@ def anomaly(error: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AnomalyStatistics:
-    """Mean and covariance of e over healthy data.
+    """Mean and covariance of e over healthy data."""
 
-    Attributes:
-        mean: Shape (2M,).
-        covariance: Symmetric positive definite, shape (2M, 2M).
-        calibrated: Whether the data came from the real arm, not from geometry.
-        samples: How many samples they rest on.
-        thresholds: What a detector found worth keeping, by name; finite numbers.
-    """
-
-    mean: Array
-    covariance: Array
-    calibrated: bool
-    samples: int
-    thresholds: Mapping[str, float] = field(default_factory=dict)
+    mean: Array  # (2M,)
+    covariance: Array  # symmetric positive definite, (2M, 2M)
+    calibrated: bool  # from the real arm, not from geometry
+    samples: int  # that they rest on
+    thresholds: Mapping[str, float] = field(default_factory=dict)  # of a detector, by name; finite
 
     @classmethod
-    def of(
-        cls, error: Array, calibrated: bool, thresholds: Mapping[str, float] | None = None
-    ) -> AnomalyStatistics:
+    def of(cls, error: Array, calibrated: bool) -> AnomalyStatistics:
         """Return the statistics of residuals of shape (N, 2M), N ≥ 2."""
         mean = error.mean(axis=0)
         centred = error - mean
         covariance = centred.T @ centred / max(len(error) - 1, 1)
         covariance = 0.5 * (covariance + covariance.T) + FLOOR**2 * np.eye(error.shape[1])
-        return cls(mean, covariance, calibrated, len(error), dict(thresholds or {}))
+        return cls(mean, covariance, calibrated, len(error))

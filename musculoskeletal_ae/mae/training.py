@@ -39,11 +39,12 @@ POSTURE_MARGIN = 0.05
 # Between twins, in units of the spread of θ: small against the bends of a route, and large enough
 # that float32 resolves the difference.
 TWIN_DISTANCE = 0.1
+RISE = 0.05  # share of the training in which the step size rises
 # Keeps the gradient of a norm finite at zero.
 TINY = 1e-12
 # A joint or muscle that hardly varies is not blown up beyond this, in scaled units.
 LEAST_SPREAD = 1e-4
-HEALTHY_STATES = 5000  # of the geometric model, for the residuals a new network starts with
+UNSEEN_STATES = 5000  # of the geometric model, for the residuals a new network starts with
 
 #: told (step, loss) after every mini-batch
 Progress = Callable[[int, float], None]
@@ -59,15 +60,10 @@ def random_states(
     lowest: float = 0.0,
     margin: float = 0.0,
 ) -> State:
-    """Return random states of the geometric model.
+    """Return random states of the geometric model, T_r uniform from lowest to highest [N].
 
-    Args:
-        robot: The nominal body.
-        count: How many.
-        rng: Source of randomness.
-        highest: T_r is uniform up to this [N]; a scalar or shape (count, 1).
-        lowest: And down to this [N].
-        margin: Reach of θ_r beyond each joint limit, as a share of the range.
+    The highest tension is one for all or of shape (count, 1); margin is the reach of θ_r beyond
+    each joint limit, as a share of the range.
     """
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
@@ -83,16 +79,9 @@ def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
-    """Return each sample with a neighbour in posture: same T, θ off by TWIN_DISTANCE.
+    """Return samples, scaled (θ, T, l) (N, D+2M), with a neighbour each, (N, 2, D+2M).
 
-    Args:
-        robot: The nominal body.
-        samples: Scaled (θ, T, l), shape (N, D+2M).
-        std: Their spread, shape (D+2M,); directions are uniform in units of it.
-        rng: Source of randomness.
-
-    Returns:
-        Samples and neighbours, shape (N, 2, D+2M).
+    It has the same T, and a θ that is off by TWIN_DISTANCE in units of the spread, std (D+2M,).
     """
     joints, muscles = robot.joint_count, robot.muscle_count
     direction = rng.normal(size=(len(samples), joints))
@@ -118,14 +107,9 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
 def loss(
     network: Network, values: Tensor, mask: Tensor, settings: TrainingSettings, twins: int = 0
 ) -> Tensor:
-    """Return the mean of L_initial over a mini-batch of scaled (θ, T, l) and mask indices.
+    """Return the mean of L_initial over scaled (θ, T, l) (N, D+2M), entered by mask indices (N,).
 
-    Args:
-        network: The network.
-        values: Scaled (θ, T, l), shape (N, D+2M).
-        mask: Indices of masks, shape (N,).
-        settings: Weights.
-        twins: The last so many rows are neighbours of the first so many, all entered by ①.
+    The last `twins` rows are neighbours of the first `twins`, all of them entered by ①.
     """
     joints, muscles = network.joints, network.muscles
     error = network.decode_standard(network.encode(values, mask))
@@ -150,18 +134,10 @@ def fit(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[float]:
-    """Train a network in place, from whatever weights it has.
+    """Train a network in place, from whatever weights it has; return the loss of each mini-batch.
 
-    Args:
-        network: The network.
-        batches: Gives mini-batches of scaled (θ, T, l), shape (N, D+2M), or (N, 2, D+2M) of samples
-            and their twins, at least `settings.steps` of them.
-        settings: How to train.
-        seed: Draws the masks where a sample is entered by one only.
-        progress: Told (step, loss) after every mini-batch.
-
-    Returns:
-        The loss of every mini-batch.
+    These are `settings.steps` of scaled (θ, T, l), shape (N, D+2M), or (N, 2, D+2M) of samples and
+    their twins. The seed draws the masks where a sample is entered by one only.
     """
     generator = torch.Generator().manual_seed(seed)
     optimiser = Optimiser(network, settings.step_size, muon=settings.optimiser == 'muon')
@@ -186,11 +162,11 @@ def fit(
     return losses
 
 
-def annealing(progress: float, rise: float = 0.05) -> float:
+def annealing(progress: float) -> float:
     """Return the factor of the step size at a share of the training in [0, 1)."""
-    if progress < rise:
-        return progress / rise
-    return 0.5 * (1.0 + math.cos(math.pi * (progress - rise) / (1.0 - rise)))
+    if progress < RISE:
+        return progress / RISE
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))
 
 
 @contextmanager
@@ -205,10 +181,10 @@ def one_thread() -> Iterator[None]:
 
 
 class Trained(NamedTuple):
-    """A network ready for a checkpoint, and the loss of every mini-batch on the way."""
+    """What `initial_mae` gives."""
 
-    mae: Mae
-    losses: list[float]
+    mae: Mae  # ready for a checkpoint
+    losses: list[float]  # of every mini-batch
 
 
 def initial_mae(
@@ -220,12 +196,7 @@ def initial_mae(
 ) -> Trained:
     """Train on the geometric model, with anomaly statistics of it that are not calibrated.
 
-    Args:
-        robot: The nominal body.
-        preset: 'paper' or 'default'.
-        seed: Same seed, same network (on the same machine).
-        progress: Told (step, loss) after every mini-batch.
-        steps: Fewer or more mini-batches than the preset's.
+    Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
     """
     chosen = preset_named(preset)
     settings = chosen.training
@@ -250,16 +221,12 @@ def initial_mae(
         f'by {settings.optimiser}'
     )
     mae = to_mae(network, robot.joints, robot.muscles, preset, history)
-    return Trained(replace(mae, anomaly=_geometric_anomaly(mae, robot, seed)), losses)
-
-
-def _geometric_anomaly(mae: Mae, robot: Robot, seed: int) -> AnomalyStatistics:
-    """Return the residuals' statistics on unseen data of the geometric model: not calibrated."""
-    rng = np.random.default_rng([seed, 1])
-    _, tension, length = random_states(robot, HEALTHY_STATES, rng, robot.tension.limit)
+    unseen = np.random.default_rng([seed, 1])
+    _, tension, length = random_states(robot, UNSEEN_STATES, unseen, robot.tension.limit)
     error = residuals(mae.estimate(tension, length), tension, length)
-    thresholds = {'norm': float(anomaly(error).max())}
-    return AnomalyStatistics.of(error, calibrated=False, thresholds=thresholds)
+    statistics = AnomalyStatistics.of(error, calibrated=False)
+    statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
+    return Trained(replace(mae, anomaly=statistics), losses)
 
 
 # -- errors ------------------------------------------------------------------------------------
@@ -269,21 +236,13 @@ OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
 class PairError(NamedTuple):
-    """Error of one output entered by one mask.
-
-    Attributes:
-        mask: How the network was entered.
-        output: 'theta', 'tension' or 'length'.
-        unit: Unit of the numbers.
-        norm: Mean over samples of the L2 norm of the error.
-        elements: Mean absolute error of each joint or muscle, shape (D,) or (M,).
-    """
+    """Error of one output entered by one mask."""
 
     mask: Mask
-    output: str
-    unit: str
-    norm: float
-    elements: Array
+    output: str  # 'theta', 'tension' or 'length'
+    unit: str  # of the numbers
+    norm: float  # mean over samples of the L2 norm
+    elements: Array  # mean absolute error of each joint or muscle, (D,) or (M,)
 
 
 def pair_errors(mae: Mae, states: State) -> list[PairError]:

@@ -17,7 +17,6 @@ from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.nodes.messages import array_message
@@ -111,7 +110,7 @@ class Controller(Shell):
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
-        report = control_report(self.robot, self.core, time.monotonic())
+        report = self.core.report(time.monotonic())
         stopped = [report.message] if self.core.safety.cause else []
         stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
         for line in stopped + stiffness:

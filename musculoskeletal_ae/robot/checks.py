@@ -3,23 +3,36 @@
 
 In postures drawn uniformly in the joint limits, the tension nearest to 60 N within [bias, limit]
 that holds the arm's own weight; the joint stiffness under muscle stiffness control at that tension;
-and the moment arms. An arm is sound when at least 95 % of the postures are held, at least 95 % have
-a smallest stiffness eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not
-stiff), and no moment arm is at fault. Beside it, not judged: the one-sided stiffness, in which
+and the moment arms
+
+    r(θ) = −G(θ)    [m],
+
+the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
+An arm is sound when at least 95 % of the postures are held, at least 95 % have a smallest stiffness
+eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff), every joint moves
+some mass, and no moment arm is at fault. Beside it, not judged: the one-sided stiffness, in which
 muscles at the bias tension count as slack.
+
+An optional third file of a robot directory, `moment_arms.csv`, declares the action the designer
+meant (columns muscle, joint, sign), so that a route on the wrong side of a joint is found even
+where the arm could still hold itself.
 """
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot.moment_arms import Finding, moment_arm_faults, moment_arm_warnings
+from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
+from musculoskeletal_ae.files import read_csv
+from musculoskeletal_ae.robot.description import RobotDescription
+from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -29,31 +42,32 @@ REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
 LEAST_INERTIA = 1e-6  # [kg·m² or kg]; with less a joint cannot be simulated
 SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
+MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N
+TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
+DECLARATION_FILE = 'moment_arms.csv'
+COLUMNS = ['muscle', 'joint', 'sign']
+
+
+class Finding(NamedTuple):
+    """Something about a robot that a person should know, and what to do about it."""
+
+    kind: str  # one word, such as 'wrong_sign'
+    message: str  # names muscles and joints
+    remedy: str
 
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """What was measured in N postures, and what is wrong.
+    """What was measured in N postures, and what is wrong."""
 
-    Attributes:
-        postures: θ [rad], shape (N, D).
-        moment_arms: r = −G [m], shape (N, M, D).
-        tension: Holding tension [N], shape (N, M); NaN where the posture is not held.
-        missing_torque: Torque lacking where a posture is not held [N·m], shape (N, D).
-        stiffness: Smallest joint-stiffness eigenvalue [N·m/rad], shape (N,); NaN if not held.
-        one_sided: Smallest eigenvalue with muscles at the bias tension slack, shape (N,).
-        faults: Why the arm is not sound; empty if it is.
-        warnings: What deserves a look but is not judged.
-    """
-
-    postures: Array
-    moment_arms: Array
-    tension: Array
-    missing_torque: Array
-    stiffness: Array
-    one_sided: Array
-    faults: tuple[Finding, ...]
-    warnings: tuple[Finding, ...]
+    postures: Array  # θ [rad], (N, D)
+    moment_arms: Array  # r [m], (N, M, D)
+    tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
+    missing_torque: Array  # torque lacking where a posture is not held [N·m], (N, D)
+    stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
+    one_sided: Array  # the same with muscles at the bias tension slack, (N,)
+    faults: tuple[Finding, ...]  # why the arm is not sound; empty if it is
+    warnings: tuple[Finding, ...]  # what deserves a look but is not judged
 
     @property
     def held(self) -> Bools:
@@ -67,12 +81,7 @@ class RobotCheck:
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
-    """Measure and judge a robot in random postures.
-
-    Args:
-        robot: The nominal body.
-        postures: How many postures are drawn.
-        seed: Random seed of the postures.
+    """Measure and judge a robot in so many postures, drawn with a random seed.
 
     Raises:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
@@ -82,20 +91,16 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     torque = robot.kinematics.holding_torque(theta)
     measured = [_measure(robot, *at) for at in zip(theta, jacobian, torque, strict=True)]
     tension, missing, stiffness, softest, one_sided = map(np.array, zip(*measured, strict=True))
-    return RobotCheck(
-        postures=theta,
-        moment_arms=-jacobian,
-        tension=tension,
-        missing_torque=missing,
-        stiffness=stiffness,
-        one_sided=one_sided,
-        faults=(
-            *moment_arm_faults(robot.description, -jacobian),
-            *_inertia_faults(robot, theta),
-            *_holding_faults(robot, stiffness, softest, missing),
-        ),
-        warnings=tuple(moment_arm_warnings(robot.description, -jacobian)),
+    arms = -jacobian
+    faults = (
+        *_wrong_signs(robot, arms),
+        *_one_way_joints(robot, arms),
+        *_useless_muscles(robot, arms),
+        *_inertia_faults(robot, theta),
+        *_holding_faults(robot, stiffness, softest, missing),
     )
+    warnings = tuple(_flipping_muscles(robot, arms))
+    return RobotCheck(theta, arms, tension, missing, stiffness, one_sided, faults, warnings)
 
 
 def _measure(
@@ -116,6 +121,102 @@ def _measure(
     one_sided = np.linalg.eigvalsh(joint_stiffness(jacobian, hessian, taut, tension))[0]
     softest = int(np.abs(vectors[:, 0]).argmax())
     return tension, np.zeros(robot.joint_count), values[0], softest, one_sided
+
+
+def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
+    """Return (muscle, joint) → ±1 of `moment_arms.csv`; nothing if there is no such file.
+
+    Raises:
+        RobotDescriptionError: Naming the file, the line and the legal values.
+    """
+    file = description.directory / DECLARATION_FILE
+    legal = (description.muscles, description.joints, ('+', '-'))
+    actions: dict[tuple[int, int], int] = {}
+    if not os.path.lexists(file):
+        return actions
+    for line, text, cells in read_csv(file, COLUMNS, refusal):
+        where = f'{file}: line {line}'
+        if len(cells) != len(COLUMNS):
+            raise RobotDescriptionError(f'{where}: expected 3 values, got {text.strip()!r}')
+        row = [*cells[:2], cells[2].replace('−', '-')]
+        for column, cell, names in zip(COLUMNS, row, legal, strict=True):
+            if cell not in names:
+                raise RobotDescriptionError(
+                    f'{where}: unknown {column} {cell!r}; legal: {", ".join(names)}'
+                )
+        muscle, joint, sign = (names.index(cell) for cell, names in zip(row, legal, strict=True))
+        if (muscle, joint) in actions:
+            raise RobotDescriptionError(f'{where}: {row[0]} at {row[1]} is declared twice')
+        actions[muscle, joint] = 1 - 2 * sign
+    return actions
+
+
+def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Declared actions that too many postures contradict."""
+    for (muscle, joint), sign in read_declared_actions(robot.description).items():
+        arm = moment_arms[:, muscle, joint]
+        against = np.mean(arm * sign <= 0.0)
+        expected, actual = ('+', '-') if sign > 0 else ('-', '+')
+        if not arm.any():
+            actual = '0, it does not cross the joint,'
+        if against > TOLERATED_SHARE:
+            yield Finding(
+                'wrong_sign',
+                f'muscle {robot.muscles[muscle]!r} has a moment arm of wrong sign at joint '
+                f'{robot.joints[joint]!r}: expected {expected}, found {actual} in '
+                f'{100 * against:.0f} % of postures (median {1e3 * np.median(arm):+.1f} mm)',
+                'lead its route along the other side of the joint axis, or correct '
+                f'{DECLARATION_FILE}',
+            )
+
+
+def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Joints that too often have muscles on one side only."""
+    lacks = {
+        '+': np.max(moment_arms, axis=1) <= MATTERS,
+        '-': np.min(moment_arms, axis=1) >= -MATTERS,
+    }
+    median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
+    for joint in np.flatnonzero(np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE):
+        missing = ' and '.join(
+            f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'
+            for sign, lacking in lacks.items()
+            if lacking[:, joint].any()
+        )
+        acting = ', '.join(
+            f'{robot.muscles[m]} ({1e3 * median[m, joint]:+.0f} mm)'
+            for m in np.flatnonzero(longest[:, joint] > MATTERS)
+        )
+        yield Finding(
+            'one_way_joint',
+            f'joint {robot.joints[joint]!r} has no muscle that pulls in direction '
+            f'{missing}; muscles that act on it: {acting or "none"}',
+            'a wire only pulls: lead a muscle along the other side of its axis',
+        )
+
+
+def _useless_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    for name, arm in zip(robot.muscles, np.abs(moment_arms).max(axis=(0, 2)), strict=True):
+        if arm < MATTERS:
+            yield Finding(
+                'useless_muscle',
+                f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
+                f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
+            )
+
+
+def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Muscles whose main action changes sign over the range."""
+    median = np.median(moment_arms, axis=0)
+    for m, joint in enumerate(np.abs(median).argmax(axis=1)):
+        against = (moment_arms[:, m, joint] * np.sign(median[m, joint]) < 0.0).mean()
+        if against > TOLERATED_SHARE:
+            yield Finding(
+                'flipping_muscle',
+                f'muscle {robot.muscles[m]!r} changes the sign of its main action, '
+                f'at joint {robot.joints[joint]!r}, in {100 * against:.0f} % of postures',
+                'lead it further from the axis of that joint',
+            )
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ legal values in the message, so that no later code needs to check again.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.entries import Entry, listed, refusal
+from musculoskeletal_ae.robot.entries import Entry, refusal
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_urdf
 
-TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
 
 #: points (link, xyz in the link's frame [m]), joined by straight lines
@@ -31,52 +30,36 @@ Route = tuple[tuple[str, Array], ...]
 
 @dataclass(frozen=True)
 class TensionRange:
-    """Muscle tensions of the robot [N]: what MSC keeps, the highest planned, the highest ever."""
+    """Muscle tensions of the robot [N]."""
 
-    bias: float
-    limit: float
-    max: float
+    bias: float = 30.0  # what MSC keeps
+    limit: float = 200.0  # the highest planned
+    max: float = 500.0  # the highest ever
 
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """What the two files of a robot directory say, checked.
-
-    Attributes:
-        directory: Where it was read from.
-        urdf: Text of robot.urdf.
-        model: Pinocchio model of the whole URDF.
-        joints: Names in the order of θ.
-        muscles: Names in the order of T and l.
-        routes: One for each muscle.
-        series_elastic: Elastic constants of the muscles.
-        stiffness: K_stiff of muscle stiffness control [N/m].
-        tension: Tension range [N].
-        end_effector: Link that grasps, is pushed and carries the marker.
-    """
+    """What the two files of a robot directory say, checked."""
 
     directory: Path
     urdf: str
-    model: pin.Model
-    joints: tuple[str, ...]
-    muscles: tuple[str, ...]
-    routes: tuple[Route, ...]
+    model: pin.Model  # of the whole URDF
+    joints: tuple[str, ...]  # in the order of θ
+    muscles: tuple[str, ...]  # in the order of T and l
+    routes: tuple[Route, ...]  # one for each muscle
     series_elastic: SeriesElastic
-    stiffness: float
+    stiffness: float  # K_stiff of muscle stiffness control [N/m]
     tension: TensionRange
-    end_effector: str
+    end_effector: str  # link that grasps, is pushed and carries the marker
 
     @property
     def root_link(self) -> str:
-        """Name of the URDF's root link."""
+        """Name of the URDF's root link, in whose frame poses and markers are given."""
         return str(_links(self.model)[0].name)
 
 
 def load_description(robot: str | Path) -> RobotDescription:
-    """Read and check a robot description.
-
-    Args:
-        robot: A shipped name such as 'musashi_left_arm', or a directory.
+    """Read and check a robot description, by a shipped name such as 'arm26' or a directory.
 
     Raises:
         RobotDescriptionError: Naming the file, the entry and the legal values.
@@ -85,7 +68,7 @@ def load_description(robot: str | Path) -> RobotDescription:
     urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
     urdf = read_text(urdf_file, refusal)
     model = read_urdf(urdf_file, urdf)
-    top = Entry(muscle_file, 'top level', read_yaml(muscle_file, refusal), '').mapping(
+    top = Entry(muscle_file, read_yaml(muscle_file, refusal), 'top level', '').mapping(
         'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector'
     )
     joints = _read_joints(top['joints'], model)
@@ -104,9 +87,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         joints=joints,
         muscles=top['muscles'].unique(names),
         routes=tuple(routes),
-        series_elastic=SeriesElastic(
-            **{key: np.array([row[key] for row in elastic]) for key in series_elastic.DEFAULT}
-        ),
+        series_elastic=SeriesElastic(**{k: np.array([row[k] for row in elastic]) for k in default}),
         stiffness=top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0),
         tension=_read_tension(top.get('tension', {})),
         end_effector=_read_end_effector(top.get('end_effector'), model, joints),
@@ -122,9 +103,8 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
     movable = list(model.names)[1:]
     for name in entry.unique(names):
         if name not in movable:
-            raise entry.fail(
-                f'unknown joint {name!r}; movable joints of robot.urdf: {listed(movable)}'
-            )
+            legal = ', '.join(movable)
+            raise entry.fail(f'unknown joint {name!r}; movable joints of robot.urdf: {legal}')
         joint = model.joints[model.getJointId(name)]
         if joint.shortname() not in kinematics.REVOLUTE + kinematics.PRISMATIC:
             raise entry.fail(
@@ -133,7 +113,7 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
             )
         lower = model.lowerPositionLimit[joint.idx_q]
         upper = model.upperPositionLimit[joint.idx_q]
-        if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
+        if not -math.inf < lower < upper < math.inf:
             raise entry.fail(
                 f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf; '
                 'expected finite lower < upper'
@@ -144,10 +124,13 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
 def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     if entry.value is None:
         return default
-    given = entry.mapping(*series_elastic.DEFAULT)
-    force, rate = (given.get(key, default[key]).number(above=0.0) for key in ('force', 'rate'))
-    stretch = given.get('wire_stretch', default['wire_stretch']).number(least=0.0)
-    return {'force': force, 'rate': rate, 'wire_stretch': stretch}
+    given = entry.mapping(*default)
+    force, rate, stretch = (given.get(key, value) for key, value in default.items())
+    return {
+        'force': force.number(above=0.0),
+        'rate': rate.number(above=0.0),
+        'wire_stretch': stretch.number(least=0.0),
+    }
 
 
 def _read_route(entry: Entry, model: pin.Model) -> Route:
@@ -168,21 +151,17 @@ def _read_route(entry: Entry, model: pin.Model) -> Route:
 def _read_link(entry: Entry, model: pin.Model) -> str:
     name, links = entry.name(), [frame.name for frame in _links(model)]
     if name not in links:
-        raise entry.fail(f'unknown link {name!r}; links of robot.urdf: {listed(links)}')
+        raise entry.fail(f'unknown link {name!r}; links of robot.urdf: {", ".join(links)}')
     return name
 
 
 def _read_tension(entry: Entry) -> TensionRange:
-    given = entry.mapping(*TENSION_DEFAULT)
-    tension = TensionRange(
-        **{key: given.get(key, TENSION_DEFAULT[key]).number(above=0.0) for key in TENSION_DEFAULT}
-    )
-    if not tension.bias < tension.limit <= tension.max:
-        raise entry.fail(
-            f'expected bias < limit <= max, got {tension.bias:g}, {tension.limit:g}, '
-            f'{tension.max:g}'
-        )
-    return tension
+    default = asdict(TensionRange())
+    given = entry.mapping(*default)
+    bias, limit, most = (given.get(key, default[key]).number(above=0.0) for key in default)
+    if not bias < limit <= most:
+        raise entry.fail(f'expected bias < limit <= max, got {bias:g}, {limit:g}, {most:g}')
+    return TensionRange(bias, limit, most)
 
 
 def _read_end_effector(entry: Entry, model: pin.Model, joints: tuple[str, ...]) -> str:
@@ -193,5 +172,4 @@ def _read_end_effector(entry: Entry, model: pin.Model, joints: tuple[str, ...]) 
     depth = [0]
     for i in range(1, model.njoints):
         depth.append(depth[model.parents[i]] + (model.names[i] in joints))
-    deepest = max(depth[frame.parentJoint] for frame in _links(model))
-    return str([f.name for f in _links(model) if depth[f.parentJoint] == deepest][-1])
+    return str(max(reversed(_links(model)), key=lambda link: depth[link.parentJoint]).name)

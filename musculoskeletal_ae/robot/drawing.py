@@ -23,31 +23,20 @@ BALL = 1.7  # of a line's width
 
 
 class Line(NamedTuple):
-    """A polyline in the root link's frame.
-
-    Attributes:
-        kind: What it stands for.
-        points: Shape (N, 3) [m].
-        width: Line width [m].
-        colour: Red, green, blue in [0, 1].
-    """
+    """A polyline in the root link's frame."""
 
     kind: Literal['bones', 'muscles']
-    points: Array
-    width: float
-    colour: tuple[float, ...]
+    points: Array  # [m], (N, 3)
+    width: float  # [m]
+    colour: tuple[float, ...]  # red, green, blue in [0, 1]
 
 
 def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = None) -> list[Line]:
-    """Return the bones of an arm, then its muscles in their order.
+    """Return the bones of an arm, then its muscles in their order, at θ [rad] (D,) and T [N] (M,).
 
-    Args:
-        robot: The nominal body.
-        theta: Posture [rad], shape (D,).
-        tension: Muscle tensions [N], shape (M,).
-        points: Route points [m], shape (P, 3); those of the geometric model by default.
+    Route points [m] (P, 3) are those of the geometric model by default.
     """
-    kin, routes = robot.kinematics, robot.routes
+    kin, routes, limits = robot.kinematics, robot.routes, robot.tension
     if points is None:
         points = routes.points(theta[None])[0]
     origins = kin.joint_poses(theta[None]).translation[0]
@@ -60,18 +49,12 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         for bone in bones
         if np.linalg.norm(bone[1] - bone[0]) > SHORTEST_BONE
     ]
-    for m, colour in enumerate(tension_colour(robot, tension).tolist()):
+    red = np.clip((tension - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
+    for m, share in enumerate(red.tolist()):
         own = np.flatnonzero(routes.muscle == m)
         route = points[np.append(routes.first[own], routes.second[own[-1]])]
-        lines.append(Line('muscles', route, MUSCLE_WIDTH, tuple(colour)))
+        lines.append(Line('muscles', route, MUSCLE_WIDTH, (share, 1.0 - share, 0.0)))
     return lines
-
-
-def tension_colour(robot: Robot, tension: Array) -> Array:
-    """Return (red, green, blue) in [0, 1] of tensions [N] (M,): green at bias, red at limit."""
-    low, high = robot.tension.bias, robot.tension.limit
-    share = np.clip((tension - low) / (high - low), 0.0, 1.0)
-    return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=1)
 
 
 def save_picture(lines: Sequence[Line], path: str | Path, title: str = '') -> None:
@@ -81,32 +64,18 @@ def save_picture(lines: Sequence[Line], path: str | Path, title: str = '') -> No
     figure = Figure(figsize=(9.0, 5.0), layout='constrained')
     every = np.concatenate([line.points for line in lines])
     middle = 0.5 * (every.max(axis=0) + every.min(axis=0))
-    reach = 0.5 * float((every.max(axis=0) - every.min(axis=0)).max()) + 0.03
+    reach = 0.5 * np.ptp(every, axis=0).max() + 0.03
+    balls = {'solid_capstyle': 'round', 'marker': 'o', 'mec': '0.35', 'mew': 0.5}
     for i, (azimuth, name) in enumerate([(-10.0, 'from the front'), (-80.0, 'from the right')]):
-        axes: Any = figure.add_subplot(1, 2, i + 1, projection='3d')
-        axes.set_proj_type('ortho')
+        axes: Any = figure.add_subplot(1, 2, i + 1, projection='3d', proj_type='ortho')
         for line in lines:
             width = 400.0 * line.width
             # Balls where bones meet, and where a muscle's route is held.
-            axes.plot(
-                *line.points.T,
-                color=line.colour,
-                linewidth=width,
-                solid_capstyle='round',
-                marker='o',
-                markersize=BALL * width,
-                markeredgecolor='0.35',
-                markeredgewidth=0.5,
-            )
-        axes.set_xlim(middle[0] - reach, middle[0] + reach)
-        axes.set_ylim(middle[1] - reach, middle[1] + reach)
-        axes.set_zlim(middle[2] - reach, middle[2] + reach)
+            axes.plot(*line.points.T, color=line.colour, lw=width, ms=BALL * width, **balls)
+        axes.set(title=name, xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')
+        axes.set(**{f'{x}lim': (m - reach, m + reach) for x, m in zip('xyz', middle)})
         axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.05)
         axes.locator_params(nbins=5)
-        axes.set_xlabel('x [m]')
-        axes.set_ylabel('y [m]')
-        axes.set_zlabel('z [m]')
         axes.view_init(elev=10.0, azim=azimuth)
-        axes.set_title(name)
     figure.suptitle(title or 'muscles: green at bias tension, red at the limit')
     figure.savefig(path, dpi=110)

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +11,12 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 
 
 class Entry:
-    """A value of a YAML file and where it stands.
+    """A value of a YAML file, of any type until a method has checked it, and where it stands."""
 
-    Attributes:
-        where: Its place, for messages.
-        value: The value; any YAML type until one of the methods has checked it.
-    """
-
-    def __init__(self, file: Path, where: str, value: Any, inside: str) -> None:
+    def __init__(self, file: Path, value: Any, where: str, inside: str | None = None) -> None:
         """Keep a value; `inside` stands before the names of its own entries."""
-        self.file, self.where, self.value, self._inside = file, where, value, inside
+        self.file, self.value, self.where = file, value, where
+        self._inside = f'{where}.' if inside is None else inside
 
     def fail(self, problem: str) -> RobotDescriptionError:
         """Return the error that says what is wrong with this entry."""
@@ -30,25 +24,23 @@ class Entry:
 
     def called(self, name: str) -> Entry:
         """Return the same entry under a name that people know it by."""
-        return Entry(self.file, name, self.value, f'{name}: ')
-
-    # -- mappings and lists ---------------------------------------------------------------------
+        return Entry(self.file, self.value, name, f'{name}: ')
 
     def mapping(self, *legal: str) -> Entry:
         """Return this mapping, all of whose keys are legal."""
+        keys = ', '.join(legal)
         if not isinstance(self.value, dict):
-            raise self.fail(f'expected a mapping with keys {listed(legal)}, got {self.value!r}')
+            raise self.fail(f'expected a mapping with keys {keys}, got {self.value!r}')
         for key in self.value:
             if key not in legal:
-                raise self.fail(f'unknown key {key!r}; legal keys: {listed(legal)}')
+                raise self.fail(f'unknown key {key!r}; legal keys: {keys}')
         return self
 
     def get(self, key: str, default: Any = None) -> Entry:
         """Return the entry of a key, with a default where it is left out."""
-        return self._part(f'{self._inside}{key}', self.value.get(key, default))
+        return Entry(self.file, self.value.get(key, default), f'{self._inside}{key}')
 
     def __getitem__(self, key: str) -> Entry:
-        """Return the entry of a key that must be there."""
         if self.value.get(key) is None:
             raise self.fail(f'key {key!r} is missing')
         return self.get(key)
@@ -59,12 +51,7 @@ class Entry:
         if not isinstance(value, list) or len(value) < at_least:
             count = f'{len(value)} given' if isinstance(value, list) else f'got {value!r}'
             raise self.fail(f'expected a list of at least {at_least} {of_what}, {count}')
-        return [self._part(f'{self.where}[{i}]', item) for i, item in enumerate(value)]
-
-    def _part(self, where: str, value: Any) -> Entry:
-        return Entry(self.file, where, value, f'{where}.')
-
-    # -- single values --------------------------------------------------------------------------
+        return [Entry(self.file, item, f'{self.where}[{i}]') for i, item in enumerate(value)]
 
     def number(self, above: float = -math.inf, least: float = -math.inf) -> float:
         """Return a finite number above one bound and at least another."""
@@ -75,10 +62,9 @@ class Entry:
         if not math.isfinite(result):
             hint = ' (YAML reads 1e5 as text; write 1.0e+5)' if isinstance(value, str) else ''
             raise self.fail(f'expected a finite number, got {value!r}{hint}')
-        if result <= above:
-            raise self.fail(f'expected a number > {above:g}, got {result:g}')
-        if result < least:
-            raise self.fail(f'expected a number >= {least:g}, got {result:g}')
+        if result <= above or result < least:
+            bound = f'> {above:g}' if result <= above else f'>= {least:g}'
+            raise self.fail(f'expected a number {bound}, got {result:g}')
         return result
 
     def name(self) -> str:
@@ -89,15 +75,10 @@ class Entry:
 
     def unique(self, names: list[str]) -> tuple[str, ...]:
         """Return the names in this entry, none of which may be there twice."""
-        for name, count in Counter(names).items():
-            if count > 1:
+        for name in names:
+            if names.count(name) > 1:
                 raise self.fail(f'{name!r} is listed twice; names must be unique')
         return tuple(names)
-
-
-def listed(names: Iterable[str]) -> str:
-    """Return names as they stand in a message."""
-    return ', '.join(names)
 
 
 def refusal(file: Path, problem: str) -> RobotDescriptionError:

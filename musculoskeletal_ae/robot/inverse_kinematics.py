@@ -28,26 +28,17 @@ SMALL_STEP = 1e-6  # [rad]
 
 
 class Posture(NamedTuple):
-    """A solution.
+    """A solution, and what it leaves of the position and of the orientation."""
 
-    Attributes:
-        theta: θ [rad], shape (D,).
-        distance: What is left of the position [m].
-        angle: What is left of the orientation [rad].
-    """
-
-    theta: Array
-    distance: float
-    angle: float
+    theta: Array  # θ [rad], (D,)
+    distance: float  # [m]
+    angle: float  # [rad]
 
 
 def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
     """Return the joint angles that bring the end effector nearest to a pose.
 
-    Args:
-        robot: The arm.
-        pose: Of the end effector in the root link's frame.
-        start: θ to start from [rad], shape (D,).
+    The pose is in the root link's frame; the search starts at the estimate θ_est [rad] (D,).
     """
     kin, lower, upper = robot.kinematics, robot.lower, robot.upper
     theta, damping = np.clip(start, lower, upper), 1e-2

@@ -12,6 +12,7 @@ or 1 + θ a for one that slides: a sum of constant matrices, the same operation 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,30 +25,18 @@ PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismati
 
 
 class JointPoses(NamedTuple):
-    """Poses of pinocchio's joints in the root link's frame for N postures; index 0 is that link.
+    """Poses of pinocchio's joints in the root link's frame for N postures; index 0 is that link."""
 
-    Attributes:
-        rotation: Shape (N, J, 3, 3).
-        translation: Joint origins [m], shape (N, J, 3).
-        axis: Joint axes, shape (N, J, 3); zero at index 0.
-    """
-
-    rotation: Array
-    translation: Array
-    axis: Array
+    rotation: Array  # (N, J, 3, 3)
+    translation: Array  # joint origins [m], (N, J, 3)
+    axis: Array  # (N, J, 3); zero at index 0
 
 
 class Kinematics:
     """Rigid-body side of a robot: link poses, gravity torque and end-effector Jacobian."""
 
-    def __init__(self, full_model: pin.Model, joints: tuple[str, ...], end_effector: str) -> None:
-        """Keep the listed joints of a model and lock all others at zero.
-
-        Args:
-            full_model: Pinocchio model of the whole URDF (fixed base).
-            joints: Names of the D joints, in the order of θ; checked by the description.
-            end_effector: Link that carries the marker and is pushed.
-        """
+    def __init__(self, full_model: pin.Model, joints: Sequence[str], end_effector: str) -> None:
+        """Keep D joints of a URDF's model, in the order of θ; lock all others at zero."""
         locked = [
             full_model.getJointId(name) for name in full_model.names[1:] if name not in joints
         ]
@@ -92,14 +81,7 @@ class Kinematics:
         return frame.parentJoint, frame.placement.act(xyz)
 
     def transforms(self, theta: Array) -> Array:
-        """Return the pose of every joint in the root link's frame.
-
-        Args:
-            theta: θ [rad], shape (N, D).
-
-        Returns:
-            Homogeneous transforms, shape (N, J, 4, 4); index 0 is the root link.
-        """
+        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
         angle = theta[:, self.theta_index[1:], None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
@@ -129,35 +111,26 @@ class Kinematics:
         """Return g(θ), the joint torque that holds the arm's own weight [N·m], shape (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.holding_torque(row) for row in theta])
-        gravity = pin.computeGeneralizedGravity(self.model, self.data, self._q(theta))
-        torque: Array = gravity[self.order]
-        return torque
+        return pin.computeGeneralizedGravity(self.model, self.data, self._q(theta))[self.order]
 
     def gravity_gradient(self, theta: Array) -> Array:
         """Return ∂g/∂θ [N·m/rad], shape (D, D), at θ (D,)."""
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, self._q(theta))
-        columns: Array = gradient[np.ix_(self.order, self.order)]
-        return columns
+        return gradient[np.ix_(self.order, self.order)]
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
-        inertia: Array = np.diag(pin.crba(self.model, self.data, self._q(theta)))[self.order]
-        return inertia
+        return np.diag(pin.crba(self.model, self.data, self._q(theta)))[self.order]
 
     def end_effector_jacobian(self, theta: Array) -> Array:
         """Return J (6, D): rows linear [m/rad] then angular, at the end effector's origin.
 
         Axes are those of the root link, so a wrench F there is the joint torque Jᵀ F.
         """
-        jacobian = pin.computeFrameJacobian(
-            self.model,
-            self.data,
-            self._q(theta),
-            self.end_effector_frame,
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )
-        columns: Array = jacobian.reshape(6, -1)[:, self.order]
-        return columns
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        q, frame = self._q(theta), self.end_effector_frame
+        jacobian = pin.computeFrameJacobian(self.model, self.data, q, frame, axes)
+        return jacobian.reshape(6, -1)[:, self.order]
 
     def end_effector_pose(self, theta: Array) -> pin.SE3:
         """Return the pose of the end effector in the root link's frame."""

@@ -16,42 +16,28 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-#: [N]; [1/m]; [1/N], metres of stretch per metre of wire and newton
 DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}
 
 
 @dataclass(frozen=True)
 class SeriesElastic:
-    """Elastic constants of M muscles, one entry each.
+    """Elastic constants of M muscles, each of shape (M,). A wire cannot push: T < 0 counts as 0."""
 
-    Attributes:
-        force: Tension at which the elastic unit has stretched by ln 2 / rate [N], shape (M,).
-        rate: Stiffening rate of the elastic unit [1/m], shape (M,).
-        wire_stretch: Stretch of the wire per metre and newton [1/N], shape (M,).
-    """
-
-    force: Array
-    rate: Array
-    wire_stretch: Array
+    force: Array  # tension at which the elastic unit has stretched by ln 2 / rate [N]
+    rate: Array  # stiffening rate of the elastic unit [1/m]
+    wire_stretch: Array  # stretch of the wire per metre and newton [1/N]
 
     def elongation(self, absolute_length: Array, tension: Array) -> Array:
-        """Return L_e(l_abs, T) [m]; tensions below zero count as zero (a wire cannot push).
-
-        Args:
-            absolute_length: Muscle length [m], shape (..., M).
-            tension: Muscle tension [N], shape (..., M).
-        """
+        """Return L_e(l_abs, T) [m]; l_abs [m] and T [N] of shape (..., M)."""
         pull = np.maximum(tension, 0.0)
-        stretch: Array = self.wire_stretch * absolute_length * pull
+        stretch = self.wire_stretch * absolute_length * pull
         return np.log1p(pull / self.force) / self.rate + stretch
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
         """Return ∂L_e/∂T [m/N], shape (..., M)."""
-        pull = np.maximum(tension, 0.0)
-        unit: Array = 1.0 / (self.rate * (self.force + pull))
+        unit = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
         return unit + self.wire_stretch * absolute_length
 
     def length_slope(self, tension: Array) -> Array:
         """Return ∂L_e/∂l_abs [m/m], shape (..., M)."""
-        slope: Array = self.wire_stretch * np.maximum(tension, 0.0)
-        return slope
+        return self.wire_stretch * np.maximum(tension, 0.0)

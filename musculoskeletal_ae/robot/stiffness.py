@@ -19,38 +19,23 @@ from musculoskeletal_ae.arrays import Array
 
 def muscle_stiffness(module: float, compliance: Array) -> Array:
     """Return k [N/m] of MSC with K_stiff [N/m] and an elastic unit of ∂L_e/∂T [m/N] in series."""
-    stiffness: Array = 1.0 / (1.0 / module + compliance)
-    return stiffness
+    return 1.0 / (1.0 / module + compliance)
 
 
 def muscle_hessian(
     muscle_jacobian: Callable[[Array], Array], theta: Array, step: float = 1e-5
 ) -> Array:
-    """Return ∂²l/∂θ² [m/rad²], shape (M, D, D), by central differences of G.
+    """Return ∂²l/∂θ² [m/rad²] (M, D, D) at θ (D,), by central differences over ±step [rad] of G.
 
-    Args:
-        muscle_jacobian: Maps θ (N, D) to G [m/rad] (N, M, D).
-        theta: θ [rad], shape (D,).
-        step: Δθ [rad].
+    The callable maps θ (N, D) to G [m/rad] (N, M, D).
     """
     offsets = step * np.eye(len(theta))
     difference = muscle_jacobian(theta + offsets) - muscle_jacobian(theta - offsets)
     raw = difference.transpose(1, 2, 0) / (2.0 * step)
-    hessian: Array = 0.5 * (raw + raw.transpose(0, 2, 1))
-    return hessian
+    return 0.5 * (raw + raw.transpose(0, 2, 1))
 
 
-def joint_stiffness(
-    muscle_jacobian: Array, hessian: Array, stiffness: Array, tension: Array
-) -> Array:
-    """Return K_θ [N·m/rad], shape (D, D), gravity's gradient not counted.
-
-    Args:
-        muscle_jacobian: G [m/rad], shape (M, D).
-        hessian: ∂²l/∂θ² [m/rad²], shape (M, D, D).
-        stiffness: k of each muscle [N/m], shape (M,); 0 for a slack one.
-        tension: T [N], shape (M,).
-    """
-    elastic = muscle_jacobian.T @ (stiffness[:, None] * muscle_jacobian)
-    joint: Array = elastic + np.einsum('m,mij->ij', tension, hessian)
-    return joint
+def joint_stiffness(jacobian: Array, hessian: Array, stiffness: Array, tension: Array) -> Array:
+    """Return K_θ [N·m/rad] (D, D) of G (M, D), ∂²l/∂θ² (M, D, D), k [N/m] (M,) and T [N] (M,)."""
+    elastic = jacobian.T @ (stiffness[:, None] * jacobian)
+    return elastic + np.einsum('m,mij->ij', tension, hessian)

@@ -17,6 +17,7 @@ import quadprog
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.robot.robot import Robot
 
 # [N] left between the limits of a muscle that is held at one value (hot, ruptured): without any,
 # quadprog takes its own rounding for infeasibility.
@@ -25,15 +26,10 @@ SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of s
 
 
 class Exertion(NamedTuple):
-    """Tensions and what they leave undone.
+    """Tensions and what they leave undone."""
 
-    Attributes:
-        tension: T [N], shape (M,).
-        missing_torque: τ + Gᵀ T, the part of τ that T does not produce [N·m], shape (D,).
-    """
-
-    tension: Array
-    missing_torque: Array
+    tension: Array  # T [N], (M,)
+    missing_torque: Array  # τ + Gᵀ T, the part of τ that T does not produce [N·m], (D,)
 
 
 class TensionProgramme:
@@ -46,14 +42,7 @@ class TensionProgramme:
     def __init__(
         self, muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
     ) -> None:
-        """State the constraints.
-
-        Args:
-            muscle_jacobian: G [m/rad], shape (M, D).
-            torque: τ [N·m], shape (D,).
-            low: Least tension [N], scalar or shape (M,).
-            high: Highest tension [N], scalar or shape (M,).
-        """
+        """State G [m/rad] (M, D), τ [N·m] (D,) and the limits [N], scalar or (M,)."""
         self._jacobian, self._torque, self._count = muscle_jacobian, torque, len(muscle_jacobian)
         eye, low = np.eye(self._count), np.broadcast_to(low, self._count)
         self._constraints = np.hstack([-muscle_jacobian, eye, -eye])
@@ -67,14 +56,12 @@ class TensionProgramme:
         first = len(self._torque) - equalities
         constraints, bounds = self._constraints[:, first:], self._bounds[first:]
         try:
-            solution = quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)
+            return quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)[0]
         except ValueError as error:
             torque = np.round(self._torque, 2)
             raise InfeasibleError(
                 f'no tension within its limits produces the torque {torque} N·m'
             ) from error
-        tension: Array = solution[0]
-        return tension
 
     def nearest(self, desired: Array | float) -> Array:
         """Return the hard form: of all tensions the nearest to desired ones [N]."""
@@ -89,14 +76,15 @@ class TensionProgramme:
 
 
 def holding_tension(
-    muscle_jacobian: Array,
-    torque: Array,
-    low: Array | float,
-    high: Array | float,
-    desired: Array | float,
+    robot: Robot, theta: Array, desired: Array | float = 0.0, jacobian: Array | None = None
 ) -> Array:
-    """Return the hard form; arguments and errors as for `TensionProgramme`."""
-    return TensionProgramme(muscle_jacobian, torque, low, high).nearest(desired)
+    """Return the T nearest to a desired one [N] that holds θ (D,) within [T_bias, T_limit], (M,).
+
+    G is the nominal one unless another is given. Errors as for `TensionProgramme`.
+    """
+    jacobian = robot.routes.muscle_jacobian(theta) if jacobian is None else jacobian
+    torque, limits = robot.kinematics.holding_torque(theta), robot.tension
+    return TensionProgramme(jacobian, torque, limits.bias, limits.limit).nearest(desired)
 
 
 def least_tension(
@@ -105,10 +93,7 @@ def least_tension(
     """Return the least tensions that produce a torque, or else what comes nearest to it.
 
     Hard where it can be, soft where the limits do not allow it. Arguments as for
-    `TensionProgramme`.
-
-    Raises:
-        InfeasibleError: If an entry is not finite.
+    `TensionProgramme`; the error is raised only if an entry is not finite.
     """
     programme = TensionProgramme(muscle_jacobian, torque, low, high)
     try:

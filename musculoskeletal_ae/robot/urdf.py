@@ -15,12 +15,12 @@ import pinocchio as pin
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 
-INERTIA = ('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz')
+#: how many numbers an attribute holds, by element
 NUMBERS = {
     'origin': {'xyz': 3, 'rpy': 3},
     'axis': {'xyz': 3},
     'mass': {'value': 1},
-    'inertia': dict.fromkeys(INERTIA, 1),
+    'inertia': dict.fromkeys(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), 1),
     'limit': {'lower': 1, 'upper': 1, 'effort': 1, 'velocity': 1},
     'box': {'size': 3},
     'cylinder': {'radius': 1, 'length': 1},
@@ -29,11 +29,7 @@ NUMBERS = {
 
 
 def read_urdf(file: Path, text: str) -> pin.Model:
-    """Return pinocchio's model of a URDF.
-
-    Args:
-        file: Named in messages.
-        text: The URDF.
+    """Return pinocchio's model of the text of a URDF.
 
     Raises:
         RobotDescriptionError: Naming the file, the link or joint, and what is expected.
@@ -45,31 +41,28 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         raise RobotDescriptionError(f'{file}: not valid XML: {error}') from error
     for part in root:
         if part.tag in ('link', 'joint'):
-            _check_part(f'{file}: {part.tag} {part.get("name")!r}', part)
+            for element in part.iter():
+                _check(f'{file}: {part.tag} {part.get("name")!r}', element)
     try:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f'{file}: not a valid URDF: {error}') from error
 
 
-def _check_part(entry: str, part: ET.Element) -> None:
-    for element in part.iter():
-        for attribute, count in NUMBERS.get(element.tag, {}).items():
-            text = element.get(attribute)
-            if text is None:
-                continue
-            where = f'{entry}: {element.tag} {attribute}'
-            values = _finite(text)
-            if len(values) != count:
-                expected = 'a finite number' if count == 1 else f'{count} finite numbers'
-                raise RobotDescriptionError(f'{where}: expected {expected}, got {text!r}')
-            if element.tag == 'mass' and values[0] < 0.0:
-                raise RobotDescriptionError(f'{where}: expected a mass >= 0 kg, got {text!r}')
-
-
-def _finite(text: str) -> list[float]:
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        return []
-    return values if all(map(math.isfinite, values)) else []
+def _check(part: str, element: ET.Element) -> None:
+    for attribute, count in NUMBERS.get(element.tag, {}).items():
+        text = element.get(attribute)
+        if text is None:
+            continue
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        expected = 'a finite number' if count == 1 else f'{count} finite numbers'
+        wrong = len(values) != count or not all(map(math.isfinite, values))
+        if not wrong and element.tag == 'mass' and values[0] < 0.0:
+            wrong, expected = True, 'a mass >= 0 kg'
+        if wrong:
+            raise RobotDescriptionError(
+                f'{part}: {element.tag} {attribute}: expected {expected}, got {text!r}'
+            )

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
+from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser, exit_status, save_plot
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']
@@ -54,24 +54,17 @@ def fit(args: Namespace) -> None:
         raise _refusal(args.table, str(error)) from error
     residual = 1e3 * (table[:, 2] - constants.elongation(table[:, 1], table[:, 0]))
     rms = math.sqrt(float(np.mean(residual**2)))
-    print(yaml_line(constants))
-    print(f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows')
-    if not args.no_plot:
-        file = args.plot or Path(f'fit_{args.table.stem}.png')
-        plot(table, constants, residual, file)
-        print(f'plot: {file}')
+    force, rate, stretch = (values[0] for values in vars(constants).values())
+    print(
+        f'series_elastic: {{force: {force:.2f}, rate: {rate:.3f}, wire_stretch: {stretch:.4e}}}\n'
+        f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
+    )
+    name = f'fit_{args.table.stem}.png'
+    save_plot(args, name, lambda file: plot(table, constants, residual, file))
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
-    """Fit L_e to a testbed table by least squares.
-
-    Args:
-        tension: Tensions of the table [N], shape (N,).
-        absolute_length: Muscle lengths of the table [m], shape (N,).
-        elongation: Measured elongations [m], shape (N,).
-
-    Returns:
-        Constants of one muscle (arrays of shape (1,)).
+    """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m] (N,) best.
 
     Raises:
         ValueError: If there are fewer than four rows, or they do not pin down three constants.
@@ -85,8 +78,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
 
     def model(log_constants: Array) -> SeriesElastic:
-        force, rate, stretch = np.exp(log_constants)[:, None]
-        return SeriesElastic(force, rate, stretch)
+        return SeriesElastic(*np.exp(log_constants)[:, None])
 
     def residual(log_constants: Array) -> Array:
         return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
@@ -120,31 +112,23 @@ def _refusal(file: Path, problem: str) -> RobotDescriptionError:
     return RobotDescriptionError(f'{file}: {problem}')
 
 
-def yaml_line(constants: SeriesElastic) -> str:
-    """Return the constants as the line that goes into muscles.yaml."""
-    return (
-        f'series_elastic: {{force: {constants.force[0]:.2f}, rate: {constants.rate[0]:.3f}, '
-        f'wire_stretch: {constants.wire_stretch[0]:.4e}}}'
-    )
-
-
 def write_example(file: Path, seed: int) -> None:
     """Write a synthetic table: the package's default constants and measurement noise."""
-    true = SeriesElastic(*(np.array([value]) for value in DEFAULT.values()))
+    true = SeriesElastic(*np.array(list(DEFAULT.values()))[:, None])
     rng = np.random.default_rng(seed)
+    head = (
+        '# SYNTHETIC one-muscle testbed table, not a measurement: the default constants '
+        f'(force {DEFAULT["force"]:g} N,\n# rate {DEFAULT["rate"]:g} /m, wire_stretch '
+        f'{DEFAULT["wire_stretch"]:g} /N) with {1e3 * EXAMPLE_NOISE:g} mm of noise. Made by\n'
+        f'#   fit_series_elastic --make-example --seed {seed} {file.name}\n# Units: N, m, m.'
+    )
     with file.open('x', encoding='utf-8') as stream:
-        stream.write(
-            '# SYNTHETIC one-muscle testbed table, not a measurement: the default constants '
-            f'(force {DEFAULT["force"]:g} N,\n# rate {DEFAULT["rate"]:g} /m, wire_stretch '
-            f'{DEFAULT["wire_stretch"]:g} /N) with {1e3 * EXAMPLE_NOISE:g} mm of noise. Made by\n'
-            f'#   fit_series_elastic --make-example --seed {seed} {file.name}\n'
-            '# Units: N, m, m.\n' + ','.join(COLUMNS) + '\n'
-        )
+        print(head, ','.join(COLUMNS), sep='\n', file=stream)
         for length in EXAMPLE_LENGTHS:
             for tension in EXAMPLE_TENSIONS:
                 exact = true.elongation(np.array([length]), np.array([tension]))[0]
                 measured = exact + EXAMPLE_NOISE * rng.standard_normal()
-                stream.write(f'{tension:g},{length:g},{measured:.5f}\n')
+                print(f'{tension:g},{length:g},{measured:.5f}', file=stream)
     print(f'wrote {file}')
 
 
@@ -158,22 +142,18 @@ def plot(table: Array, constants: SeriesElastic, residual: Array, file: Path) ->
     lengths = np.unique(table[:, 1])
     for i, length in enumerate(lengths):
         rows = table[:, 1] == length
-        colour = f'C{i % 10}'
-        # A table with a length of its own in every row has no curves worth a legend.
-        label = f'{length:.3g} m' if len(lengths) <= 10 else None
+        dots = {'marker': 'o', 'linestyle': '', 'markersize': 4, 'color': f'C{i % 10}'}
         curve = 1e3 * constants.elongation(np.full_like(tension, length), tension)
-        fit.plot(tension, curve, color=colour, linewidth=1.0, label=label)
-        fit.plot(table[rows, 0], 1e3 * table[rows, 2], 'o', color=colour, markersize=4)
-        rest.plot(table[rows, 0], residual[rows], 'o', color=colour, markersize=4)
+        fit.plot(tension, curve, color=f'C{i % 10}', linewidth=1.0, label=f'{length:.3g} m')
+        fit.plot(table[rows, 0], 1e3 * table[rows, 2], **dots)
+        rest.plot(table[rows, 0], residual[rows], **dots)
     fit.set(xlabel='tension [N]', ylabel='elongation [mm]', title='fit (lines) and table (dots)')
+    # A table with a length of its own in every row has no curves worth a legend.
     if len(lengths) <= 10:
         fit.legend(title='muscle length')
     rest.axhline(0.0, color='black', linewidth=0.8)
     rest.set(xlabel='tension [N]', ylabel='table − fit [mm]', title='residual')
-    try:
-        figure.savefig(file, dpi=110)
-    except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
-        raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
+    figure.savefig(file, dpi=110)
 
 
 if __name__ == '__main__':

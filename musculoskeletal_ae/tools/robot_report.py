@@ -3,19 +3,39 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.robot.checks import (
     DESIRED_TENSION,
+    MATTERS,
     REQUIRED_SHARE,
     REQUIRED_STIFFNESS,
     RobotCheck,
+    check_robot,
 )
-from musculoskeletal_ae.robot.moment_arms import MATTERS
 from musculoskeletal_ae.robot.robot import Robot
+
+
+def check(args: Namespace) -> int:
+    """Check a robot and print the report; return the exit status."""
+    robot = Robot.load(args.robot)
+    name = robot.description.directory.name
+    result = check_robot(robot, args.postures, args.seed)
+    if not args.quiet:
+        print(summary(robot, result, args.seed))
+        print(moment_arm_table(robot, result))
+    save_plot(args, f'check_{name}.png', lambda file: plot(robot, result, file))
+    for warning in result.warnings:
+        print(f'warning: {warning.message}; {warning.remedy}')
+    for fault in result.faults:
+        print(f'fault: {fault.message}\n    remedy: {fault.remedy}')
+    count = len(result.faults)
+    print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
+    return 1 if count else 0
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
@@ -33,22 +53,21 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     ]
     if held.any():
         one_sided = (np.nan_to_num(result.one_sided) >= REQUIRED_STIFFNESS) & held
-        singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1].astype(float)
+        singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1]
         lines += [
             f'  one-sided, muscles at bias slack (not judged):  {100 * one_sided.mean():.1f} %',
             '',
             f'{"over the postures":<44}{"min":>9}{"5 %":>9}{"median":>9}{"max":>9}',
-            _spread('smallest stiffness eigenvalue [N·m/rad]', result.stiffness[held]),
-            _spread('  one-sided [N·m/rad]', result.one_sided[held]),
-            _spread('smallest singular value of G [mm]', 1e3 * singular),
-            _spread('highest holding tension [N]', result.tension[held].max(axis=1)),
         ]
+        for title, values in {
+            'smallest stiffness eigenvalue [N·m/rad]': result.stiffness[held],
+            '  one-sided [N·m/rad]': result.one_sided[held],
+            'smallest singular value of G [mm]': 1e3 * singular,
+            'highest holding tension [N]': result.tension[held].max(axis=1),
+        }.items():
+            spread = np.percentile(values, [0, 5, 50, 100])
+            lines.append(f'{title:<44}' + ''.join(f'{value:9.1f}' for value in spread))
     return '\n'.join(lines)
-
-
-def _spread(title: str, values: Array) -> str:
-    numbers = np.percentile(values, [0, 5, 50, 100])
-    return f'{title:<44}' + ''.join(f'{value:9.1f}' for value in numbers)
 
 
 def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
@@ -63,10 +82,10 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
         f'"." = below {1e3 * MATTERS:g} mm in every posture',
         ' ' * first + ''.join(name.rjust(width) for name in robot.joints),
     ]
-    for m, name in enumerate(robot.muscles):
+    for name, row in zip(robot.muscles, spread):
         cells = [
             '.' if np.abs(cell).max() < 1e3 * MATTERS else ''.join(f'{v:+5.0f}' for v in cell)
-            for cell in spread[m]
+            for cell in row
         ]
         lines.append(name.ljust(first) + ''.join(cell.rjust(width) for cell in cells))
     return '\n'.join([*lines, ''])
@@ -76,26 +95,23 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     """Draw the moment arms over the range of each joint, the stiffness and the held share."""
     from matplotlib.figure import Figure
 
-    joints = robot.joint_count
-    columns = min(3, joints + 1)
-    rows = -(-(joints + 1) // columns)
+    columns = min(3, robot.joint_count + 1)
+    rows = -(-(robot.joint_count + 1) // columns)
     figure = Figure(figsize=(5.2 * columns, 3.8 * rows), layout='constrained')
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
-    colours = [f'C{m % 10}' for m in range(robot.muscle_count)]
-    angle = np.rad2deg(result.postures)
-    for k, name in enumerate(robot.joints):
+    dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
+    arms = 1e3 * result.moment_arms.transpose(2, 1, 0)
+    for panel, name, angle, of_joint in zip(axes, robot.joints, result.postures.T, arms):
         for m, muscle in enumerate(robot.muscles):
-            arm = 1e3 * result.moment_arms[:, m, k]
-            if np.abs(arm).max() >= 1e3 * MATTERS:
-                axes[k].scatter(
-                    angle[:, k], arm, s=5, color=colours[m], label=muscle, alpha=0.6, linewidths=0
+            if np.abs(of_joint[m]).max() >= 1e3 * MATTERS:
+                panel.scatter(
+                    np.rad2deg(angle), of_joint[m], color=f'C{m % 10}', label=muscle, **dots
                 )
-        axes[k].axhline(0.0, color='black', linewidth=0.8)
-        axes[k].set(title=name, xlabel='joint angle [deg]', ylabel='moment arm −G [mm]')
-        if axes[k].collections:
-            axes[k].legend(fontsize=6, ncols=2, markerscale=2, loc='best')
-    last = axes[joints]
-    held = result.held
+        panel.axhline(0.0, color='black', linewidth=0.8)
+        panel.set(title=name, xlabel='joint angle [deg]', ylabel='moment arm −G [mm]')
+        if panel.collections:
+            panel.legend(fontsize=6, ncols=2, markerscale=2, loc='best')
+    last, held = axes[robot.joint_count], result.held
     if held.any():
         last.hist(result.stiffness[held], bins=30, label='all muscles', color='C0')
         last.hist(result.one_sided[held], bins=30, label='one-sided', histtype='step', color='C1')
@@ -106,7 +122,7 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
         ylabel='postures',
     )
     last.legend(fontsize=7)
-    for unused in axes[joints + 1 :]:
+    for unused in axes[robot.joint_count + 1 :]:
         unused.set_axis_off()
     figure.suptitle(robot.description.directory.name)
     figure.savefig(file, dpi=110)

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.report import control_report
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
@@ -55,7 +54,7 @@ class Bench:
         self.core.target(dict(zip(ROBOT.joints, zip(theta, effort))))
 
     def report(self):
-        return control_report(ROBOT, self.core, self.now)
+        return self.core.report(self.now)
 
 
 def values(commands):
@@ -307,7 +306,7 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
     limit = core.limit[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + 1e-6
-    said = control_report(robot, core, 12.0)
+    said = core.report(12.0)
     assert said.level == 'warn'
     assert robot.muscles[strongest] in said.values['tension limited by heat']
 

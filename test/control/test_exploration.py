@@ -3,21 +3,24 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.exploration import Exploration, holdable_postures
+from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
 
 ROBOT = Robot.load('arm26')
 BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
 
 
 def steps(seed, count):
-    exploration = Exploration(ROBOT, seed)
-    return [exploration.next_step() for _ in range(count)]
+    return list(islice(Exploration(ROBOT, seed), count))
 
 
 def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
@@ -43,6 +46,16 @@ def test_every_posture_can_be_held_and_lies_within_the_joint_limits():
         np.testing.assert_allclose(held, ROBOT.kinematics.holding_torque(step.theta), atol=1e-6)
 
 
+def test_holdable_postures_are_held_by_their_tensions_on_another_body_too():
+    individual = Individual(ROBOT, 1)
+    postures = ROBOT.random_postures(50, np.random.default_rng(0))
+    for theta, tension in holdable_postures(ROBOT, postures, 5, individual.muscle_jacobian):
+        exerted = -individual.muscle_jacobian(theta[None])[0].T @ tension
+        np.testing.assert_allclose(exerted, ROBOT.kinematics.holding_torque(theta), atol=1e-6)
+        assert ((tension > BIAS - 1e-6) & (tension < LIMIT + 1e-6)).all()
+        holding_tension(ROBOT, theta)  # the nominal body holds it as well
+
+
 def test_a_seed_gives_its_own_stream_again():
     one, again, other = (steps(seed, 9) for seed in (3, 3, 4))
     for a, b in zip(one, again):
@@ -54,4 +67,4 @@ def test_a_seed_gives_its_own_stream_again():
 def test_an_arm_that_holds_no_posture_is_refused_with_a_remedy(tmp_path):
     robot = Robot.load(write_robot(tmp_path, tension={'bias': 30.0, 'limit': 30.001}))
     with pytest.raises(RobotDescriptionError, match='run check_robot'):
-        Exploration(robot, 0).next_step()
+        next(iter(Exploration(robot, 0)))

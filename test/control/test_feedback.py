@@ -31,10 +31,7 @@ def jacobian(robot):
 
 
 def holding(robot, desired=0.0):
-    torque = robot.kinematics.holding_torque(0.5 * (robot.lower + robot.upper))
-    return holding_tension(
-        jacobian(robot), torque, robot.tension.bias, robot.tension.limit, desired
-    )
+    return holding_tension(robot, 0.5 * (robot.lower + robot.upper), desired)
 
 
 def step(feedback, robot, error, tension, gain=GAIN):

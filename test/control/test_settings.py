@@ -25,8 +25,3 @@ def test_no_joint_stiffness_is_as_it_comes_for_every_joint(given):
 def test_joint_stiffness_that_is_not_one_number_a_joint_is_refused(given):
     with pytest.raises(MusculoskeletalError, match='legal: 2 numbers of at least 0'):
         Settings(joint_stiffness=given).desired_stiffness(2)
-
-
-def test_only_preset_default_solves_the_balance_of_torques():
-    assert Settings(preset='default').by_balance
-    assert not Settings(preset='paper').by_balance

@@ -148,6 +148,22 @@ def test_a_damaged_header_costs_no_sample(tmp_path, arm26, sound):
             assert (directory / 'backup-1' / FILE).read_bytes() == bytes(data)
 
 
+def test_damaged_table_names_cost_no_sample(tmp_path, arm26, sound):
+    data = sound.read_bytes()
+    start = data.index(b'table')
+    for place in range(start, data.rindex(b'NOT NULL', 0, 4096), 7):
+        for flip in (1, 0x80):  # another letter, and none at all
+            damaged = bytearray(data)
+            damaged[place] ^= flip
+            directory = tmp_path / f'{place}-{flip}'
+            directory.mkdir()
+            (directory / FILE).write_bytes(bytes(damaged))
+            for _ in range(2):
+                found, _, not_used = read(directory, arm26)
+                assert len(found) == 5, place
+            assert not_used == ''
+
+
 def test_a_torn_file_costs_what_is_missing(tmp_path, arm26, sound):
     for cut in (1, 100, 5000):
         directory = tmp_path / str(cut)

@@ -36,7 +36,9 @@ def small() -> Mae:
         std=np.ones(5),
         version=7,
         training='by hand; θ',
-        anomaly=AnomalyStatistics.of(rng.normal(size=(50, 4)), True, {'norm': 0.25}),
+        anomaly=replace(
+            AnomalyStatistics.of(rng.normal(size=(50, 4)), True), thresholds={'norm': 0.25}
+        ),
     )
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot.tension import TensionProgramme, holding_tension, least_tension
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 
 LOW, HIGH = 30.0, 200.0
 
@@ -19,32 +19,33 @@ def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_neare
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     inside = rng.uniform(LOW, HIGH, 8)  # so that a solution exists
     torque = -jacobian.T @ inside
-    tension = holding_tension(jacobian, torque, LOW, HIGH, desired)
+    programme = TensionProgramme(jacobian, torque, LOW, HIGH)
+    tension = programme.nearest(desired)
     np.testing.assert_allclose(-jacobian.T @ tension, torque, atol=1e-8)
     assert (tension >= LOW - 1e-8).all()
     assert (tension <= HIGH + 1e-8).all()
     # Optimality of a convex problem: the gradient points away from every feasible point.
-    for other in [inside, *(holding_tension(jacobian, torque, LOW, HIGH, w) for w in (0.0, 150.0))]:
+    for other in [inside, programme.nearest(0.0), programme.nearest(150.0)]:
         assert (tension - desired) @ (other - tension) >= -1e-6
 
 
 def test_a_torque_out_of_reach_is_refused():
     jacobian = np.array([[0.05], [-0.05]])
     with pytest.raises(InfeasibleError, match='within its limits'):
-        holding_tension(jacobian, np.array([0.05 * 171.0]), LOW, HIGH, 60.0)
+        TensionProgramme(jacobian, np.array([0.05 * 171.0]), LOW, HIGH).nearest(60.0)
 
 
 def test_a_joint_without_muscles_and_without_load_is_held():
     jacobian = np.array([[0.05, 0.0], [-0.05, 0.0]])
-    tension = holding_tension(jacobian, np.zeros(2), LOW, HIGH, 60.0)
+    tension = TensionProgramme(jacobian, np.zeros(2), LOW, HIGH).nearest(60.0)
     np.testing.assert_allclose(tension, [60.0, 60.0])
 
 
 def test_limits_may_differ_between_muscles():
     jacobian = np.array([[0.05], [-0.05], [0.05]])
     high = np.array([200.0, 200.0, 0.0])  # the third is ruptured
-    tension = holding_tension(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high, 60.0)
-    np.testing.assert_allclose(tension, [70.0, 50.0, 0.0], atol=1e-6)
+    programme = TensionProgramme(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high)
+    np.testing.assert_allclose(programme.nearest(60.0), [70.0, 50.0, 0.0], atol=1e-6)
 
 
 def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
