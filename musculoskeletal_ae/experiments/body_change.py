@@ -89,7 +89,7 @@ def _panels(study: Study, rows: Rows, name: str, xlabel: str, title: str) -> Any
     figure, panels = plots.new_figure(*size, height, count, sharex=True)
     for panel in panels[robot.muscle_count :]:
         panel.set_axis_off()
-    for m, (muscle, panel) in enumerate(zip(robot.muscles, panels)):  # noqa: B905 - some stay empty
+    for m, (muscle, panel) in enumerate(zip(robot.muscles, panels)):  # some stay empty
         for when, label in LABELS.items():
             y, width = 1e3 * curves[when][:, m], 1.0 if when == 'true' else 1.8
             style = {'color': plots.WHEN.get(when, plots.TRUE), 'lw': width}

@@ -34,7 +34,6 @@ from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
 

@@ -5,14 +5,14 @@ Paper. The same motions before and after learning, 0.414 → 0.186 rad; the erro
 when a 3.6 kg dumbbell was grasped; when muscle #2 was deactivated, A rose after learning but hardly
 before.
 
-Here. One recording, seen by the networks before and after learning: the held-out motion, with 3.6 kg in
-the hand from its middle on; then, weight in hand, every muscle in turn is cut for 3 s and mended. A
-cut comes when the muscle carries more than 10 N above T_bias (waiting up to 14 s; a muscle that
-never does is cut all the same, shown in grey, and not counted). Messages go one by one through the
-detector of the estimator node; detection is the first alarm that begins after the cut, and a cut
-that is not noticed counts 3 s. The right muscle is named if it is the suspect in that message.
-Healthy messages: the held-out motion and another one with the weight grasped and released every
-minute, an hour over all individuals; false alarms are alarms that begin in the latter. AUROC
+Here. One recording, seen by the networks before and after learning: the held-out motion, with 3.6
+kg in the hand from its middle on; then, weight in hand, every muscle in turn is cut for 3 s and
+mended. A cut comes when the muscle carries more than 10 N above T_bias (waiting up to 14 s; a
+muscle that never does is cut all the same, shown in grey, and not counted). Messages go one by one
+through the detector of the estimator node; detection is the first alarm that begins after the cut,
+and a cut that is not noticed counts 3 s. The right muscle is named if it is the suspect in that
+message. Healthy messages: the held-out motion and another one with the weight grasped and released
+every minute, an hour over all individuals; false alarms are alarms that begin in the latter. AUROC
 compares d of those with d of cut messages from 0.1 s after the cut. "Threshold" is the detector’s,
 for d; A and d "ruptured min" are the smallest, over muscles, of the median while cut.
 """
@@ -142,8 +142,9 @@ def tracking(study: Study, rows: Rows) -> Plot:
     )
     for joint, panel in enumerate(panels):
         factor, unit = plotted(robot, joint)
-        theta = {when: factor * seen.theta[shown, joint] for when, seen in trace['watched'].items()}
-        plots.before_after(panel, time, theta, lw=0.8)
+        for when, colour in plots.WHEN.items():
+            theta = factor * trace['watched'][when].theta[shown, joint]
+            plots.line(panel, time, theta, color=colour, lw=0.8, label=f'{when} learning')
         true = factor * trace['theta'][shown, joint]
         plots.line(panel, time, true, color=plots.TRUE, lw=1.2, label='true')
         span = np.ptp(true) + 1.0

@@ -163,7 +163,8 @@ def online_learning(study: Study, rows: Rows) -> Plot:
         curves, values = zip(*(row.traces[preset] for row in rows.values()), strict=True)
         whole = len(curves[0].running) // every * every
         running = np.array([c.running[:whole].reshape(-1, every).mean(axis=1) for c in curves])
-        seconds, mean = np.arange(running.shape[1]) + 0.5, running.mean(axis=0)
+        seconds = np.arange(0.5, running.shape[1])
+        mean: Array = running.mean(axis=0)
         for each in running if len(running) > 1 else ():
             plots.line(left, seconds / 60, each, 10, color=colour, lw=0.5, alpha=0.25)
         label = f'preset {preset}'

@@ -78,7 +78,7 @@ def record(
     return Recording(*columns(rows))
 
 
-def columns(rows: Iterable[tuple[Any, ...]]) -> tuple[Array, ...]:
+def columns(rows: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
     """Return rows of equal length as one array for each column."""
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 

@@ -45,14 +45,14 @@ class Row(NamedTuple):
     def cells(self, result: Mapping[str, Any]) -> Cells:
         """Return the line for a result.json; {} where nothing was measured."""
         numbers = [self.number(result, key) for key in (self.paper, self.default, self.bound)]
-        shown = [NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers]
+        paper, default, bound = (NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers)
         number, aim, verdict = numbers[1], NOTHING, ''
         if self.aim is not None:
             aim = f'{"≥" if self.more_is_better else "≤"} {self.aim:g}' if self.aim else '0'
             if number is not None:
                 missed = self.aim - number if self.more_is_better else number - self.aim
                 verdict = 'met' if missed <= 0.0 else f'missed by {missed:.{self.digits}f}'
-        return Cells(self.quantity, self.printed, *shown, aim, verdict)
+        return Cells(self.quantity, self.printed, paper, default, bound, aim, verdict)
 
 
 def _at(result: Mapping[str, Any], key: str) -> float | None:
@@ -64,19 +64,16 @@ def _at(result: Mapping[str, Any], key: str) -> float | None:
 
 def markdown(about: Mapping[str, Any], lines: Iterable[Cells]) -> str:
     """Return the table as the README has it; `about` is that of a result.json."""
-    return '\n'.join(
-        [
-            f'{about["robot"]}, emulated individuals {", ".join(map(str, about["seeds"]))}, '
-            f'{about["minutes"]:g} minutes of exploration; {NOTHING}: not printed, or nothing to '
-            'compare. Bound: least squares on the true body (estimate), the least ‖T‖ that can '
-            'hold the target (control), the true body without friction (simulator).',
-            '',
-            '| | paper, on Musashi | preset `paper` | preset `default` | bound | aim |',
-            '|---|---|---|---|---|---|',
-            *(
-                f'| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
-                f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
-                for each in lines
-            ),
-        ]
+    individuals = ', '.join(map(str, about['seeds']))
+    text = (
+        f'{about["robot"]}, emulated individuals {individuals}, {about["minutes"]:g} minutes of '
+        f'exploration; {NOTHING}: not printed, or nothing to compare. Bound: least squares on the '
+        'true body (estimate), the least ‖T‖ that can hold the target (control), the true body '
+        'without friction (simulator).\n\n'
+        '| | paper, on Musashi | preset `paper` | preset `default` | bound | aim |\n'
+        '|---|---|---|---|---|---|'
     )
+    for each in lines:
+        text += f'\n| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
+        text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
+    return text
