@@ -80,6 +80,10 @@ class PolynomialFilter:
         self._robot = robot
         every = product(range(self.DEGREE + 1), repeat=robot.joint_count)
         self._powers = np.array([powers for powers in every if sum(powers) <= self.DEGREE])
+        # Slopes of the monomials, as monomials: k x^(k−1) in each joint's direction, (D, K, K).
+        units = np.eye(robot.joint_count, dtype=int)
+        lower = [(self._powers[:, None] - unit == self._powers).all(axis=-1) for unit in units]
+        self._slopes = np.array(lower) * self._powers.T[:, :, None]
         theta = robot.random_postures(self.MODEL_SAMPLES, np.random.default_rng(0))
         design, target = self._monomials(theta), robot.routes.relative_lengths(theta)
         fit = np.linalg.lstsq(design, target, rcond=None)[0]
@@ -109,19 +113,11 @@ class PolynomialFilter:
 
     def _measurement(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return the mapping's l + L_e [m] (M,) at one (θ, T) and H [m/rad] (M, D)."""
-        x = self._scaled(theta)
-        table = x[:, None] ** np.arange(self.DEGREE + 1)  # (D, DEGREE+1)
-        joints = np.arange(len(x))
-        factors = table[joints, self._powers]  # (K, D)
-        lower = table[joints, np.maximum(self._powers - 1, 0)]
-        slope = np.empty_like(factors)
-        for d in joints:
-            others = np.delete(factors, d, axis=1).prod(axis=1)
-            slope[:, d] = self._powers[:, d] * lower[:, d] * others
+        monomials = self._monomials(theta[None])[0]
         coefficients, elastic = self._coefficients[:-1], self._coefficients[-1]
-        predicted = factors.prod(axis=1) @ coefficients + elastic * self.TENSION_SCALE * tension
+        predicted = monomials @ coefficients + elastic * self.TENSION_SCALE * tension
         turn = 2.0 / (self._robot.upper - self._robot.lower)
-        return predicted, (coefficients.T @ slope) * turn
+        return predicted, coefficients.T @ (self._slopes @ monomials).T * turn
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for successive messages T [N] (N, M), l [m] (N, M)."""

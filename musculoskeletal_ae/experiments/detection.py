@@ -12,12 +12,7 @@ from scipy.stats import mannwhitneyu
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, AnomalyDetector
-from musculoskeletal_ae.experiments.recording import (
-    SAMPLE_TIME,
-    Recording,
-    columns,
-    rows_between,
-)
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, columns, rows_between
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.mae.units import State

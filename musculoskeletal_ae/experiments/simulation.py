@@ -31,8 +31,7 @@ def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
     recording = study.stream(seed, 'held_out')
     arm = Motion(recording.theta, recording.tension)
-    numbers: dict[str, Any] = {}
-    traces = {'arm': arm}
+    numbers, traces = dict[str, Any](), {'arm': arm}
     for preset in dict.fromkeys([study.preset, 'paper']):
         for when, mae in study.networks(seed, preset).items():
             simulated, rows = Simulation(study.robot, mae, preset), []

@@ -94,8 +94,8 @@ class Study:
 
     def keyed(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return a preset's numbers as result.json names them: those of preset paper `paper_…`."""
-        named = {'': self.preset, 'paper_': 'paper'}
-        prefixes = [prefix for prefix, name in named.items() if name == preset]
+        named = ('', self.preset), ('paper_', 'paper')
+        prefixes = [prefix for prefix, name in named if name == preset]
         return {prefix + key: value for prefix in prefixes for key, value in numbers.items()}
 
 
