@@ -41,7 +41,7 @@ class Prepared(Training):
         from dataclasses import replace
 
         mae = replace(self._mae, anomaly=statistics)
-        return Update(mae, 0.0, 0.0, np.empty(0), self.changed)
+        return Update(mae, 0.0, changed=self.changed)
 
     def close(self):
         self._job = None
