@@ -30,26 +30,18 @@ SURE = 3.0  # standard errors that a difference of means may have by chance
 
 @dataclass(frozen=True)
 class RestSettings:
-    """What counts as rest.
+    """What counts as rest."""
 
-    Attributes:
-        window: How long the arm has to be still [s].
-        joint_rate: Highest rate of a joint [rad/s].
-        length_rate: Highest rate of a muscle length [m/s].
-        least_readings: Of θ in half a window.
-    """
-
-    window: float = 0.3
-    joint_rate: float = 0.02
-    length_rate: float = 0.002
-    least_readings: int = 2
+    window: float = 0.3  # how long the arm has to be still [s]
+    joint_rate: float = 0.02  # highest rate of a joint [rad/s]
+    length_rate: float = 0.002  # highest rate of a muscle length [m/s]
+    least_readings: int = 2  # of θ in half a window
 
 
 class RestDetector:
     """Turns the stream of readings into one mean per rest."""
 
     def __init__(self, settings: RestSettings) -> None:
-        """Start with an empty window."""
         self.settings = settings
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
         self.reset()
@@ -62,11 +54,9 @@ class RestDetector:
         self._still = False
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Take one reading; return the mean of a rest that ended or is long enough.
+        """Take a message, `dt` [s] after the one before, with θ NaN where none was measured.
 
-        Args:
-            reading: One message; its θ is NaN where none was measured.
-            dt: Time since the message before [s].
+        Returns the mean of a rest that ended or is long enough.
         """
         self._time += dt
         self._window.append((self._time, reading))
@@ -133,7 +123,6 @@ class FrictionDirection:
     """
 
     def __init__(self) -> None:
-        """Know nothing yet: s = 0."""
         self._length: Array | None = None
 
     def step(self, length: Array, dt: float) -> Array:
@@ -176,17 +165,13 @@ class Waiting(NamedTuple):
 
 
 class RestCollector:
-    """Steps through the messages and gives out the rests that may be learned from.
-
-    Attributes:
-        anomaly: Whether an anomaly closes the gate.
-        rejected: Messages that no sensor measures, and rests that are not learned from, by reason.
-    """
+    """Steps through the messages and gives out the rests that may be learned from."""
 
     def __init__(self, robot: Robot, settings: RestSettings, healthy: Reservoir) -> None:
         """Watch `robot`; messages of the healthy arm go to `healthy`."""
         self._robot, self._healthy = robot, healthy
-        self.anomaly = False
+        self.anomaly = False  # closes the gate
+        # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
         self._detector = RestDetector(settings)
         self._hole = max(HOLE, settings.window)
@@ -199,13 +184,9 @@ class RestCollector:
     def step(
         self, tension: Array, length: Array, dt: float, theta: Array | None = None
     ) -> list[Sample]:
-        """Take one message of the muscle modules; return the rests that count from now on.
+        """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
 
-        Args:
-            tension: T [N], shape (M,).
-            length: l [m], shape (M,).
-            dt: Time since the message before [s].
-            theta: θ measured at the same time [rad], shape (D,); None without.
+        Returns the rests that count from now on.
         """
         dt += self._skipped
         if dt > self._hole:
@@ -268,9 +249,7 @@ class RestCollector:
 def _longest(robot: Robot) -> Array:
     """Return |l| of every muscle that no posture passes [m], shape (M,)."""
     theta = robot.random_postures(POSTURES, np.random.default_rng(0), OUTSIDE)
-    slack = np.zeros((POSTURES, robot.muscle_count))
-    length = np.abs(
-        [robot.muscle_lengths(theta, slack + pull) for pull in (0.0, robot.tension.max)]
-    )
-    longest: Array = length.max(axis=(0, 1)) + LENGTH_MARGIN
-    return longest
+    pulls = np.zeros((2, POSTURES, robot.muscle_count))
+    pulls[1] = robot.tension.max
+    length = np.abs([robot.muscle_lengths(theta, pull) for pull in pulls])
+    return np.asarray(length.max(axis=(0, 1)) + LENGTH_MARGIN)
