@@ -24,7 +24,7 @@ alone meets it as well as the true body does, which is as well as friction lets 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -177,6 +177,7 @@ FREEDOM = 4.0  # of the Student distribution
 ROUNDS = 6  # of Gauss–Newton per fit
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a Gauss–Newton step, tried until one lowers the cost
 FIRST_NOISE = 0.002  # [m], before anything is known
+LEAST_NOISE = 0.0003  # [m] of a length at rest, beyond what all the rest explains
 #: samples from before a muscle changed that are enough to start from what they said
 LEAST_ANCHOR = 8
 
@@ -191,7 +192,6 @@ class Prior:
     friction_mean: float = 0.05
     offset: float = 0.001  # zero of the length sensor [m]
     smooth: float = 0.002  # the smooth rest [m]
-    noise: float = 0.0003  # least deviation of a length at rest that nothing else explains [m]
 
     def spread(self, layout: Layout) -> Array:
         """Return s of every parameter of a muscle."""
@@ -226,29 +226,25 @@ class Fit(NamedTuple):
 def fit_body(
     body: CorrectedBody,
     seen: Observations,
-    prior: Prior = PRIOR,
     prior_mean: list[Array] | None = None,
+    least_noise: float = LEAST_NOISE,
 ) -> Fit:
     """Fit the parameters of a body in place, from the present ones.
 
-    Args:
-        body: Is fitted.
-        seen: The samples.
-        prior: What is known without any. A muscle with samples that say nothing about it any more
-            was changed: what they said is where its new parameters are looked for.
-        prior_mean: Parameters learned before, without the samples that they came from; they take
-            the place of the geometric model.
+    A muscle with samples that say nothing about it any more was changed: what they said is where
+    its new parameters are looked for. In the place of the geometric model come the parameters
+    `prior_mean` where some were learned before, without the samples that they came from.
     """
     poses = body.poses(seen.theta)
     parts = []
     for m, layout in enumerate(body.layouts):
-        known, mean, spread = seen.known[:, m], prior.mean(layout), prior.spread(layout)
+        known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
         if prior_mean is not None:
             mean = prior_mean[m]
         if (~known).sum() >= LEAST_ANCHOR:
-            _fit_muscle(body, poses, seen, ~known, mean, spread, prior.noise, m)
+            _fit_muscle(body, poses, seen, ~known, mean, spread, least_noise, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
-        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, prior.noise, m))
+        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, least_noise, m))
     residual, noise, weight = zip(*parts, strict=True)
     return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
 
@@ -330,4 +326,4 @@ def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
     everything = np.ones(shape, dtype=bool)
     lengths = mae.lengths(theta, tension)
     seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
-    fit_body(body, seen, replace(PRIOR, noise=NETWORK_ERROR))
+    fit_body(body, seen, least_noise=NETWORK_ERROR)

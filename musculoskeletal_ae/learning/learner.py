@@ -42,30 +42,18 @@ class Learner:
     def __init__(
         self,
         robot: Robot,
-        mae: Mae | None = None,
+        mae: Mae | None = None,  # fits the robot; None: wait for one
         preset: str = 'default',
         seed: int = 0,
         *,
-        steps: int = STEPS,
-        period: float = 0.01,
+        steps: int = STEPS,  # of training per update, in preset default
+        period: float = 0.01,  # of the messages of the muscle modules [s]
         rest: RestSettings | None = None,
         novelty: Novelty | None = None,
         training: Callable[[Robot, str, int], Training] = Training,
-        directory: Path | None = None,
+        directory: Path | None = None,  # where samples and network are kept; None for nowhere
     ) -> None:
         """Go on from the saved state, if there is one that fits, else from a network.
-
-        Args:
-            robot: The geometric model.
-            mae: Fits the robot; None: wait for one.
-            preset: How to learn, 'default' or 'paper'.
-            seed: Random seed.
-            steps: Of training per update, in preset default.
-            period: Of the messages of the muscle modules [s].
-            rest: What counts as rest.
-            novelty: What counts as new.
-            training: Where updates are made.
-            directory: Where samples and network are kept; None for nowhere.
 
         Raises:
             MusculoskeletalError: If there is no such preset.

@@ -65,6 +65,7 @@ class State:
         self._robot = robot
         names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
         self._seed = zlib.crc32(names.encode())  # of checksums: another robot's records do not fit
+        self._size = HEAD.size + 8 * (1 + robot.joint_count + 4 * robot.muscle_count)
         self._connection: sqlite3.Connection | None = None
         self._next_look = 0.0
         try:
@@ -99,11 +100,7 @@ class State:
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._connection = _connect(self._file)
-        self._opened = self._identity()
-
-    def _identity(self) -> tuple[int, int]:
-        status = self._file.stat()
-        return status.st_dev, status.st_ino
+        self._opened = self._file.stat()
 
     def close(self) -> None:
         """Release the directory; all is on disk already."""
@@ -174,10 +171,6 @@ class State:
             problem = f'{self._file}: made by a learner of other joints and muscles'
         return problem, data
 
-    @property
-    def _size(self) -> int:
-        return HEAD.size + 8 * (1 + self._robot.joint_count + 4 * self._robot.muscle_count)
-
     def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
         values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
         return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
@@ -205,7 +198,7 @@ class State:
             return
         self._next_look = now + LOOK
         try:
-            if self._connection is not None and self._identity() != self._opened:
+            if self._connection and not os.path.samestat(self._file.stat(), self._opened):
                 raise FileNotFoundError(f'{self._file} was replaced')
             if self.directory.exists() and not os.access(self.directory, os.W_OK):
                 raise PermissionError(f'{self.directory} is read-only')
