@@ -22,7 +22,7 @@ settings.load_profile('no deadline')
 
 @pytest.fixture(scope='session')
 def trained_files(tmp_path_factory) -> dict[str, Path]:
-    """Return checkpoint files of briefly trained networks of arm26, by preset, trained once a run."""
+    """Return files of briefly trained networks of arm26, by preset, trained once a run."""
     # Torch is loaded for tests that want a network only.
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
