@@ -60,6 +60,12 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             'm',
             settable=True,
         ),
+        'faults': Parameter(
+            ('',),
+            'what is wrong, each KIND [QUANTITY] [MUSCLE] [SIZE], such as "bias tension 40" '
+            '([""] mends; doc/interface.md lists the kinds)',
+            settable=True,
+        ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
         'marker_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
