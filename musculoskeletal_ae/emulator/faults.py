@@ -77,7 +77,7 @@ def read_fault(line: str, robot: Robot) -> Fault:
     if name not in KINDS:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
     kind = KINDS[name]
-    quantities = QUANTITIES if kind.of_quantity else ()
+    quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
     size, most = kind.size, kind.most
     if kind.of_quantity and words and words[0] in QUANTITIES:
         quantities = (words.pop(0),)

@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.validity import read_posture
@@ -86,6 +87,6 @@ class BringupStatus(Shell):
             line += f'  ANOMALY: {self.suspect}'
         elif self.stopped:
             line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset resumes)'
-        print(line, flush=True)
+        print(printable(line), flush=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

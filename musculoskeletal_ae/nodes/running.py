@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import ast
+import faulthandler
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -17,7 +19,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.parameters import help_text
 
 # What rclpy raises for a value of the wrong type or beyond its range, given at the start.
@@ -35,8 +37,38 @@ def reason(error: Exception) -> str:
 
 
 def _refuse(error: object) -> NoReturn:
-    print(f'error: {error}', file=sys.stderr)
+    print(f'error: {printable(error)}', file=sys.stderr)
     sys.exit(1)
+
+
+class ShieldedExecutor(SingleThreadedExecutor):
+    """Goes on whatever a callback or the taking of a message lets out; the node counts it."""
+
+    def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Any) -> Any:
+        def escaped(error: Exception) -> None:
+            # The end, asked for by a callback or by a signal while it published, is none.
+            if isinstance(error, ExternalShutdownException) or not self.context.ok():
+                raise error
+            named = getattr(entity, 'topic_name', None) or getattr(entity, 'srv_name', None)
+            node.survive(named or type(entity).__name__, error)
+
+        def take(entity: Any) -> Any:
+            try:
+                work = take_from_wait_list(entity)
+            except Exception as error:  # noqa: BLE001 - else the executor never asks it again
+                return escaped(error)
+            if work is None:
+                return None
+
+            async def shielded() -> None:
+                try:
+                    await work()
+                except Exception as error:  # noqa: BLE001
+                    escaped(error)
+
+            return shielded
+
+        return super()._make_handler(entity, node, take)
 
 
 def help_of(node: str) -> str:
@@ -55,12 +87,15 @@ def run(name: str) -> None:
     if {'--help', '-h'} & set(sys.argv[1:]):
         print(help_of(name))
         return
+    # What ends the interpreter itself says where, on stderr, which bringup.sh keeps.
+    with suppress(AttributeError, ValueError, RuntimeError, OSError):
+        faulthandler.enable()
     node: Node | None = None
     try:
         module = import_module(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
-        executor = SingleThreadedExecutor()
+        executor = ShieldedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):

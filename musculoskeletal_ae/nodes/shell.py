@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import UInt8MultiArray
 
-from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError, printable
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
@@ -65,6 +66,7 @@ class Shell(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
+        self._fault = ''
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -80,6 +82,33 @@ class Shell(Node):
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
+
+    # -- what must not end the node -------------------------------------------------------------
+
+    def survive(self, source: str, error: Exception) -> None:
+        """Count what a callback let out, by topic or service, and go on."""
+        kind = type(error).__name__
+        if source == 'Timer':  # no message did it
+            self._fault = f'fault of its own: {kind}: {error}'
+        if self._reception.reject(source, kind, f'{kind}: {printable(error)}'):
+            self.get_logger().error(printable(traceback.format_exc()))
+
+    def create_service(  # type: ignore[override]
+        self, srv_type: Any, srv_name: str, callback: Any, **options: Any
+    ) -> Any:
+        """Offer a service that answers, whatever its callback lets out."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response = callback(request, response)
+            except Exception as error:  # noqa: BLE001
+                self.survive(srv_name, error)
+                refuse_request(request, response, printable(error))
+            if hasattr(response, 'message'):
+                response.message = printable(response.message)
+            return response
+
+        return super().create_service(srv_type, srv_name, answer, **options)
 
     # -- parameters -----------------------------------------------------------------------------
 
@@ -166,7 +195,13 @@ class Shell(Node):
     # -- diagnostics ----------------------------------------------------------------------------
 
     def _report(self) -> None:
-        report = self.report()
+        try:
+            report = self.report()
+        except Exception as error:  # noqa: BLE001 - who reports nothing seems well
+            self.survive('Timer', error)
+            report = Report('error', self._fault, {})
+        if self._fault:
+            report, self._fault = Report('error', self._fault, report.values), ''
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
         values = {
@@ -183,13 +218,24 @@ class Shell(Node):
         status = DiagnosticStatus(
             level=LEVELS[report.level],
             name=f'{self.get_fully_qualified_name()}: state',
-            message=report.message,
+            message=printable(report.message),
             hardware_id=self.robot.description.directory.name,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def refuse_request(request: Any, response: Any, reason: str) -> None:
+    """Let the response to a request that could not be worked on say so, where it can."""
+    refused = SetParametersResult(successful=False, reason=reason)
+    if hasattr(response, 'results'):  # of parameters, those done before
+        response.results += [refused] * (len(request.parameters) - len(response.results))
+    elif isinstance(getattr(response, 'result', None), SetParametersResult):
+        response.result = refused
+    elif hasattr(response, 'success'):
+        response.success, response.message = False, reason
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

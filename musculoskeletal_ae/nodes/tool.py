@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import signal
 import sys
 from argparse import Namespace
@@ -58,6 +59,7 @@ def run_tool(
         argv: Arguments; None for those of the process.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
+    faulthandler.enable()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])
