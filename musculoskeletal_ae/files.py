@@ -22,6 +22,7 @@ Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # [bytes] of a text
 LARGEST_YAML = 1 << 20  # [bytes]; it is slow to read
+LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty
 MOST_ENTRIES = 100_000  # in a YAML file, what aliases stand for included
 DEEPEST = 50  # levels of a YAML file
 LONGEST = 1000  # characters of a number in YAML: those to base 60 take the square of it
@@ -105,7 +106,7 @@ def read_csv(
         Exception: What `refuse` makes, if it cannot be read or has another head.
     """
     rows = []
-    for number, line in enumerate(read_text(file, refuse).splitlines(), 1):
+    for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):
         if line.strip() and not line.startswith('#'):
             try:
                 cells = next(csv.reader([line]))

@@ -26,7 +26,7 @@ HEAD = struct.Struct('<II')  # kind, checksum
 
 def files(directory: Path) -> list[Path]:
     """Return the files of an old state."""
-    return [file for name in (LOG, NETWORK, LOCK) if (file := directory / name).exists()]
+    return [file for name in (LOG, NETWORK, LOCK) if (file := directory / name).is_file()]
 
 
 def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, bytes | None]:
@@ -38,7 +38,7 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
     problem, log, network = '', directory / LOG, directory / NETWORK
     names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles}).encode()
     header = MAGIC + struct.pack('<II', len(names), zlib.crc32(names)) + names
-    data = log.read_bytes() if log.exists() else b''
+    data = log.read_bytes() if log.is_file() else b''
     size = HEAD.size + 8 * (robot.joint_count + 4 * robot.muscle_count)
     records = [data[at : at + size] for at in range(len(header), len(data) - size + 1, size)]
     whole = [record for record in records if zlib.crc32(record[:4] + record[8:]) == _sum(record)]
@@ -49,7 +49,7 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
     else:
         for record in whole:
             _replay(record, robot, samples)
-    return problem, network.read_bytes() if network.exists() else None
+    return problem, network.read_bytes() if network.is_file() else None
 
 
 def _sum(record: bytes) -> int:

@@ -106,6 +106,8 @@ class State:
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
+        if self._file.exists() and not self._file.is_file():
+            raise OSError(f'{self._file} is no regular file')  # one that may never end
         self._connection = _connect(self._file)
         self._opened = self._identity()
 

@@ -8,6 +8,7 @@ stdout.
 from __future__ import annotations
 
 import math
+import sys
 import time
 from typing import Any
 
@@ -31,6 +32,8 @@ class BringupStatus(Shell):
         """Listen; options are those of Node."""
         super().__init__('bringup_status', **options)
         self.duration: float = self.parameter('duration')
+        self.patience: float = self.parameter('patience')
+        self.begun = time.monotonic()
         self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
@@ -75,6 +78,8 @@ class BringupStatus(Shell):
         now = time.monotonic()
         if self.started is None:
             if not self.anomalies:
+                if 0.0 < self.patience < now - self.begun:
+                    sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
                 return
             self.started = now
         error, anomaly = (

@@ -58,6 +58,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             (0.0,),
             'error of the length sensors, one for all or one each',
             'm',
+            (-1.0, 1.0),
             settable=True,
         ),
         'faults': Parameter(
@@ -121,6 +122,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **SHARED,
         'duration': Parameter(
             0.0, 'time from the first estimate to the end (0: no end)', 's', (0.0, 1e9)
+        ),
+        'patience': Parameter(
+            0.0, 'longest wait for the first estimate (0: no end)', 's', (0.0, 1e9)
         ),
     },
 }

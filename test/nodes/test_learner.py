@@ -328,7 +328,7 @@ def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained_f
     assert not alive(worker)
 
 
-def test_a_deleted_directory_is_an_error_at_once_and_nothing_is_lost(host, state, graph, arm26):
+def test_a_deleted_directory_is_an_error_at_once_and_nothing_is_lost(host, state, graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     learner = host(state_directory=state)
     learner.learn(lambda: learner.samples >= 2, 'samples')

@@ -151,6 +151,17 @@ def test_no_escape_from_a_message_reaches_the_terminal(graph, capsys):
     assert process.process.returncode == 1 and '\x1b' not in output
 
 
+def test_the_status_line_waits_for_a_slow_start_and_not_for_ever(graph):
+    status = graph.host(BringupStatus, robot='arm26', duration=1e6, patience=0.01)
+    status.anomalies.append(0.0)
+    status._print()  # it has come up, however late
+    status.begun -= 1e3
+    status._print()
+    status.started = None
+    with pytest.raises(SystemExit, match='did not come up'):
+        status._print()
+
+
 def test_what_ends_the_interpreter_says_where(graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     process = graph.start('hardware_emulator', robot='arm26')
