@@ -67,6 +67,18 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
     raise refuse(file, f'is larger than {largest} bytes')
 
 
+def read_start(file: Path, largest: int) -> bytes:
+    """Return the first bytes of a regular file; none where there is no such file.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    if not file.is_file():
+        return b''
+    with file.open('rb') as stream:
+        return stream.read(largest)
+
+
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file.
 
