@@ -148,7 +148,7 @@ def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
 
 def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
     cases = [
-        (('replay', tmp_path / 'nothing'), 1, 'does not exist'),
+        (('replay', tmp_path / 'nothing'), 1, 'No such file'),
         (('record', bag), 1, 'is not empty; name a new directory'),
         (('record', '--recover', bag), 1, 'there is nothing to recover'),
         (('replay', bag, '--rate', '2'), 2, '--rate other than 1 needs --clock'),
