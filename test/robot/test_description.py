@@ -220,7 +220,9 @@ def in_arm26(old, new):
 
 def with_inertia(*moments):
     values = ' '.join(f'{k}="{v}"' for k, v in zip(('ixx', 'ixy', 'iyy', 'izz'), moments))
-    return lambda text: re.sub(r'<inertia [^>]*>', f'<inertia {values} ixz="0" iyz="0"/>', text, count=1)
+    return lambda text: re.sub(
+        r'<inertia [^>]*>', f'<inertia {values} ixz="0" iyz="0"/>', text, count=1
+    )
 
 
 STRANGE = {
