@@ -46,7 +46,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.qos import LATCHED
-from musculoskeletal_ae.nodes.tool import message_class
+from musculoskeletal_ae.nodes.running import message_class
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')

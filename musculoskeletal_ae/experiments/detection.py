@@ -136,7 +136,7 @@ def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     anomaly, distance = np.empty(count), np.empty(count)
     suspect, alarm = np.empty(count, dtype=int), np.empty(count, dtype=bool)
     for n in range(count):
-        detector.commanded_length(recording.command[n])
+        detector.commanded(length=recording.command[n])
         restored = State(*(part[n] for part in estimated))
         verdict = detector.step(restored, recording.tension[n], recording.length[n], SAMPLE_TIME)
         anomaly[n], distance[n], suspect[n] = verdict.anomaly, verdict.distance, verdict.suspect

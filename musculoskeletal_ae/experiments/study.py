@@ -17,7 +17,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.plots import Plot
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.learning.learner import STEPS
+from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, residuals
 
@@ -65,13 +66,13 @@ class Reservoir:
         self,
         muscles: int,
         seed: int = 0,
-        novelty: Novelty | None = None,
+        settings: Settings = DEFAULT,
         capacity: int = CAPACITY,
     ) -> None:
-        """Start empty; rests differ by `novelty`."""
+        """Start empty; rests differ as samples do."""
         self._rng = np.random.default_rng([seed, 0x4E])
         self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
-        self._rests = SampleStore(novelty)
+        self._rests = SampleStore(settings)
         self._seen, self._since, self.time = 0, 0.0, 0.0
 
     def step(self, tension: Array, length: Array, dt: float) -> None:

@@ -22,8 +22,9 @@ from pathlib import Path
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
-from musculoskeletal_ae.learning.rest import RestCollector, RestSettings
-from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.learning.rest import RestCollector
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
 from musculoskeletal_ae.learning.state import State
 from musculoskeletal_ae.learning.training import Job, Training, Update
 from musculoskeletal_ae.mae import checkpoint
@@ -32,7 +33,6 @@ from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.report import Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 
-STEPS = 100  # of training in one update of preset default
 #: between the beginnings of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
 
@@ -60,8 +60,7 @@ class Learner:
         *,
         steps: int = STEPS,
         period: float = 0.01,
-        rest: RestSettings | None = None,
-        novelty: Novelty | None = None,
+        settings: Settings = DEFAULT,
         training: Callable[[Robot, str, int], Training] = Training,
         directory: Path | None = None,
     ) -> None:
@@ -74,8 +73,7 @@ class Learner:
             seed: Random seed.
             steps: Of training per update, in preset default.
             period: Of the messages of the muscle modules [s].
-            rest: What counts as rest.
-            novelty: What counts as new.
+            settings: What counts as rest, and as new.
             training: Makes what makes the updates.
             directory: Where samples and network are kept; None for nowhere.
 
@@ -85,15 +83,15 @@ class Learner:
         """
         self.robot = robot
         self.training = training(robot, preset, seed)
-        self.samples = SampleStore(novelty)
+        self.samples = SampleStore(settings)
         self._mae: Mae | None = None
         self.checkpoint: bytes | None = None
         self.enabled = True
         self.last_update: Update | None = None
         self.updates = self.published = 0
         self._pairing = Pairing(period)
-        self._healthy = Reservoir(robot.muscle_count, seed, novelty)
-        self._rests = RestCollector(robot, rest or RestSettings(), self._healthy)
+        self._healthy = Reservoir(robot.muscle_count, seed, settings)
+        self._rests = RestCollector(robot, settings, self._healthy)
         self._steps = steps
         self._news = True  # to learn from, since the last update began
         self._begun = self._given = -math.inf  # the last update, the last checkpoint [s]

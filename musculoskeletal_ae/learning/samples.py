@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 
 CAPACITY = 400
 
@@ -58,19 +59,6 @@ class Observations:
         return len(self.theta)
 
 
-@dataclass(frozen=True)
-class Novelty:
-    """By how much a sample has to differ from every stored one.
-
-    Attributes:
-        joint: In one joint [rad].
-        tension: In one muscle [N].
-    """
-
-    joint: float = 0.05
-    tension: float = 10.0
-
-
 class SampleStore:
     """Samples in the order in which they came, at most `capacity`.
 
@@ -81,9 +69,9 @@ class SampleStore:
         accepted: How many were ever accepted.
     """
 
-    def __init__(self, novelty: Novelty | None = None, capacity: int = CAPACITY) -> None:
+    def __init__(self, settings: Settings = DEFAULT, capacity: int = CAPACITY) -> None:
         """Start empty."""
-        self.novelty = novelty or Novelty()
+        self._settings = settings
         self.capacity = capacity
         self.accepted = 0
         self.clear()
@@ -124,9 +112,8 @@ class SampleStore:
         return Observations(theta, tension, length, direction, np.array(self.known))
 
     def _scaled(self, sample: Sample) -> Array:
-        return np.concatenate(
-            [sample.theta / self.novelty.joint, sample.tension / self.novelty.tension]
-        )
+        theta = sample.theta / self._settings.new_joint_distance
+        return np.concatenate([theta, sample.tension / self._settings.new_tension_distance])
 
     def _distances(self, sample: Sample) -> Array:
         stored = np.array([self._scaled(s) for s in self.samples])

@@ -313,7 +313,7 @@ class Trainer:
 
 def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
     """Return the three norms, each in units of the spread of the data, all three masks entered."""
-    error = network.decode_standard(network.encode(seen.repeat(3, 1), mask))
+    error = network.decoder(network.encode(seen.repeat(3, 1), mask))
     error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
     return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

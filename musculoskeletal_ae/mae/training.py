@@ -112,7 +112,7 @@ def loss(
     The last `twins` rows are neighbours of the first `twins`, all of them entered by ①.
     """
     joints, muscles = network.joints, network.muscles
-    error = network.decode_standard(network.encode(values, mask))
+    error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std  # (N, D+2M)
     result = error.new_zeros(())
     if twins:
@@ -199,9 +199,7 @@ def initial_mae(
     Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
     """
     chosen = preset_named(preset)
-    settings = chosen.training
-    if steps is not None:
-        settings = replace(settings, steps=steps)
+    settings = chosen.training if steps is None else replace(chosen.training, steps=steps)
     rng = np.random.default_rng(seed)
     if chosen.network.standardise:
         samples = overload_states(robot, settings.samples, rng).scaled()

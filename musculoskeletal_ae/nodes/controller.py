@@ -16,17 +16,17 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.messages import array_message, serve
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
-
-RESUMED = 'going on to the last target, if any; controller/explore explores again'
+from musculoskeletal_ae.validity import read_joints
 
 
 class Controller(Shell):
@@ -40,19 +40,19 @@ class Controller(Shell):
             self.follow_parameter(name, partial(self._configure, name))
         self.logged: list[str] = []
         self.publishers_of = {
-            LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
-            TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
+            kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
+            for kind in (LENGTH, TENSION)
         }
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
-        self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
-        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
+        self.follow_muscle_states(self._muscles)
+        self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
-        self.create_service(SetBool, 'controller/explore', self._explore)
-        self.create_service(Trigger, 'controller/stop', self._stop)
-        self.create_service(Trigger, 'controller/reset', self._reset)
+        serve(self, SetBool, 'controller/explore', self._explore)
+        serve(self, Trigger, 'controller/stop', self._stop)
+        serve(self, Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.parameter('explore'):
@@ -61,43 +61,37 @@ class Controller(Shell):
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
 
-    def _muscles(self, message: Float64MultiArray) -> None:
-        rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
-        self.core.muscles(Muscles(*rows), time.monotonic())
+    def _muscles(self, states: Array) -> None:
+        self.core.muscles(Muscles(*states), time.monotonic())
 
-    def _estimated(self, message: JointState) -> None:
-        self.core.estimated(read_posture(message, self.robot.joints), time.monotonic())
+    def _estimated(self, theta: Array) -> None:
+        self.core.estimated(theta, time.monotonic())
         # The estimate is made from the newest muscle states: now everything is fresh.
         self._step()
 
     def _target(self, message: JointState) -> None:
         self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
-        if self.core.safety.cause:
-            self.get_logger().warning(
-                f'stopped ({self.core.safety.cause}): the target waits for controller/reset'
-            )
-        if self.core.clamped:
-            clamped = ', '.join(self.core.clamped)
-            self.get_logger().warning(f'target clamped to the joint limits: {clamped}')
+        warn = self.get_logger().warning
+        if cause := self.core.safety.cause:
+            warn(f'stopped ({cause}): the target waits for controller/reset')
+        if clamped := ', '.join(self.core.clamped):
+            warn(f'target clamped to the joint limits: {clamped}')
 
-    def _explore(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        reason = self.core.explore(request.data)
-        response.success = not reason
+    def _explore(self, request: SetBool.Request) -> str:
+        if reason := self.core.explore(request.data):
+            raise MusculoskeletalError(reason)
         stopped = self.core.safety.cause
         holding = f'stopped: {stopped}' if stopped else 'holding'
-        response.message = reason or ('exploring' if request.data else holding)
-        return response
+        return 'exploring' if request.data else holding
 
-    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _stop(self, _: Trigger.Request) -> str:
         self.core.stop('controller/stop was called')
-        response.success, response.message = True, 'stopped; controller/reset ends it'
-        return response
+        return 'stopped; controller/reset ends it'
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        reason = self.core.reset(time.monotonic())
-        response.success = not reason
-        response.message = f'refused: {reason}' if reason else RESUMED
-        return response
+    def _reset(self, _: Trigger.Request) -> str:
+        if reason := self.core.reset(time.monotonic()):
+            raise MusculoskeletalError(f'refused: {reason}')
+        return 'going on to the last target, if any; controller/explore explores again'
 
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:

@@ -9,25 +9,22 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.arm import Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array, read_joints, read_wrench
+from musculoskeletal_ae.validity import read_joints
 
 TEMPERATURE = 25.0  # [°C]
-# After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
 
 
 class Sim(Arm):
@@ -37,14 +34,14 @@ class Sim(Arm):
         """Declare topics; options are those of Node."""
         super().__init__('sim', **options)
         as_robot = self.parameter('as_robot')
-        self.advertise('' if as_robot else 'sim/', joints=True, description=as_robot)
+        self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._follow, RELIABLE)
-        self.listen(WrenchStamped, 'sim/external_wrench', self._push, RELIABLE)
+        self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
+        self.follow_wrench(partial(setattr, self, 'wrench'))
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -56,12 +53,6 @@ class Sim(Arm):
             self.arm = arm
         else:
             self.arm.use(mae)
-
-    def _follow(self, message: Float64MultiArray) -> None:
-        self.command = read_array(message, 1, self.robot.muscle_count)
-
-    def _push(self, message: WrenchStamped) -> None:
-        self.wrench = read_wrench(message, self.robot.root_link)
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

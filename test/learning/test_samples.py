@@ -15,9 +15,9 @@ from musculoskeletal_ae.learning.rest import (
     FrictionDirection,
     RestCollector,
     RestDetector,
-    RestSettings,
 )
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT
 
 DT = 0.01
 
@@ -37,19 +37,19 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
-    found = run(RestDetector(RestSettings()), 3.5, lambda _: 0.3, lambda _: 0.01)
+    found = run(RestDetector(DEFAULT), 3.5, lambda _: 0.3, lambda _: 0.01)
     assert len(found) == 3
     np.testing.assert_allclose(found[0].theta, 0.3)
     np.testing.assert_allclose(found[0].length, 0.01)
 
 
 def test_a_moving_joint_or_wire_is_no_rest():
-    assert run(RestDetector(RestSettings()), 3.0, theta=lambda t: 0.05 * t) == []
-    assert run(RestDetector(RestSettings()), 3.0, length=lambda t: 0.01 * t) == []
+    assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.05 * t) == []
+    assert run(RestDetector(DEFAULT), 3.0, length=lambda t: 0.01 * t) == []
 
 
 def test_rest_that_ends_early_still_counts():
-    found = run(RestDetector(RestSettings()), 2.0, theta=lambda t: max(0.0, t - 0.6))
+    found = run(RestDetector(DEFAULT), 2.0, theta=lambda t: max(0.0, t - 0.6))
     assert len(found) == 1
     np.testing.assert_allclose(found[0].theta, 0.0, atol=0.01)
 
@@ -57,7 +57,7 @@ def test_rest_that_ends_early_still_counts():
 def test_sparse_noisy_angles_of_a_camera_are_averaged():
     rng = np.random.default_rng(0)
     found = run(
-        RestDetector(RestSettings()),
+        RestDetector(DEFAULT),
         10.0,
         theta=lambda _: 0.5 + 0.02 * rng.standard_normal(),
         measured=lambda n: n % 3 == 0,
@@ -68,7 +68,7 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
 
 
 def test_no_rest_without_joint_angles():
-    assert run(RestDetector(RestSettings()), 3.0, measured=lambda _: False) == []
+    assert run(RestDetector(DEFAULT), 3.0, measured=lambda _: False) == []
 
 
 def test_friction_acts_against_the_last_sliding_and_ignores_noise():
@@ -122,7 +122,7 @@ def healthy():
 
 @pytest.fixture
 def collector(arm26, healthy):
-    return RestCollector(arm26, RestSettings(), healthy)
+    return RestCollector(arm26, DEFAULT, healthy)
 
 
 def rests_at(collector, arm26, theta, seconds, tension=60.0):
@@ -166,7 +166,7 @@ def test_what_no_arm_can_measure_is_refused_with_a_reason(collector, arm26):
 def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch, collector):
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST_WAITING', 20)
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
-    collector = RestCollector(arm26, RestSettings(), Reservoir(6))
+    collector = RestCollector(arm26, DEFAULT, Reservoir(6))
     theta = 0.5 * (arm26.lower + arm26.upper)
     rests_at(collector, arm26, theta, 0.5)
     pull = np.full(6, 60.0)
