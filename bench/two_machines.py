@@ -5,9 +5,9 @@ python -m bench two_machines [--minutes 3] [--loss 0.05] [--delay 0.05] [--cut 1
 
 Needs Linux, root and the `ip` command (network namespaces, veth). Two runs of the shipped arm, each
 with a new learner: one on a perfect link, one where this process passes on every Ethernet frame
-late, drops a share of them, and lets nothing through for a while in the middle (as `tc netem`
-would, without its kernel module). Exit status 1 if the second run learned worse (error of the last half
-minute), lost a sample that it had, or if the arm's side does not end with the learner's network.
+late, drops a share of them, and lets nothing through for a while in the middle (what `tc netem`
+does, without its kernel module). Exit status 1 if the second run learned worse (error of the last
+half minute), lost a sample, or if the arm's side does not end with the learner's network.
 """
 
 from __future__ import annotations

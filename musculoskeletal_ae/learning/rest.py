@@ -46,11 +46,9 @@ class RestDetector:
         self._still = False
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Take one reading; return the mean of a rest that ended or is long enough.
+        """Take a message, `dt` [s] after the one before, with θ NaN where none was measured.
 
-        Args:
-            reading: One message; its θ is NaN where none was measured.
-            dt: Time since the message before [s].
+        Returns the mean of a rest that ended or is long enough.
         """
         self._time += dt
         self._window.append((self._time, reading))
@@ -117,7 +115,6 @@ class FrictionDirection:
     """
 
     def __init__(self) -> None:
-        """Know nothing yet: s = 0."""
         self._length: Array | None = None
 
     def step(self, length: Array, dt: float) -> Array:
@@ -160,17 +157,13 @@ class Waiting(NamedTuple):
 
 
 class RestCollector:
-    """Steps through the messages and gives out the rests that may be learned from.
-
-    Attributes:
-        anomaly: Whether an anomaly closes the gate.
-        rejected: Messages that no sensor measures, and rests that are not learned from, by reason.
-    """
+    """Steps through the messages and gives out the rests that may be learned from."""
 
     def __init__(self, robot: Robot, settings: Settings, healthy: Reservoir) -> None:
         """Watch `robot`; messages of the healthy arm go to `healthy`."""
         self._robot, self._healthy = robot, healthy
-        self.anomaly = False
+        self.anomaly = False  # closes the gate
+        # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
         self._detector = RestDetector(settings)
         self._hole = max(HOLE, settings.rest_time)
@@ -183,13 +176,9 @@ class RestCollector:
     def step(
         self, tension: Array, length: Array, dt: float, theta: Array | None = None
     ) -> list[Sample]:
-        """Take one message of the muscle modules; return the rests that count from now on.
+        """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
 
-        Args:
-            tension: T [N], shape (M,).
-            length: l [m], shape (M,).
-            dt: Time since the message before [s].
-            theta: θ measured at the same time [rad], shape (D,); None without.
+        Returns the rests that count from now on.
         """
         dt += self._skipped
         if dt > self._hole:
@@ -252,9 +241,7 @@ class RestCollector:
 def _longest(robot: Robot) -> Array:
     """Return |l| of every muscle that no posture passes [m], shape (M,)."""
     theta = robot.random_postures(POSTURES, np.random.default_rng(0), OUTSIDE)
-    slack = np.zeros((POSTURES, robot.muscle_count))
-    length = np.abs(
-        [robot.muscle_lengths(theta, slack + pull) for pull in (0.0, robot.tension.max)]
-    )
-    longest: Array = length.max(axis=(0, 1)) + LENGTH_MARGIN
-    return longest
+    pulls = np.zeros((2, POSTURES, robot.muscle_count))
+    pulls[1] = robot.tension.max
+    length = np.abs([robot.muscle_lengths(theta, pull) for pull in pulls])
+    return np.asarray(length.max(axis=(0, 1)) + LENGTH_MARGIN)

@@ -72,10 +72,15 @@ def random_states(
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
     """Return random states mostly within tension.limit, some beyond it, up to tension.max."""
+    highest = highest_tensions(robot, count, rng)
+    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+
+
+def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Return tension.limit (count, 1) [N], or in some rows more, up to tension.max."""
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
-    highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
-    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+    return np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:

@@ -125,6 +125,12 @@ def collector(arm26, healthy):
     return RestCollector(arm26, DEFAULT, healthy)
 
 
+def middle(robot):
+    """Return θ, T, l in the middle of the joint limits."""
+    theta, tension = 0.5 * (robot.lower + robot.upper), np.full(6, 60.0)
+    return theta, tension, robot.muscle_lengths(theta, tension)
+
+
 def rests_at(collector, arm26, theta, seconds, tension=60.0):
     pull = np.full(6, tension)
     length = arm26.muscle_lengths(theta, pull)
@@ -135,14 +141,14 @@ def rests_at(collector, arm26, theta, seconds, tension=60.0):
 
 
 def test_a_rest_counts_after_the_margin(collector, arm26):
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    theta, _, _ = middle(arm26)
     assert rests_at(collector, arm26, theta, MARGIN) == []
     (rest, *_) = rests_at(collector, arm26, theta, 1.5)
     np.testing.assert_allclose(rest.theta, theta)
 
 
 def test_what_comes_shortly_before_an_anomaly_is_not_learned(collector, arm26, healthy):
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    theta, _, _ = middle(arm26)
     rests_at(collector, arm26, theta, 2.0)
     collector.set_anomaly(True)
     assert rests_at(collector, arm26, theta, 10.0) == []
@@ -167,20 +173,17 @@ def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch, 
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST_WAITING', 20)
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
     collector = RestCollector(arm26, DEFAULT, Reservoir(6))
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    theta, pull, length = middle(arm26)
     rests_at(collector, arm26, theta, 0.5)
-    pull = np.full(6, 60.0)
     for _ in range(200):
-        collector.step(pull, arm26.muscle_lengths(theta, pull), 0.0, theta)
+        collector.step(pull, length, 0.0, theta)
     assert len(collector._waiting) <= 20
     assert len(collector._detector._window) <= 50
     assert len(collector._detector._rest) <= 50
 
 
 def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26, healthy):
-    theta = 0.5 * (arm26.lower + arm26.upper)
-    pull = np.full(6, 60.0)
-    length = arm26.muscle_lengths(theta, pull)
+    theta, pull, length = middle(arm26)
     rests = []
     for n in range(800):
         glitch = n in (300, 500)
@@ -192,12 +195,10 @@ def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26, healthy):
 
 
 def test_a_wire_may_have_slid_either_way_in_a_hole_of_the_stream(collector, arm26):
-    theta = 0.5 * (arm26.lower + arm26.upper)
-    pull = np.full(6, 60.0)
-    length = arm26.muscle_lengths(theta, pull)
+    theta, pull, length = middle(arm26)
     for n in range(50):  # wound in, so that friction has a direction
         collector.step(pull, length + 0.01 - 0.0002 * n, DT, theta)
-    (rest, *_) = [*rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)]
+    rest, *_ = rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)
     assert (rest.direction > 0.5).all()
     collector.step(pull, length, HOLE + 1.0, theta)
     *_, rest = rests_at(collector, arm26, theta, 2.0 + MARGIN)
