@@ -408,6 +408,8 @@ class Attack:
         if not self.moving():
             return
         topics, services = list(self.topics().items()), list(self.services().items())
+        # All of them, or a few: some stop the arm at once, and then no other is tried on it.
+        topics = self.rng.sample(topics, self.rng.choice((1, 2, 4, len(topics))))
         until, rng = self.tried['messages'] + messages, self.rng
         when = sorted(rng.randrange(messages) for _ in range(kills))
         while (left := until - self.tried['messages']) > 0:
@@ -426,6 +428,9 @@ class Attack:
                 when.pop(0)
                 self.kill()
             self.spin(rng.choice((0.01, 0.05)))
+        for publisher in self.publishers.values():
+            self.node.destroy_publisher(publisher)
+        self.publishers.clear()
 
 
 LATCHING = ('mae_checkpoint', 'anomaly_detected')
