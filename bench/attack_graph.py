@@ -16,6 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
@@ -143,6 +145,8 @@ class Attack:
         self.tried: Counter[str] = Counter()
         self.findings: dict[str, list[str]] = {}
         self.samples = 0
+        self._topics: dict[str, str] = {}
+        self._services: dict[str, str] = {}
         self._looked = 0.0
         self._listen()
 
@@ -302,19 +306,19 @@ class Attack:
 
     def topics(self) -> dict[str, str]:
         """Return type by name of every topic that a node listens to."""
-        found = {}
         for name in NODES:
-            pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
-            found |= {topic: kinds[0] for topic, kinds in pairs}
-        return found
+            with suppress(NodeNameNonExistentError):  # just killed; what it listened to is known
+                pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
+                self._topics |= {topic: kinds[0] for topic, kinds in pairs}
+        return self._topics
 
     def services(self) -> dict[str, str]:
         """Return type by name of every service that a node offers."""
-        found = {}
         for name in NODES:
-            pairs = self.node.get_service_names_and_types_by_node(name, self.namespace)
-            found |= {service: kinds[0] for service, kinds in pairs if kinds[0] in SERVICES}
-        return found
+            with suppress(NodeNameNonExistentError):
+                pairs = self.node.get_service_names_and_types_by_node(name, self.namespace)
+                self._services |= {s: kinds[0] for s, kinds in pairs if kinds[0] in SERVICES}
+        return self._services
 
     def publish(self, topic: str, kind: str) -> None:
         """Publish one hostile message."""
