@@ -34,8 +34,9 @@ from musculoskeletal_ae.robot.robot import Robot
 JITTER = 0.03  # [s] by which a loaded machine publishes a command later than it was made
 RELIEF = 0.3  # [s] for which a tension that is being relieved was measured before
 SILENT = 5.0  # [s] that a node under attack may keep /diagnostics waiting
-GROWTH = 1.2  # of a node's memory, over what it was after a minute
-YOUNG = 60.0  # [s]
+GROWTH = 1.2  # of a node's memory, over what it was after five minutes
+YOUNG = 300.0  # [s]
+MOST_MEMORY = 500.0  # [MB] of any node at any time
 
 
 class Size(NamedTuple):
@@ -137,11 +138,11 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
     silent = [f'{name}: {s:.1f} s' for name, s in attack.silences.items() if s > SILENT]
     fat = []
     for name, process in attack.processes.items():
-        old = [memory for age, memory in process.memory if age > YOUNG]
-        if old:
-            print(f'{name}: {old[0]:.0f} MB after a minute, at most {max(old):.0f} MB')
-            if max(old) > GROWTH * old[0]:
-                fat.append(f'{name} from {old[0]:.0f} to {max(old):.0f} MB')
+        most = max((memory for _, memory in process.memory), default=0.0)
+        old = [memory for age, memory in process.memory if age > YOUNG] or [most]
+        print(f'{name}: at most {most:.0f} MB, {old[0]:.0f} MB at five minutes or never so old')
+        if most > MOST_MEMORY or max(old) > GROWTH * old[0]:
+            fat.append(f'{name} from {old[0]:.0f} to {most:.0f} MB')
     sent = tried['messages'] + tried['requests']
     commands = sum(step.count for step in steps)
     return [
