@@ -32,7 +32,7 @@ from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 200
+POSTURES = 64
 SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept
 LEAST = 20  # messages that say something
 PROOF = 10.0  # [s]
@@ -78,8 +78,8 @@ class Gate:
         while now - self._messages[0][0] > SPAN:
             self._messages.popleft()
 
-    def take(self, mae: Mae, now: float) -> None:
-        """Let a network take over.
+    def check(self, mae: Mae) -> None:
+        """Try a network.
 
         Raises:
             GateError: If it does not explain the arm; the one in use stays.
@@ -87,6 +87,9 @@ class Gate:
         with np.errstate(all='ignore'):
             if faults := [*self._faults(mae)]:
                 raise GateError('; '.join(faults))
+
+    def take(self, mae: Mae, now: float) -> None:
+        """Note that a network took over."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]

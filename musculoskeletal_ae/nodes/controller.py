@@ -26,6 +26,7 @@ from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
 
+LOOK_AROUND = 0.1  # [s] between looks at who publishes
 RESUMED = 'going on to the last target, if any; controller/explore explores again'
 
 
@@ -49,12 +50,13 @@ class Controller(Shell):
         self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
-        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         self.create_service(SetBool, 'controller/explore', self._explore)
         self.create_service(Trigger, 'controller/stop', self._stop)
         self.create_service(Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
+        self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
 
@@ -62,13 +64,19 @@ class Controller(Shell):
         self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, message: Float64MultiArray) -> None:
-        rows = read_array(message, len(QUANTITIES), self.robot.muscle_count)
-        self.core.muscles(Muscles(*rows), time.monotonic())
+        now, count = time.monotonic(), self.robot.muscle_count
+        muscles = Muscles(*read_array(message, len(QUANTITIES), count))
+        self.core.muscles(muscles, now)
+        self.gate.message(muscles.tension, muscles.length, now)
 
     def _estimated(self, message: JointState) -> None:
         self.core.estimated(read_posture(message, self.robot.joints), time.monotonic())
         # The estimate is made from the newest muscle states: now everything is fresh.
         self._step()
+
+    def _anomaly(self, message: Bool) -> None:
+        self.core.anomaly(message.data)
+        self.take_anomaly(message.data)
 
     def _target(self, message: JointState) -> None:
         self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
@@ -99,14 +107,32 @@ class Controller(Shell):
         response.message = f'refused: {reason}' if reason else RESUMED
         return response
 
+    def _look_around(self) -> None:
+        """Let nobody else say how the muscles are."""
+        topic = self.resolve_topic_name('muscle_states')
+        if self.count_publishers(topic) <= 1:
+            self.core.intruder = ''
+            return
+        names = sorted(
+            f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
+            for publisher in self.get_publishers_info_by_topic(topic)
+        )
+        # One name twice: a node that was killed stays known for a while beside its successor.
+        several = len(set(names)) > 1
+        self.core.intruder = f'muscle_states come from {" and ".join(names)}' if several else ''
+
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:
-        command = self.core.step(time.monotonic())
+        command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
             self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
+
+    def clock_jumped_back(self) -> None:
+        """Count time from here; latches stay."""
+        self.core.clock_jumped_back()
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""

@@ -21,6 +21,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_pose
 
@@ -31,7 +32,7 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         """Declare topics; options are those of Node."""
         super().__init__('estimator', **options)
-        self.core = Core(self.robot)
+        self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
         self.follow_parameter(
             'anomaly_threshold', partial(setattr, self.core.detector, 'threshold')
         )
@@ -57,11 +58,15 @@ class Estimator(Shell):
         self.core.commanded_tension(command, time.monotonic())
 
     def _estimate(self, message: Float64MultiArray) -> None:
-        length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
-        clock = self.get_clock().now()
-        estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, time.monotonic())
+        length, tension, temperature = read_array(
+            message, len(QUANTITIES), self.robot.muscle_count
+        )
+        clock, now = self.get_clock().now(), time.monotonic()
+        self.plausibility.check_muscles(tension, length, temperature, now)
+        estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         if estimate is None:
             return
+        self.gate.message(tension, length, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
         restored = np.stack([state.length, state.tension])
@@ -70,6 +75,7 @@ class Estimator(Shell):
         if estimate.detected:
             self.get_logger().warning(f'anomaly detected: {self.core.cause}')
             self.detected.publish(Bool(data=True))
+            self.take_anomaly(True)
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.robot.root_link))
@@ -80,6 +86,7 @@ class Estimator(Shell):
         response.success = True
         response.message = f'cleared: {cause}' if cause else 'nothing was detected'
         self.core.reset()
+        self.take_anomaly(False)
         self.detected.publish(Bool(data=False))
         return response
 

@@ -9,21 +9,22 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Bool, Float64MultiArray
 
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Arm
-from musculoskeletal_ae.nodes.qos import RELIABLE
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array, read_joints, read_wrench
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_wrench
 
 TEMPERATURE = 25.0  # [°C]
 # After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
@@ -44,6 +45,9 @@ class Sim(Arm):
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
         self.listen(Float64MultiArray, 'muscle_length_command', self._follow, RELIABLE)
+        if not as_robot:
+            self.listen(Float64MultiArray, 'muscle_states', self._note, SENSOR)
+        self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
         self.listen(WrenchStamped, 'sim/external_wrench', self._push, RELIABLE)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
@@ -59,6 +63,10 @@ class Sim(Arm):
 
     def _follow(self, message: Float64MultiArray) -> None:
         self.command = read_array(message, 1, self.robot.muscle_count)
+
+    def _note(self, message: Float64MultiArray) -> None:
+        length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
+        self.gate.message(tension, length, time.monotonic())
 
     def _push(self, message: WrenchStamped) -> None:
         self.wrench = read_wrench(message, self.robot.root_link)
