@@ -310,7 +310,9 @@ class Controller:
                 desired = self._command(dt)
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
-        command = self.safety.step(desired, self.limit, dt, not late.startswith('muscle'))
+        waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
+        fresh = not late.startswith('muscle')
+        command = self.safety.step(desired, self.limit, 0.0 if waits else dt, fresh)
         if self.safety.cause and not self.safety.passing:
             self.explore(False)
         return command
