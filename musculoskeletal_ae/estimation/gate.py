@@ -40,13 +40,13 @@ NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already
 
 #: largest share left unexplained of the fixed postures
 LIMITS = {
-    **{'θ by ①': 0.5, 'T by ①': 1.2, 'l by ①': 0.9},
-    **{'θ by ②': 0.9, 'T by ②': 1.2, 'l by ②': 0.9},
-    **{'θ by ③': 0.5, 'T by ③': 3.0, 'l by ③': 0.5, 'G by ①': 0.9},
+    **{'θ by ①': 0.35, 'T by ①': 1.6, 'l by ①': 1.3},
+    **{'θ by ②': 1.0, 'T by ②': 1.6, 'l by ②': 1.1},
+    **{'θ by ③': 0.35, 'T by ③': 6.0, 'l by ③': 0.35, 'G by ①': 1.3},
 }
 WORSE = 2.0
-FLOOR = {'T by ②': 40.0, 'l by ②': 0.02, 'l by ① at θ of ②': 0.02}  # [N], [m], [m]
-LEAST_CUT = 1.0  # d of messages with a muscle cut over the threshold, the clearest muscle
+FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
+LEAST_CUT = 0.3  # d of messages with a muscle cut over the threshold, the clearest muscle
 
 
 class Gate:
