@@ -7,13 +7,9 @@ from pathlib import Path
 
 
 class MusculoskeletalError(Exception):
-    """Base of every error this package raises on purpose.
+    """Base of every error this package raises on purpose."""
 
-    Attributes:
-        reason: In a few words, what a rejected message is counted under.
-    """
-
-    reason = 'cannot be used'
+    reason = 'cannot be used'  # in a few words, what a rejected message is counted under
 
 
 class RobotDescriptionError(MusculoskeletalError):
@@ -45,18 +41,12 @@ class MessageError(MusculoskeletalError):
 
 
 class BagError(MusculoskeletalError):
-    """A recording that is damaged, or not what it says it is.
+    """A recording that is damaged, or not what it says it is; where in a file, where that helps."""
 
-    Attributes:
-        file: Which file.
-        offset: Where in it [bytes]; None where no place can be named.
-    """
-
-    def __init__(self, file: Path, offset: int | None, problem: str, remedy: str) -> None:
+    def __init__(self, file: Path, problem: str, remedy: str, offset: int | None = None) -> None:
         where = f'{file}' if offset is None else f'{file}, byte {offset}'
         super().__init__(f'{where}: {problem}; {remedy}')
         self.file = file
-        self.offset = offset
 
 
 class UnfinishedBagError(BagError):

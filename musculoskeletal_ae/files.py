@@ -3,7 +3,7 @@
 
 Only regular files are opened (a FIFO would block, a device may never end), no more than a limit is
 read, and what a few bytes of YAML can ask for is bounded before anything is built from it. All
-functions take `refuse`, which makes the caller's error of a file and what is wrong with it.
+functions take `refuse`, which makes the error that they raise of a file and what is wrong with it.
 """
 
 from __future__ import annotations
@@ -32,11 +32,7 @@ _NUMERIC = tuple('+-.0123456789')
 
 
 def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
-    """Open a regular file for reading.
-
-    Raises:
-        Exception: What `refuse` makes, if there is none or it cannot be opened.
-    """
+    """Open a regular file for reading."""
     try:
         # Not blocking, because opening a FIFO waits for its writer.
         descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -50,11 +46,7 @@ def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
 
 
 def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
-    """Return the content of a regular file of at most `largest` bytes.
-
-    Raises:
-        Exception: What `refuse` makes, if it cannot be read or is larger.
-    """
+    """Return the content of a regular file of at most `largest` bytes."""
     with open_regular(file, refuse) as stream:
         try:
             if os.fstat(stream.fileno()).st_size <= largest:
@@ -67,11 +59,7 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
 
 
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
-    """Return the text of a UTF-8 file.
-
-    Raises:
-        Exception: What `refuse` makes, if it cannot be read, is larger or is no such text.
-    """
+    """Return the text of a UTF-8 file of at most `largest` bytes."""
     try:
         return read_bytes(file, refuse, largest).decode('utf-8')
     except UnicodeDecodeError as error:
@@ -79,11 +67,7 @@ def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
 
 
 def read_yaml(file: Path, refuse: Refuse) -> Any:
-    """Return what a YAML file holds.
-
-    Raises:
-        Exception: What `refuse` makes, if it cannot be read or `parse_yaml` refuses it.
-    """
+    """Return what a YAML file holds, by `parse_yaml`."""
     text = read_text(file, refuse, LARGEST_YAML)
     try:
         return parse_yaml(text)
@@ -94,15 +78,9 @@ def read_yaml(file: Path, refuse: Refuse) -> Any:
 def read_csv(
     file: Path, columns: Sequence[str], refuse: Refuse
 ) -> list[tuple[int, str, list[str]]]:
-    """Return (line number, line, cells) below the head of a table; # begins a comment line.
+    """Return (line number, line, cells) below the head of a table, which must name the columns.
 
-    Args:
-        file: The table.
-        columns: What its head must say.
-        refuse: Makes the error.
-
-    Raises:
-        Exception: What `refuse` makes, if it cannot be read or has another head.
+    # begins a comment line.
     """
     rows = []
     for number, line in enumerate(read_text(file, refuse).splitlines(), 1):
@@ -135,13 +113,13 @@ def parse_yaml(text: str) -> Any:
 
 @dataclass
 class _Collection:
-    """A list or mapping that is being read: its keys, and whether one comes next."""
+    """A list or mapping that is being read."""
 
     anchor: str
     before: int  # entries of the text before it
     mapping: bool
     keys: set[str] = field(default_factory=set)
-    at_key: bool = True
+    at_key: bool = True  # a key comes next
 
 
 def _check(text: str) -> None:

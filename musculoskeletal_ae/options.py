@@ -6,7 +6,7 @@ A tool writes only what is its own:
     def main(argv: list[str] | None = None) -> int:
         parser = Parser('train', 'Trains the autoencoder and writes a checkpoint.')
         parser.add_robot()
-        parser.add_out('FILE.safetensors', required=True)
+        parser.add_out('FILE.safetensors')
         parser.add_seed('of the training data and the weights')
         parser.add_argument('--jobs', type=whole(1, 256), help='processes')
         args = parser.parse_args(argv)
@@ -25,10 +25,11 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.directories import shipped_robots
 
 DEFAULT_ROBOT = 'musashi_left_arm'
 
@@ -120,22 +121,15 @@ class Parser(argparse.ArgumentParser):
         sys.exit(2)
 
     def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
-        """Add the robot, by name or directory; `flag` 'robot' makes it positional.
+        """Add the robot, by name or directory; without a default it must be given.
 
-        Args:
-            flag: Name of the argument.
-            default: None: it must be given.
+        The flag 'robot' makes it positional.
         """
-        from musculoskeletal_ae.robot.directories import shipped_robots
-
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
-        if flag.startswith('-'):
-            required = default is None
-            self.add_argument(
-                flag, metavar='NAME|DIR', default=default, required=required, help=text
-            )
-        else:
-            self.add_argument(flag, help=text)
+        kind: dict[str, Any] = {'metavar': 'NAME|DIR', 'required': default is None}
+        self.add_argument(
+            flag, default=default, help=text, **(kind if flag.startswith('-') else {})
+        )
 
     def add_checkpoint(
         self, text: str = 'trained network', flag: str = '--checkpoint', required: bool = False
@@ -151,11 +145,9 @@ class Parser(argparse.ArgumentParser):
         """Add `--seed`; the text says what it is the random seed of."""
         self.add_argument('--seed', type=seed, default=0, help=f'random seed {text}')
 
-    def add_seeds(self, default: tuple[int, ...] | None = (0,)) -> None:
+    def add_seeds(self, default: tuple[int, ...] | None, text: str = 'individual arms') -> None:
         """Add `--seeds`, the individual arms."""
-        self.add_argument(
-            '--seeds', type=seeds, default=default, metavar='N,…', help='individual arms'
-        )
+        self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
         """Add `--minutes` of robot time; the text says what happens in them."""
@@ -166,13 +158,10 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--quick', action='store_true', help=text)
 
     def add_out(
-        self,
-        metavar: str,
-        text: str = 'where to write',
-        default: Path | None = None,
-        required: bool = False,
+        self, metavar: str, text: str = 'where to write', default: Path | None = None
     ) -> None:
-        """Add `--out`, a file or directory."""
+        """Add `--out`, a file or directory; without a default it must be given."""
+        required = default is None
         self.add_argument(
             '--out', type=Path, metavar=metavar, default=default, required=required, help=text
         )
@@ -184,33 +173,24 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--no-plot', action='store_true', help='write no plot')
 
 
-def save_plot(args: argparse.Namespace, default: str, save: Callable[[Path], None]) -> None:
-    """Save the plot that `add_plot` offers, and say where; `default` is its name in full.
-
-    Raises:
-        MusculoskeletalError: If it cannot be written.
-    """
-    if not args.no_plot:
-        file = args.plot or Path(default)
-        try:
-            save(file)
-        except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
-            raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
-        print(f'plot: {file}')
+def save_plot(file: Path | None, save: Callable[[Path], None]) -> None:
+    """Save a plot, if one is wanted, and say where; an error says that it cannot be written."""
+    if file is None:
+        return
+    try:
+        save(file)
+    except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
+        raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
+    print(f'plot: {file}')
 
 
 def exit_status(
     work: Callable[[], int | None], *also: type[Exception], interrupted: int = 130
 ) -> int:
-    """Do a tool's work and return its exit status, without a traceback.
+    """Do a tool's work and return its exit status, without a traceback; None of `work` is 0.
 
-    Args:
-        work: Returns a status, or None for 0.
-        also: Kinds of errors that are said in one line, beside what this package and files raise.
-        interrupted: Status after Ctrl-C.
-
-    Returns:
-        What `work` returns, or 1 after an error that was printed.
+    Errors of this package, of files and of the kinds in `also` are one line and status 1; Ctrl-C
+    gives the status `interrupted`.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:

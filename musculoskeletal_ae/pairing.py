@@ -14,21 +14,13 @@ from musculoskeletal_ae.arrays import Array
 
 
 class Paired(NamedTuple):
-    """One message of the muscle modules, with the θ of the same time if there is one.
+    """One message of the muscle modules, with the θ of the same time if there is one."""
 
-    Attributes:
-        time: When it came [s].
-        tension: T [N], shape (M,).
-        length: l [m], shape (M,).
-        dt: Time since the message before [s], 0 for the first.
-        theta: θ [rad], shape (D,), or None.
-    """
-
-    time: float
-    tension: Array
-    length: Array
-    dt: float
-    theta: Array | None
+    time: float  # when it came [s]
+    tension: Array  # T [N], (M,)
+    length: Array  # l [m], (M,)
+    dt: float  # time since the message before [s], 0 for the first
+    theta: Array | None  # θ [rad], (D,)
 
 
 class Pairing:
@@ -64,10 +56,9 @@ class Pairing:
         pending, self._pending = self._pending, (time, tension, length)
         paired = None
         if pending is not None:
-            came, before = pending[0], self._before
-            paired = Paired(
-                *pending, 0.0 if before is None else came - before, self._nearest(came, time)
-            )
+            came = pending[0]
+            dt = 0.0 if self._before is None else came - self._before
+            paired = Paired(*pending, dt, self._nearest(came, time))
             self._before = came
         del self._angles[:-1]
         return paired

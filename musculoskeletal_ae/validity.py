@@ -2,8 +2,9 @@
 """Which messages are used: the rules of validity and of order (doc/interface.md), without ROS.
 
 Messages are told by their fields, so that the rules hold for a live message and for one of a bag
-alike. Reading raises `MessageError` with a short reason; who reads counts it and lives on. A
-JointState is matched by name in any order, a Float64MultiArray by length and, where given, layout.
+alike. What breaks a rule raises `MessageError` with a short reason; who reads counts it and lives
+on. A JointState is matched by name in any order, a Float64MultiArray by length and, where given,
+layout.
 """
 
 from __future__ import annotations
@@ -19,11 +20,8 @@ from musculoskeletal_ae.exceptions import MessageError
 
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000
-
 MOST_WRENCH = 1e4  # [N], [N·m]: no arm outlives more
-
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
-
 QUANTITIES = ('length', 'tension', 'temperature')
 
 # A source time that lies further back than this is another publisher's clock, not a reordering.
@@ -41,10 +39,8 @@ class SourceOrder:
     def is_late(self, time: int, number: int = 0) -> bool:
         """Say whether a message was sent no later than the last one that was taken.
 
-        Args:
-            time: When it was sent [ns]; 0 where that is not known.
-            number: Which of the publisher's messages it is, where that is known: it goes on when
-                the publisher's clock steps back.
+        It was sent at `time` [ns], 0 where that is not known, as the publisher's `number`th, where
+        that is known: the number goes on when the publisher's clock steps back.
         """
         last_time, last_number = self._last
         return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
@@ -55,11 +51,7 @@ class SourceOrder:
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:
-    """Return the data of a Float64MultiArray as shape (rows, columns); rows = 1 gives (columns,).
-
-    Raises:
-        MessageError: If the length, layout or a value breaks a rule.
-    """
+    """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,)."""
     if len(message.data) > MOST_ENTRIES:
         raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
     if len(message.data) == 0:
@@ -91,16 +83,10 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
 def read_joints(
     message: Any, joints: Sequence[str], foreign_allowed: bool
 ) -> dict[str, tuple[float, float]]:
-    """Return name → (position, effort) of the listed joints; effort is 0 where none is given.
+    """Return name → (position, effort) of the listed joints in a JointState; no effort is 0.
 
-    Args:
-        message: A JointState.
-        joints: Joints the robot lists.
-        foreign_allowed: Ignore joints the robot does not list (`joint_states`) and ask for all
-            that it does; else refuse unknown ones and accept a subset (targets).
-
-    Raises:
-        MessageError: If names, lengths or a value break a rule.
+    Where foreign joints are allowed (`joint_states`), those the robot does not list are ignored,
+    and all that it lists are asked for; else (targets) they are refused, and a subset will do.
     """
     names, efforts, speeds = list(message.name), message.effort, message.velocity
     counts = len(names), len(message.position), len(efforts), len(speeds)
@@ -113,10 +99,9 @@ def read_joints(
             'wrong length', '{} names, {} positions, {} efforts, {} velocities'.format(*counts)
         )
     listed = set(joints)
-    if not foreign_allowed:
-        for name in names:
-            if name not in listed:
-                raise MessageError('unknown joint', f'{name!r}; legal: {", ".join(joints)}')
+    unknown = [name for name in names if name not in listed]
+    if unknown and not foreign_allowed:
+        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     values: dict[str, tuple[float, float]] = {}
     for i, name in enumerate(names):
         if name not in listed:
@@ -146,9 +131,6 @@ def read_wrench(message: Any, root_link: str) -> Array:
     """Return force [N] and torque [N·m] (6,) of a WrenchStamped in axes of the root link.
 
     An empty frame means the root link.
-
-    Raises:
-        MessageError: If it is given in another frame, not finite, or absurd.
     """
     force, torque = message.wrench.force, message.wrench.torque
     wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
@@ -162,11 +144,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def read_pose(message: Any, frame: str) -> pin.SE3:
-    """Return the pose of a PoseStamped that is given in `frame`.
-
-    Raises:
-        MessageError: If it is given in another frame, not finite, or without an orientation.
-    """
+    """Return the pose of a PoseStamped that is given in `frame`."""
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     position, turn = message.pose.position, message.pose.orientation

@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
+
+# Each of pytest-xdist's processes has a ROS graph of its own.
+if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
+    os.environ['ROS_DOMAIN_ID'] = str(int(os.environ.get('ROS_DOMAIN_ID', '1')) + int(worker))
 
 # Compiled code is loaded in somebody's first example; no test here judges time.
 settings.register_profile('no deadline', deadline=None)
@@ -14,22 +21,35 @@ settings.load_profile('no deadline')
 
 
 @pytest.fixture(scope='session')
-def trained() -> dict[str, Any]:
-    """Return briefly trained networks of arm26, by preset."""
+def trained_files(tmp_path_factory) -> dict[str, Path]:
+    """Return files of briefly trained networks of arm26, by preset, trained once a run."""
     # Torch is loaded for tests that want a network only.
+    from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
     from musculoskeletal_ae.presets import PRESETS
     from musculoskeletal_ae.robot.robot import Robot
 
-    robot = Robot.load('arm26')
-    return {preset: initial_mae(robot, preset, seed=3, steps=600).mae for preset in PRESETS}
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if worker else folder  # what pytest-xdist's processes have in common
+    files = {preset: folder / f'arm26_{preset}.safetensors' for preset in PRESETS}
+    with (folder / 'lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for preset, file in files.items():
+            if not file.exists():
+                mae = initial_mae(Robot.load('arm26'), preset, seed=3, steps=600).mae
+                checkpoint.save(mae, file)
+    return files
 
 
 @pytest.fixture(scope='session')
-def trained_file(trained, tmp_path_factory) -> str:
-    """Return a checkpoint file of the network of preset `default`."""
+def trained(trained_files) -> dict[str, Any]:
+    """Return briefly trained networks of arm26, by preset."""
     from musculoskeletal_ae.mae import checkpoint
 
-    path = tmp_path_factory.mktemp('checkpoint') / 'arm26.safetensors'
-    checkpoint.save(trained['default'], path)
-    return str(path)
+    return {preset: checkpoint.load(file) for preset, file in trained_files.items()}
+
+
+@pytest.fixture(scope='session')
+def trained_file(trained_files) -> str:
+    """Return the checkpoint file of the network of preset `default`."""
+    return str(trained_files['default'])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mcap file read from end to end, before anything in it is used (https://mcap.dev/spec).
 
-The library reads the records and compares checksums. What it takes as it comes is refused here:
-records that are cut, do not belong or whose lengths do not fit, chunks that decompress to more than
+The library parses the records. What it takes as it comes is refused here: records that are cut, do
+not belong or whose lengths do not fit, checksums that differ, chunks that decompress to more than
 they say, topics of other types than they say, and messages in other numbers than the file counts.
 """
 
@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -29,14 +31,15 @@ from musculoskeletal_ae.files import open_regular
 
 # No record, and no chunk once decompressed, is larger: what a damaged file can ask for is bounded.
 LARGEST = 64 << 20  # [bytes]
+LATEST = (1 << 63) - 1  # [ns]; ROS time is signed
 DAMAGED = 'the file is damaged: use a copy or another recording'
+NO_SCHEMA = mcap.Schema(id=0, name='', encoding='', data=b'')  # of a channel that names none
 
 _MAGIC = b'\x89MCAP0\r\n'
-_HEAD = 9  # [bytes] of a record: opcode and length
+_HEAD = struct.Struct('<BQ')  # of a record: opcode and length
 _ANYWHERE = frozenset(Opcode)
 _IN_CHUNK = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
 _LONGEST_RUN = 1 << 20  # [bytes]
-_LATEST = (1 << 63) - 1  # [ns]; ROS time is signed
 _CDR = (b'\x00\x01', b'\x00\x00')
 _NAME = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 _LONGEST_NAME = 256
@@ -54,6 +57,17 @@ class BagTopic:
     message_count: int = 0
 
 
+class BagMessage(NamedTuple):
+    """A message as it was recorded."""
+
+    topic: str  # absolute name
+    log_time: int  # when it was received [ns]
+    publish_time: int  # when it was sent [ns]
+    data: bytes  # serialized
+    file: Path  # the mcap file it is from
+    offset: int  # where in the file its chunk begins
+
+
 @dataclass
 class Block:
     """A piece of the file that is read at once: a chunk, or a run of messages outside of chunks."""
@@ -63,85 +77,62 @@ class Block:
     start: int  # earliest log time [ns]
     end: int  # latest log time [ns]
     topics: set[str]
-    chunk: bool
 
 
 @dataclass
 class McapFile:
-    """What is in one file.
-
-    Attributes:
-        path: The file.
-        size: Its length [bytes].
-        channels: Its topics by channel number.
-        blocks: Where the messages are.
-        backward: How many messages have an earlier log time than the one before them.
-        cut: Where the incomplete last record begins; None in a file that was ended properly.
-        checked: Whether checksums cover all messages.
-        summarised: Whether the messages were compared with the file's own count.
-    """
+    """What is in one file."""
 
     path: Path
-    size: int
-    channels: dict[int, BagTopic] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
-    backward: int = 0
-    cut: int | None = None
-    checked: bool = True
-    summarised: bool = False
+    size: int  # [bytes]
+    ended: bool  # whether it was, properly
+    end: int = len(_MAGIC)  # of the last complete record
+    channels: dict[int, BagTopic] = field(default_factory=dict)  # by channel number
+    blocks: list[Block] = field(default_factory=list)  # where the messages are
+    backward: int = 0  # messages with an earlier log time than the one before them
+    checked: bool = True  # whether checksums cover all messages
+    summarised: bool = False  # whether the messages were compared with the file's own count
 
     @classmethod
     def read(cls, path: Path) -> McapFile:
-        """Read a file from end to end.
-
-        Raises:
-            BagError: If it is damaged. That it was not ended is no error here: see `cut`.
-        """
+        """Read a file from end to end, or raise a BagError that says where it is damaged."""
         with open_regular(path, _unreadable) as stream:
-            file = cls(path, os.fstat(stream.fileno()).st_size)
-            if file.size == 0:
-                raise BagError(path, 0, 'the file is empty', 'nothing was recorded: record again')
-            if stream.read(len(_MAGIC)) != _MAGIC:
-                raise BagError(path, 0, 'this is no mcap file', 'name a bag directory or a .mcap')
-            stream.seek(-len(_MAGIC), os.SEEK_END)
-            ended = file.size > len(_MAGIC) and stream.read() == _MAGIC
-            stream.seek(0)
-            source = _Source(stream, file.size, _ANYWHERE)
+            size, magic = os.fstat(stream.fileno()).st_size, len(_MAGIC)
+            if size == 0:
+                raise BagError(path, 'the file is empty', 'nothing was recorded: record again', 0)
+            if stream.read(magic) != _MAGIC:
+                raise BagError(path, 'this is no mcap file', 'name a bag directory or a .mcap', 0)
+            ended = os.pread(stream.fileno(), magic, max(size - magic, magic)) == _MAGIC
+            file = cls(path, size, ended)
             try:
-                file._scan(source)
+                file._scan(stream)
             # The library lets many kinds of errors out of bytes that are no records.
             except Exception as error:
-                if ended or not isinstance(error, EOFError) or not source.exhausted:
-                    raise BagError(path, source.begin, str(error), DAMAGED) from error
-                file.cut = source.begin
+                raise BagError(path, str(error), DAMAGED, file.end) from error
         return file
 
-    def messages(self, block: Block) -> Iterator[tuple[str, mcap.Message]]:
-        """Yield (topic, message) of a block in the order they have in it.
-
-        Raises:
-            BagError: If the file has changed.
-        """
+    def messages(self, block: Block) -> Iterator[BagMessage]:
+        """Yield the messages of a block in their order; a BagError says that it has changed."""
         try:
             with open_regular(self.path, _unreadable) as stream:
                 stream.seek(block.offset)
                 data = stream.read(block.stop - block.offset)
             if len(data) != block.stop - block.offset:
                 raise EOFError('it has become shorter')
-            for record in _records(data, _ANYWHERE):
-                for inner in _contents(record):
-                    if isinstance(inner, mcap.Message):
-                        yield self.channels[inner.channel_id].name, inner
+            for record in _records_in(data, _ANYWHERE):
+                for m in _contents(record):
+                    if isinstance(m, mcap.Message):
+                        name, times = self.channels[m.channel_id].name, (m.log_time, m.publish_time)
+                        yield BagMessage(name, *times, m.data, self.path, block.offset)
         except Exception as error:
-            raise BagError(self.path, block.offset, f'has changed: {error}', DAMAGED) from error
+            raise BagError(self.path, f'has changed: {error}', DAMAGED, block.offset) from error
 
-    def _scan(self, source: _Source) -> None:
-        schemas: dict[int, mcap.Schema] = {}
-        channels: dict[int, mcap.Channel] = {}
-        statistics: mcap.Statistics | None = None
-        latest = 0
-        for record in _reader(source, validate_crcs=True, record_size_limit=LARGEST).records:
-            if source.begin == len(_MAGIC) and not isinstance(record, mcap.Header):
+    def _scan(self, stream: BinaryIO) -> None:
+        schemas, channels = {0: NO_SCHEMA}, dict[int, mcap.Channel]()
+        statistics = footer = None
+        crc, latest, size = zlib.crc32(_MAGIC), 0, self.size - self.ended * len(_MAGIC)
+        for end, data, record in _records(stream, self.end, size, _ANYWHERE):
+            if self.end == len(_MAGIC) and not isinstance(record, mcap.Header):
                 raise ValueError('the file does not begin with a header')
             match record:
                 case mcap.Header() if record.profile not in ('ros2', ''):
@@ -151,125 +142,103 @@ class McapFile:
                     self.checked &= record.uncompressed_crc != 0
                 case mcap.Message():
                     self.checked = False
+                case mcap.DataEnd() if record.data_section_crc not in (0, crc):
+                    raise ValueError('the checksum of the data does not fit')
                 case mcap.DataEnd():
                     self.checked |= record.data_section_crc != 0
-                    source.crc = 0
                 case mcap.Statistics():
                     statistics = record
-                case mcap.Footer() if record.summary_crc not in (0, source.crc_before):
-                    raise ValueError('the checksum of the summary does not fit')
+                case mcap.Footer():
+                    footer = record
+                    if footer.summary_crc not in (0, zlib.crc32(data[:-4], crc)):
+                        raise ValueError('the checksum of the summary does not fit')
+            # One checksum is of all before DataEnd, the other one of what is after it.
+            crc = 0 if isinstance(record, mcap.DataEnd) else zlib.crc32(data, crc)
             for inner in _contents(record):
                 match inner:
                     case mcap.Message():
-                        self._add(inner, source, isinstance(record, mcap.Chunk))
+                        self._add(inner, end, chunk=inner is not record)
                         self.backward += inner.log_time < latest
                         latest = inner.log_time
-                    case mcap.Schema():
-                        if inner.id == 0 or schemas.setdefault(inner.id, inner) != inner:
-                            raise ValueError(f'schema {inner.id} is given twice and differs')
-                    case mcap.Channel():
-                        if channels.setdefault(inner.id, inner) != inner:
-                            raise ValueError(f'channel {inner.id} is given twice and differs')
-                        if inner.id not in self.channels:
-                            self.channels[inner.id] = _topic(inner, schemas)
-        if source.offset != source.size:
-            raise ValueError(f'{source.size - source.offset} bytes after the end')
-        if statistics is not None:
-            total = sum(topic.message_count for topic in self.channels.values())
-            if statistics.message_count != total:
-                counted = statistics.message_count
-                raise ValueError(f'the summary counts {counted} messages, {total} were read')
-            for number, counted in statistics.channel_message_counts.items():
-                topic = self.channels.get(number)
-                if counted != (topic.message_count if topic else 0):
-                    raise ValueError(f'channel {number} has not the {counted} messages it says')
+                    case mcap.Schema() if schemas.setdefault(inner.id, inner) != inner:
+                        raise ValueError(f'schema {inner.id} is given twice and differs')
+                    case mcap.Channel() if channels.setdefault(inner.id, inner) != inner:
+                        raise ValueError(f'channel {inner.id} is given twice and differs')
+                    case mcap.Channel() if inner.id not in self.channels:
+                        self.channels[inner.id] = _topic(inner, schemas)
+            self.end = end
+        if footer and size - self.end >= (1 if self.ended else len(_MAGIC)):
+            raise ValueError(f'{size - self.end} bytes after the end')
+        if self.ended and not footer:
+            raise ValueError('a record reaches beyond the end')
+        if self.ended and statistics:
+            read = Counter({number: topic.message_count for number, topic in self.channels.items()})
+            said = statistics.channel_message_counts
+            differ = [number for number, count in said.items() if count != read[number]]
+            if statistics.message_count != read.total() or differ:
+                problem = f'counts {statistics.message_count} messages, {read.total()} were read'
+                raise ValueError(f'the summary {problem}; channels that differ: {differ[:20]}')
             self.summarised = True
 
-    def _add(self, message: mcap.Message, source: _Source, chunk: bool) -> None:
-        """Take note of a message in the record that the source has just read."""
+    def _add(self, message: mcap.Message, end: int, chunk: bool) -> None:
+        """Take note of a message in the record that ends at `end`."""
         topic = self.channels.get(message.channel_id)
         if topic is None:
             raise ValueError(f'a message of channel {message.channel_id}, which is not there')
-        if max(message.log_time, message.publish_time) > _LATEST:
+        if max(message.log_time, message.publish_time) > LATEST:
             raise ValueError('a message has a time beyond all ROS times')
         if not topic.refused and message.data[:2] not in _CDR:
             raise ValueError('a message is not in CDR')
         topic.message_count += 1
-        time, begin, stop = message.log_time, source.begin, source.offset
-        last = self.blocks[-1] if self.blocks else None
+        time, last = message.log_time, self.blocks[-1] if self.blocks else None
         if last and (
-            begin == last.offset
+            self.end == last.offset
             if chunk
-            else not last.chunk and begin == last.stop and stop - last.offset <= _LONGEST_RUN
+            else self.end == last.stop and end - last.offset <= _LONGEST_RUN
         ):
-            last.stop = stop
-            last.start, last.end = min(last.start, time), max(last.end, time)
+            last.stop, last.start, last.end = end, min(last.start, time), max(last.end, time)
             last.topics.add(topic.name)
         else:
-            self.blocks.append(Block(begin, stop, time, time, {topic.name}, chunk))
+            self.blocks.append(Block(self.end, end, time, time, {topic.name}))
 
 
-class _Source:
-    """What the library reads records from: exactly the bytes it asks for, or an error.
+class _Record(BytesIO):
+    """Gives the library exactly the bytes it asks for, or an error."""
 
-    Attributes:
-        size: How many bytes there are.
-        begin: Where the present record begins.
-        offset: How far it has been read.
-        crc: CRC-32 of what was read since it was set to 0; `crc_before`: without the last piece.
-    """
-
-    def __init__(self, stream: BinaryIO, size: int, legal: Collection[int]) -> None:
-        """Read a stream of `size` bytes in which records of `legal` kinds belong."""
-        self._stream, self.size, self._legal = stream, size, legal
-        self.begin = self.offset = self._end = 0
-        self.crc = self.crc_before = 0
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether the present record reaches beyond the end."""
-        return self._end > self.size
-
-    def read(self, count: int) -> bytes:
-        """Return exactly `count` bytes of the present record, or of the next one after its end.
-
-        Raises:
-            EOFError: If there are not so many.
-            ValueError: If the record has not so many, or does not belong here.
-        """
-        if self.offset == self._end:
-            # One byte of opcode is read first; what is read as a whole is the magic.
-            self.begin = self.offset
-            self._end += _HEAD if count == 1 else count
-        if self._end > self.size:
-            raise EOFError('a record reaches beyond the end')
-        if not 0 <= count <= self._end - self.offset:
-            raise ValueError('the lengths in a record do not fit')
-        data = self._stream.read(count)
+    def read(self, count: int | None = -1) -> bytes:
+        data = super().read(count)
         if len(data) != count:
-            raise EOFError('the file has become shorter')
-        self.offset += count
-        self.crc_before, self.crc = self.crc, zlib.crc32(data, self.crc)
-        if self.offset == self.begin + 1 and data[0] not in self._legal:
-            raise ValueError(f'record {data[0]:#04x} does not belong here')
-        if self.offset == self.begin + _HEAD:
-            self._end = self.offset + int.from_bytes(data, 'little')
-            if self._end == self.offset:
-                raise ValueError('the lengths in a record do not fit: it is empty')
+            raise ValueError('the lengths in a record do not fit')
         return data
 
 
-def _reader(source: _Source, **options: Any) -> StreamReader:
-    # It calls nothing but `read`.
-    return StreamReader(source, emit_chunks=True, **options)  # type: ignore[arg-type]
+def _records(
+    stream: BinaryIO, begin: int, size: int, legal: Collection[int]
+) -> Iterator[tuple[int, bytes, mcap.McapRecord]]:
+    """Yield (end, bytes, record) up to the footer, or to a record that reaches beyond the end."""
+    opcode = 0
+    while opcode != Opcode.FOOTER and begin + _HEAD.size <= size:
+        head = stream.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head)
+        begin += _HEAD.size + length
+        if opcode not in legal:
+            raise ValueError(f'record {opcode:#04x} does not belong here')
+        if length > LARGEST:
+            raise ValueError(f'a record claims {length} bytes, which exceeds the limit {LARGEST}')
+        if begin > size:
+            return
+        data = head + stream.read(length)
+        reader = StreamReader(_Record(data), skip_magic=True, emit_chunks=True)
+        yield begin, data, next(reader.records)
 
 
-def _records(data: bytes, legal: Collection[int]) -> Iterator[mcap.McapRecord]:
-    """Yield the records in a piece of a file or in the content of a chunk."""
-    source = _Source(BytesIO(data), len(data), legal)
-    records = _reader(source, skip_magic=True).records
-    while source.offset < source.size:
-        yield next(records)
+def _records_in(data: bytes, legal: Collection[int]) -> Iterator[mcap.McapRecord]:
+    stop = 0
+    for end, _, record in _records(BytesIO(data), 0, len(data), legal):
+        stop = end
+        yield record
+    if stop != len(data):
+        raise ValueError('a record reaches beyond the end')
 
 
 def _contents(record: mcap.McapRecord) -> Iterator[mcap.McapRecord]:
@@ -292,7 +261,7 @@ def _contents(record: mcap.McapRecord) -> Iterator[mcap.McapRecord]:
         raise ValueError(f'the chunk does not have the {size} bytes it claims when decompressed')
     if record.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError('the checksum of the chunk does not fit')
-    yield from _records(data, _IN_CHUNK)
+    yield from _records_in(data, _IN_CHUNK)
 
 
 def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
@@ -300,8 +269,8 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
     name = channel.topic
     if len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
         raise ValueError(f'{name[:60]!r} is not the name of a topic')
-    schema = schemas.get(channel.schema_id, mcap.Schema(id=0, name='', encoding='', data=b''))
-    if schema.id != channel.schema_id:
+    schema = schemas.get(channel.schema_id)
+    if schema is None:
         raise ValueError(f'topic {name} has schema {channel.schema_id}, which is not there')
     refused = ''
     if channel.message_encoding != 'cdr':
@@ -318,4 +287,4 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
 
 
 def _unreadable(file: Path, problem: str) -> BagError:
-    return BagError(file, None, problem, 'choose another file')
+    return BagError(file, problem, 'name another bag directory or .mcap')

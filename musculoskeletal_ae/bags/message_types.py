@@ -38,11 +38,7 @@ def type_hash(type_name: str) -> str:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Return the message in serialized bytes.
-
-    Raises:
-        ValueError: If the bytes are not a message of that type.
-    """
+    """Return the message in serialized bytes; a ValueError says that they are none of the type."""
     try:
         return TYPESTORE.deserialize_cdr(data, type_name)
     # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes
@@ -52,13 +48,9 @@ def decode(data: bytes, type_name: str) -> Any:
 
 
 def contradiction(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
-    """Say where a recorded definition differs from that of ROS 2 Jazzy; '' if nowhere.
+    """Say where a recorded definition of a known type differs from ROS 2 Jazzy's; '' if nowhere.
 
-    Args:
-        type_name: A known type.
-        encoding: How the definition is written.
-        text: The definition.
-        recorded_hash: RIHS01 hash, '' where none was recorded.
+    The encoding says how the definition is written; the RIHS01 hash is '' where none was recorded.
     """
     if encoding != ENCODING:
         return f'is written in {encoding[:40]!r}, not {ENCODING!r}'
@@ -78,7 +70,7 @@ def contradiction(type_name: str, encoding: str, text: bytes, recorded_hash: str
 
 @lru_cache(maxsize=100)
 def _fields(type_name: str, text: str) -> dict[str, Any]:
-    """Return the fields of a type and all it contains, constants and defaults left out."""
-    # The parser takes neither comments everywhere nor the line ends of Windows.
+    # Of a type and all it contains, constants and defaults left out. The parser takes neither
+    # comments everywhere nor the line ends of Windows.
     text = '\n'.join(line.split('#')[0].strip() for line in text.splitlines())
     return {name: fields for name, (_, fields) in get_types_from_msg(text, type_name).items()}

@@ -2,6 +2,7 @@
 """metadata.yaml of a rosbag2 directory: written in version 9, read in all versions.
 
 It is written when recording starts, with a mark that it is not ended, and replaced when it ends.
+The classes name and order its entries as rosbag2 does.
 """
 
 from __future__ import annotations
@@ -9,59 +10,82 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
+from msgspec import Struct, convert, to_builtins
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
-from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
+from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import parse_yaml, read_yaml
 
 FILE = 'metadata.yaml'
 VERSION = 9
 REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yaml'
 
-# A QoS profile as rosbag2 writes it in version 9.
-Qos = Mapping[str, Any]
+Qos = Mapping[str, Any]  # a profile as rosbag2 writes it in version 9
 
 _MARK = 'musculoskeletal_ae_unfinished'
 _NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
-class TopicCount(NamedTuple):
-    """What metadata.yaml says of a topic."""
+class _Duration(Struct):
+    nanoseconds: int
 
-    name: str
+
+class _Time(Struct):
+    nanoseconds_since_epoch: int
+
+
+class Topic(Struct):
+    """A topic."""
+
+    name: str  # absolute
     type: str
+    serialization_format: str = 'cdr'
+    offered_qos_profiles: Any = ()  # a list of `Qos`; text in older versions
+    type_description_hash: str = ''
+
+
+class TopicCount(Struct):
+    """A topic and its number of messages."""
+
+    topic_metadata: Topic
     message_count: int
-    qos: Sequence[Qos] = ()
-    type_hash: str = ''
 
 
-class Metadata(NamedTuple):
-    """What metadata.yaml says.
+class Metadata(Struct, kw_only=True):
+    """What metadata.yaml says."""
 
-    Attributes:
-        files: Names of the mcap files in the directory, in order.
-        topics: Topics, types, counts.
-        start: Earliest log time [ns], None without messages.
-        duration: To the latest one [ns].
-        finished: Whether the recording was ended.
-    """
+    version: int
+    storage_identifier: str
+    duration: _Duration
+    starting_time: _Time
+    message_count: int
+    topics_with_message_count: list[TopicCount]
+    compression_format: Any = ''
+    compression_mode: Any = ''
+    relative_file_paths: list[str]
+    files: Any = ()  # not in older versions
+    custom_data: Any = None
+    ros_distro: Any = 'jazzy'
 
-    files: Sequence[str]
-    topics: Sequence[TopicCount]
-    start: int | None
-    duration: int
-    finished: bool
+    @property
+    def finished(self) -> bool:
+        """Whether the recording was ended."""
+        return not (isinstance(self.custom_data, dict) and _MARK in self.custom_data)
 
 
-def offered_qos(latched: bool, depth: int = 10, reliable: bool = True) -> Qos:
+class _Document(Struct):
+    rosbag2_bagfile_information: Metadata
+
+
+def offered_qos(latched: bool, reliable: bool = True) -> Qos:
     """Return a QoS profile as a publisher offers it."""
     return {
         'history': 'keep_last',
-        'depth': 1 if latched else depth,
+        'depth': 1 if latched else 10,
         'reliability': 'reliable' if reliable else 'best_effort',
         'durability': 'transient_local' if latched else 'volatile',
         'deadline': _FOREVER,
@@ -74,7 +98,7 @@ def offered_qos(latched: bool, depth: int = 10, reliable: bool = True) -> Qos:
 
 def qos_text(profiles: Sequence[Qos]) -> str:
     """Return QoS profiles as rosbag2 writes them into a channel's metadata."""
-    return _yaml(list(profiles)) if profiles else ''
+    return _yaml(profiles) if profiles else ''
 
 
 def read_qos(text: str) -> Sequence[Qos]:
@@ -85,109 +109,72 @@ def read_qos(text: str) -> Sequence[Qos]:
         return []
 
 
-def write_metadata(directory: Path, metadata: Metadata) -> None:
-    """Write metadata.yaml in one step: a reader sees the old one or the new one."""
-    start = {'nanoseconds_since_epoch': _NO_TIME if metadata.start is None else metadata.start}
-    duration = {'nanoseconds': metadata.duration}
-    count = sum(topic.message_count for topic in metadata.topics)
-    content = {
-        'version': VERSION,
-        'storage_identifier': 'mcap',
-        'duration': duration,
-        'starting_time': start,
-        'message_count': count,
-        'topics_with_message_count': [
-            {
-                'topic_metadata': {
-                    'name': topic.name,
-                    'type': topic.type,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': list(topic.qos),
-                    'type_description_hash': topic.type_hash,
-                },
-                'message_count': topic.message_count,
-            }
-            for topic in metadata.topics
-        ],
-        'compression_format': '',
-        'compression_mode': '',
-        'relative_file_paths': list(metadata.files),
-        'files': [
-            {'path': name, 'starting_time': start, 'duration': duration, 'message_count': count}
-            for name in metadata.files
-        ],
-        'custom_data': None if metadata.finished else {_MARK: 'true'},
-        'ros_distro': 'jazzy',
-    }
+def write_metadata(
+    directory: Path, name: str, topics: list[TopicCount], times: list[int], finished: bool
+) -> None:
+    """Write metadata.yaml in one step: a reader sees the old one or the new one.
+
+    `name` is that of the one mcap file; `times` its earliest and latest log time [ns], [] without
+    messages.
+    """
+    start, end = times or (_NO_TIME, _NO_TIME)
+    time, span = _Time(start), _Duration(end - start)
+    count = sum(topic.message_count for topic in topics)
+    metadata = Metadata(
+        version=VERSION,
+        storage_identifier='mcap',
+        duration=span,
+        starting_time=time,
+        message_count=count,
+        topics_with_message_count=topics,
+        relative_file_paths=[name],
+        files=[{'path': name, 'starting_time': time, 'duration': span, 'message_count': count}],
+        custom_data=None if finished else {_MARK: 'true'},
+    )
     new = directory / f'{FILE}.new'
     with new.open('w', encoding='utf-8') as stream:
-        stream.write(_yaml({'rosbag2_bagfile_information': content}))
-        if metadata.finished:
+        stream.write(_yaml(_Document(metadata)))
+        if finished:
             stream.flush()
             os.fsync(stream.fileno())
     new.replace(directory / FILE)
 
 
-def read_metadata(directory: Path) -> Metadata:
-    """Read and check metadata.yaml.
-
-    Raises:
-        UnfinishedBagError: If there is none.
-        BagError: If it cannot be used.
-    """
+def read_metadata(directory: Path) -> Metadata | None:
+    """Return metadata.yaml, None where there is none; a BagError says why it cannot be used."""
     file = directory / FILE
     if not os.path.lexists(file):
-        problem = 'is missing, so the recording was not ended'
-        raise UnfinishedBagError(file, None, problem, 'run `record --recover`')
+        return None
     try:
-        return _checked(read_yaml(file, _unusable))
+        metadata = convert(read_yaml(file, _unusable), _Document).rosbag2_bagfile_information
+        _check(metadata)
+        return metadata
     except ValueError as error:
         raise _unusable(file, str(error)) from error
 
 
-def _checked(content: Any) -> Metadata:
-    info = _get(content, 'rosbag2_bagfile_information', dict)
-    version = _get(info, 'version', int)
-    if not 1 <= version <= VERSION:
-        raise ValueError(f'version {version} is none of 1 … {VERSION}')
-    storage = _get(info, 'storage_identifier', str)
-    if storage != 'mcap':
+def _check(metadata: Metadata) -> None:
+    if not 1 <= metadata.version <= VERSION:
+        raise ValueError(f'version {metadata.version} is none of 1 … {VERSION}')
+    if (storage := metadata.storage_identifier) != 'mcap':
         raise ValueError(f'storage {storage[:40]!r} is not mcap: use `ros2 bag convert`')
-    if str(info.get('compression_mode') or 'none')[:8].lower() != 'none':
+    if str(metadata.compression_mode or 'none')[:8].lower() != 'none':
         raise ValueError('rosbag2 compressed the whole file: use `ros2 bag convert`')
-    files = _get(info, 'relative_file_paths', list)
-    for name in files:
-        # A bag names files beside its metadata.yaml and nothing else on this machine.
-        if not isinstance(name, str) or Path(name).name != name or name in ('', '.', '..'):
-            raise ValueError('relative_file_paths must name files in the same directory')
-    if not files or len(set(files)) != len(files):
+    names = metadata.relative_file_paths
+    # A bag names files beside its metadata.yaml and nothing else on this machine.
+    if any(Path(name).name != name or name in ('', '.', '..') for name in names):
+        raise ValueError('relative_file_paths must name files in the same directory')
+    if not names or len(set(names)) != len(names):
         raise ValueError('relative_file_paths must name each file once')
-    topics = []
-    for entry in _get(info, 'topics_with_message_count', list):
-        topic, count = _get(entry, 'topic_metadata', dict), _get(entry, 'message_count', int)
-        topics.append(TopicCount(_get(topic, 'name', str), _get(topic, 'type', str), count))
-    if sum(topic.message_count for topic in topics) != _get(info, 'message_count', int):
+    counts = [topic.message_count for topic in metadata.topics_with_message_count]
+    if sum(counts) != metadata.message_count:
         raise ValueError('message_count is not the sum over the topics')
-    start = _get(_get(info, 'starting_time', dict), 'nanoseconds_since_epoch', int)
-    duration = _get(_get(info, 'duration', dict), 'nanoseconds', int)
-    custom = info.get('custom_data')
-    return Metadata(
-        files, topics, start, duration, not (isinstance(custom, dict) and _MARK in custom)
-    )
-
-
-def _get(entry: Any, key: str, kind: type) -> Any:
-    value = entry.get(key) if isinstance(entry, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise ValueError(f'{key} is missing or not of type {kind.__name__}')
-    return value
 
 
 def _yaml(value: object) -> str:
-    # Aliases (&id001) are legal YAML, but no one expects them in a bag.
-    dumper = type('Plain', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
-    return str(yaml.dump(value, Dumper=dumper, sort_keys=False))
+    # Builtins are copies, so there are no aliases (&id001), which no one expects in a bag.
+    return str(yaml.safe_dump(to_builtins(value), sort_keys=False))
 
 
 def _unusable(file: Path, problem: str) -> BagError:
-    return BagError(file, None, f'cannot be used: {problem}', REMEDY)
+    return BagError(file, f'cannot be used: {problem}', REMEDY)

@@ -10,7 +10,8 @@ import math
 from collections.abc import Collection, Iterator
 from itertools import chain
 
-from musculoskeletal_ae.bags.reader import Bag, BagMessage
+from musculoskeletal_ae.bags.mcap_file import BagMessage
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
 
@@ -19,19 +20,10 @@ LONGEST_LAG = 1.0  # [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
-    """Return from when to when [ns, recorded] a bag is played.
-
-    Args:
-        bag: An opened bag.
-        start: Seconds from its beginning.
-        duration: Seconds to play; None for all that is left.
-
-    Raises:
-        BagError: If the bag is shorter than that.
-    """
+    """Return from when to when [ns, recorded] a bag is played: `duration` [s] from `start` [s]."""
     length = (bag.end - bag.start) / 1e9
     if start > length:
-        raise BagError(bag.path, None, f'is {length:.3f} s long', 'give a smaller --start')
+        raise BagError(bag.path, f'is {length:.3f} s long', 'give a smaller --start')
     first = bag.start + round(start * 1e9)
     return first, bag.end if duration is None else min(bag.end, first + round(duration * 1e9))
 
@@ -39,11 +31,8 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
     """Yield what is published from start to stop [ns, recorded].
 
-    What was latched before the start comes first, as it would reach a late joiner. Messages that
-    cannot be decoded end the replay: they do not reach the nodes.
-
-    Raises:
-        BagError: At such a message, or if the file has changed.
+    What was latched before the start comes first, as it would reach a late joiner. A message that
+    cannot be decoded ends the replay with a BagError: it does not reach the nodes.
     """
     held: dict[str, BagMessage] = {}
     if start > bag.start:
@@ -55,23 +44,17 @@ def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[Ba
 
 
 class Timeline:
-    """Which recorded time it is now.
-
-    Attributes:
-        rate: Recorded seconds in one second.
-        paused: Whether recorded time stands still.
-    """
+    """Which recorded time it is, `rate` recorded seconds in one second; may stand still."""
 
     def __init__(self, start: int, rate: float, now: float) -> None:
         """Begin at `start` [ns, recorded] when the steady clock says `now` [s]."""
-        self.rate, self.paused = rate, False
-        self._recorded, self._steady = start, now
+        self.paused = False
+        self._rate, self._recorded, self._steady = rate, start, now
 
     def recorded(self, now: float) -> int:
         """Return the recorded time [ns]."""
-        if self.paused:
-            return self._recorded
-        return self._recorded + int((now - self._steady) * self.rate * 1e9)
+        passed = 0.0 if self.paused else now - self._steady
+        return self._recorded + int(passed * self._rate * 1e9)
 
     def wait(self, recorded: int, now: float) -> float:
         """Return the seconds until a recorded time [ns] is due, infinite if paused before it.
@@ -80,7 +63,7 @@ class Timeline:
         """
         if self.paused:
             return math.inf if recorded > self._recorded else 0.0
-        return (recorded - self._recorded) / (self.rate * 1e9) - (now - self._steady)
+        return (recorded - self._recorded) / (self._rate * 1e9) - (now - self._steady)
 
     def jump(self, recorded: int, now: float) -> None:
         """Make it this recorded time [ns] now; paused, everything up to it is due."""
@@ -93,9 +76,8 @@ class Timeline:
 
     def resume(self, now: float) -> None:
         """Go on from where it stands."""
-        if self.paused:
-            self._steady = now
-            self.paused = False
+        self._recorded, self._steady = self.recorded(now), now
+        self.paused = False
 
     def catch_up(self, recorded: int, now: float) -> None:
         """Go on from `recorded` if it should have been published long ago."""

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
+from itertools import count
 from pathlib import Path
 
 from musculoskeletal_ae.bags.metadata import FILE, read_qos
@@ -14,22 +14,15 @@ from musculoskeletal_ae.exceptions import BagError
 
 
 def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None]:
-    """Write all complete messages of a bag into a finished one.
+    """Write all complete messages of an unfinished bag, directory or .mcap, into a finished one.
 
-    Args:
-        path: An unfinished bag: a directory or a bare .mcap.
-        out: The new directory. None: a directory is replaced, and the original kept beside it as
-            `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`.
-
-    Returns:
-        The finished bag, its number of messages, and where the original is now if it was moved.
-
-    Raises:
-        BagError: If the bag is damaged otherwise, or is finished already.
+    Without a new directory `out`, a directory is replaced, and the original kept beside it as
+    `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`. Returned are the finished bag, its
+    number of messages, and where the original is now if it was moved.
     """
     bag, finished = _open(path)
     if finished and out is None:
-        raise BagError(path, None, 'the recording is finished', 'there is nothing to recover')
+        raise BagError(path, 'the recording is finished', 'there is nothing to recover')
     if out is not None or not path.is_dir():
         target = out or path.with_name(f'{path.stem}_recovered')
         return target, _copy(bag, target), None
@@ -37,14 +30,14 @@ def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None
     path = path.resolve()
     backup, scratch = _free(path, '.unfinished'), _free(path, '.recovering')
     try:
-        count = _copy(bag, scratch / path.name)
+        messages = _copy(bag, scratch / path.name)
     except BaseException:
         shutil.rmtree(scratch, ignore_errors=True)
         raise
     path.rename(backup)
     (scratch / path.name).rename(path)
     scratch.rmdir()
-    return path, count, backup
+    return path, messages, backup
 
 
 def _open(path: Path) -> tuple[Bag, bool]:
@@ -67,12 +60,11 @@ def _copy(bag: Bag, target: Path) -> int:
             topic.name: writer.add_topic(topic.name, topic.type, read_qos(topic.qos), topic.schema)
             for topic in bag.topics.values()
         }
-        for message in bag.messages():
-            number = numbers[message.topic]
-            writer.write(number, message.log_time, message.publish_time, message.data)
+        for topic, log_time, publish_time, data, *_ in bag.messages():
+            writer.write(numbers[topic], log_time, publish_time, data)
     return Bag.open(target).message_count
 
 
 def _free(path: Path, suffix: str) -> Path:
-    names = (path.with_name(f'{path.name}{suffix}{n or ""}') for n in itertools.count())
+    names = (path.with_name(f'{path.name}{suffix}{n or ""}') for n in count())
     return next(name for name in names if not name.exists())

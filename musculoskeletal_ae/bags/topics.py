@@ -11,17 +11,11 @@ from musculoskeletal_ae.exceptions import BagError
 
 
 class Topic(NamedTuple):
-    """One row of the table in doc/interface.md.
-
-    Attributes:
-        type: ROS message type.
-        latched: The last message reaches late joiners.
-        sent: By hardware, vision, user or controller: what nodes do not compute from the rest.
-    """
+    """One row of the table in doc/interface.md."""
 
     type: str
-    latched: bool = False
-    sent: bool = False
+    latched: bool = False  # the last message reaches late joiners
+    sent: bool = False  # by hardware, vision, user or controller: not computed from the rest
 
 
 _ARRAY = 'std_msgs/msg/Float64MultiArray'
@@ -62,12 +56,8 @@ SENT = [name for name, topic in TOPICS.items() if topic.sent]
 def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    Args:
-        bag: An opened bag.
-        namespace: The one that is meant where the bag has several.
-
-    Raises:
-        BagError: If there are several, or a topic has a type other than the interface's.
+    `namespace` is the one that is meant where the bag has several; a BagError asks for it, or says
+    that a topic has a type other than the interface's.
     """
     names = _relative_names(bag, namespace)
     ours = {relative: name for name, relative in names.items() if relative in TOPICS}
@@ -87,9 +77,6 @@ def select(
             the interface), or relative or recorded names; these may be foreign to the interface.
         namespace: The one that is meant where the bag has several.
         keep_names: Publish under the recorded names.
-
-    Raises:
-        BagError: If nothing is left, or a wanted topic is not there or cannot be used.
     """
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.
@@ -98,20 +85,16 @@ def select(
         names = _relative_names(bag, namespace)
     has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
     if list(wanted) in ([DEFAULT], [ALL]):
-        relevant = SENT if list(wanted) == [DEFAULT] else TOPICS
+        relevant = SENT if wanted[0] == DEFAULT else TOPICS
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
             problem = f'has no topic to replay by default; {has}'
-            raise BagError(bag.path, None, problem, 'choose with --topics all or --topics NAME,…')
+            raise BagError(bag.path, problem, 'choose with --topics all or --topics NAME,…')
     else:
-        chosen = []
-        for name in wanted:
-            named = [
-                recorded for recorded, relative in names.items() if name in (recorded, relative)
-            ]
-            if not named:
-                raise BagError(bag.path, None, f'topic {name} is not in the bag', has)
-            chosen += named
+        chosen = [name for one in wanted for name in names if one in (name, names[name])]
+        for one in wanted:
+            if one not in {*names, *names.values()}:
+                raise BagError(bag.path, f'topic {one} is not in the bag', has)
     for name in chosen:
         _compare_type(bag, name, names[name])
     return {name: name if keep_names else names[name] for name in chosen}
@@ -122,22 +105,19 @@ def latched_topics(bag: Bag) -> set[str]:
 
     Those of the interface are latched even if the recorder took no note of it.
     """
-    latched = {name for name, topic in TOPICS.items() if topic.latched}
+    ours = {name for name, topic in TOPICS.items() if topic.latched}
     return {
         name
         for name, topic in bag.topics.items()
-        if 'transient_local' in topic.qos or interface_name(name) in latched
+        if 'transient_local' in topic.qos or interface_name(name) in ours
     }
 
 
 def namespaces(names: Iterable[str]) -> list[str]:
-    """Return the namespaces ('' or '/left_arm') under which the topics were recorded.
+    """Return the namespaces ('' or '/left_arm') under which topics were recorded; foreign are none.
 
     `/sim/joint_states` alone may be the joint_states of a namespace `/sim`: of the namespaces that
     explain all topics of the interface, the shortest is meant. Only if none does there are several.
-
-    Args:
-        names: The recorded absolute names; foreign ones are of no account.
     """
     readings = [
         {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
@@ -161,10 +141,8 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
         if others:
             several = ', '.join(name or '/' for name in (namespace, *others))
             problem = f'topics of the interface lie under several namespaces: {several}'
-            remedy = (
-                'choose one with --from-namespace, or keep the recorded names with --keep-names'
-            )
-            raise BagError(bag.path, None, problem, remedy)
+            remedy = 'choose one with --from-namespace, or keep all names with --keep-names'
+            raise BagError(bag.path, problem, remedy)
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
     return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}
 
@@ -174,6 +152,6 @@ def _compare_type(bag: Bag, name: str, relative: str) -> None:
     expected = TOPICS[relative].type if relative in TOPICS else topic.type
     if topic.type != expected:
         problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
-        raise BagError(bag.path, None, problem, 'rename the topic where it is recorded')
+        raise BagError(bag.path, problem, 'rename the topic where it is recorded')
     if topic.refused:
-        raise BagError(bag.path, None, f'topic {name} {topic.refused}', 'leave it out')
+        raise BagError(bag.path, f'topic {name} {topic.refused}', 'leave it out')

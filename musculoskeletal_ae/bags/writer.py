@@ -11,8 +11,8 @@ from pathlib import Path
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
-from musculoskeletal_ae.bags import message_types
-from musculoskeletal_ae.bags.metadata import Metadata, Qos, TopicCount, qos_text, write_metadata
+from musculoskeletal_ae.bags import message_types, metadata
+from musculoskeletal_ae.bags.mcap_file import NO_SCHEMA
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
@@ -27,25 +27,19 @@ class BagWriter:
     """
 
     def __init__(self, directory: Path, compression: str = 'zstd') -> None:
-        """Create the directory; one that exists must be empty.
-
-        Raises:
-            BagError: If it cannot be written to.
-        """
+        """Create the directory; one that exists must be empty, else there is a BagError."""
         self.directory = Path(directory)
         self._name = f'{self.directory.resolve().name}_0.mcap'
-        self._topics: dict[int, TopicCount] = {}
+        self._topics: dict[int, metadata.Topic] = {}
         self._schemas: dict[str, int] = {}
         self._pending: list[tuple[int, int, int, bytes]] = []
         self._pending_size = 0
         self._counts: Counter[int] = Counter()
-        self._start: int | None = None
-        self._end = 0
+        self._times: list[int] = []  # the earliest and the latest
         with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
-                remedy = 'name a new directory to record to'
-                raise BagError(self.directory, None, 'is not empty', remedy)
+                raise BagError(self.directory, 'is not empty', 'name a new directory to record to')
             self._file = (self.directory / self._name).open('xb')
             self._mcap = Writer(
                 self._file,
@@ -58,41 +52,26 @@ class BagWriter:
         self._write_metadata(finished=False)
 
     def add_topic(
-        self, name: str, type_name: str, qos: Sequence[Qos], schema: Schema | None = None
+        self, name: str, type_name: str, qos: Sequence[metadata.Qos], schema: Schema = NO_SCHEMA
     ) -> int:
-        """Add a topic and return its number.
+        """Add a topic by its absolute name and return its number.
 
-        Args:
-            name: Absolute name.
-            type_name: Its message type.
-            qos: Profiles its publishers offer.
-            schema: A definition to copy as it is, for a type that is not of ROS 2 Jazzy.
+        The schema is a definition to copy as it is, for a type that is not of ROS 2 Jazzy.
         """
-        type_hash = ''
+        encoding, text, type_hash = schema.encoding, schema.data, ''
         if message_types.known(type_name):
             type_hash = message_types.type_hash(type_name)
-            text = message_types.definition(type_name).encode()
-            schema = Schema(0, text, message_types.ENCODING, type_name)
+            encoding, text = message_types.ENCODING, message_types.definition(type_name).encode()
         if type_name not in self._schemas:
-            schema = schema or Schema(0, b'', '', type_name)
-            self._schemas[type_name] = self._mcap.register_schema(
-                schema.name, schema.encoding, schema.data
-            )
-        extra = {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': type_hash}
+            self._schemas[type_name] = self._mcap.register_schema(type_name, encoding, text)
+        extra = {'offered_qos_profiles': metadata.qos_text(qos), 'topic_type_hash': type_hash}
         number = self._mcap.register_channel(name, 'cdr', self._schemas[type_name], extra)
-        self._topics[number] = TopicCount(name, type_name, 0, qos, type_hash)
+        self._topics[number] = metadata.Topic(name, type_name, 'cdr', qos, type_hash)
         self._write_metadata(finished=False)
         return number
 
     def write(self, topic: int, log_time: int, publish_time: int, data: bytes) -> None:
-        """Add a message; it is in the file after the next `flush`.
-
-        Args:
-            topic: Number from `add_topic`.
-            log_time: When it was received [ns].
-            publish_time: When it was sent [ns].
-            data: Serialized message.
-        """
+        """Add a serialized message to a topic by number; the next `flush` puts it into the file."""
         self._pending.append((log_time, topic, publish_time, data))
         self._pending_size += len(data)
         if self._pending_size > _LARGEST_CHUNK:
@@ -107,14 +86,15 @@ class BagWriter:
             for log_time, topic, publish_time, data in pending:
                 self._mcap.add_message(topic, log_time, data, publish_time)
                 self._counts[topic] += 1
-                self._start = min(log_time, log_time if self._start is None else self._start)
-                self._end = max(log_time, self._end)
             self._mcap.flush()
+        if pending:
+            times = [*self._times, pending[0][0], pending[-1][0]]
+            self._times = [min(times), max(times)]
 
     @property
     def message_count(self) -> int:
         """Messages in the file."""
-        return sum(self._counts.values())
+        return self._counts.total()
 
     def close(self) -> None:
         """End the file and its metadata.yaml."""
@@ -136,14 +116,10 @@ class BagWriter:
 
     def _write_metadata(self, finished: bool) -> None:
         # Counts come with the end: until then readers go by what is in the mcap file.
-        topics, start, duration = list(self._topics.values()), None, 0
-        if finished and self._start is not None:
-            start, duration = self._start, self._end - self._start
-            topics = [t._replace(message_count=self._counts[n]) for n, t in self._topics.items()]
+        counts, times = (self._counts, self._times) if finished else (Counter[int](), [])
+        topics = [metadata.TopicCount(topic, counts[n]) for n, topic in self._topics.items()]
         with self._writing():
-            write_metadata(
-                self.directory, Metadata([self._name], topics, start, duration, finished)
-            )
+            metadata.write_metadata(self.directory, self._name, topics, times, finished)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -151,4 +127,4 @@ class BagWriter:
             yield
         except OSError as error:
             problem = f'cannot be written: {error.strerror or error}'
-            raise BagError(self.directory, None, problem, 'name another place') from error
+            raise BagError(self.directory, problem, 'name another place') from error

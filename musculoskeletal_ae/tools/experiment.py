@@ -18,7 +18,7 @@ from musculoskeletal_ae.experiments.report import write_report
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run, total_weight
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.experiments.table import update_readme
-from musculoskeletal_ae.options import Parser, exit_status, seeds, whole
+from musculoskeletal_ae.options import Parser, exit_status, whole
 from musculoskeletal_ae.robot.robot import Robot
 
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
@@ -39,8 +39,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))
     parser.add_robot()
     parser.add_preset('networks to measure; preset paper is always shown beside them')
-    text = 'individual arms (default: 0,1,2,3,4; quick: 0)'
-    parser.add_argument('--seeds', type=seeds, metavar='N,…', help=text)
+    parser.add_seeds(None, 'individual arms (default: 0,1,2,3,4; quick: 0)')
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
     parser.add_quick('a taste of everything, in a minute')
     parser.add_out('DIR', 'results and report', Path('experiments'))

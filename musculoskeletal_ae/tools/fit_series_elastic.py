@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 from argparse import Namespace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -29,20 +30,14 @@ def main(argv: list[str] | None = None) -> int:
         'Fits the elongation L_e(l_abs, T) of a muscle to a testbed table and prints the constants '
         'as a line for muscles.yaml.',
     )
-    parser.add_argument(
-        'table', type=Path, help=f'CSV with the columns {", ".join(COLUMNS)} [N, m, m]'
-    )
+    text = f'CSV with the columns {", ".join(COLUMNS)} [N, m, m]'
+    parser.add_argument('table', type=Path, help=text)
     parser.add_plot('picture of table and fit', 'fit_<table>.png')
-    parser.add_argument(
-        '--make-example',
-        action='store_true',
-        help='write a synthetic table to TABLE instead (never over an existing file)',
-    )
+    text = 'write a synthetic table to TABLE instead (never over an existing file)'
+    parser.add_argument('--make-example', action='store_true', help=text)
     parser.add_seed('of the example noise')
     args = parser.parse_args(argv)
-    if args.make_example:
-        return exit_status(lambda: write_example(args.table, args.seed))
-    return exit_status(lambda: fit(args))
+    return exit_status(lambda: (write_example if args.make_example else fit)(args))
 
 
 def fit(args: Namespace) -> None:
@@ -59,8 +54,8 @@ def fit(args: Namespace) -> None:
         f'series_elastic: {{force: {force:.2f}, rate: {rate:.3f}, wire_stretch: {stretch:.4e}}}\n'
         f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
     )
-    name = f'fit_{args.table.stem}.png'
-    save_plot(args, name, lambda file: plot(table, constants, residual, file))
+    picture = None if args.no_plot else args.plot or Path(f'fit_{args.table.stem}.png')
+    save_plot(picture, lambda file: plot(table, constants, residual, file))
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
@@ -88,11 +83,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
 
 
 def read_table(file: Path) -> Array:
-    """Read a testbed table: rows (tension [N], absolute length [m], elongation [m]), (N, 3).
-
-    Raises:
-        RobotDescriptionError: Naming the file and the row.
-    """
+    """Read a testbed table: rows (tension [N], absolute length [m], elongation [m]), (N, 3)."""
     rows = []
     for number, line, cells in read_csv(file, COLUMNS, _refusal):
         try:
@@ -112,8 +103,9 @@ def _refusal(file: Path, problem: str) -> RobotDescriptionError:
     return RobotDescriptionError(f'{file}: {problem}')
 
 
-def write_example(file: Path, seed: int) -> None:
+def write_example(args: Namespace) -> None:
     """Write a synthetic table: the package's default constants and measurement noise."""
+    file, seed = args.table, args.seed
     true = SeriesElastic(*np.array(list(DEFAULT.values()))[:, None])
     rng = np.random.default_rng(seed)
     head = (
@@ -124,11 +116,10 @@ def write_example(file: Path, seed: int) -> None:
     )
     with file.open('x', encoding='utf-8') as stream:
         print(head, ','.join(COLUMNS), sep='\n', file=stream)
-        for length in EXAMPLE_LENGTHS:
-            for tension in EXAMPLE_TENSIONS:
-                exact = true.elongation(np.array([length]), np.array([tension]))[0]
-                measured = exact + EXAMPLE_NOISE * rng.standard_normal()
-                print(f'{tension:g},{length:g},{measured:.5f}', file=stream)
+        for length, tension in product(EXAMPLE_LENGTHS, EXAMPLE_TENSIONS):
+            exact = true.elongation(np.array([length]), np.array([tension]))[0]
+            measured = exact + EXAMPLE_NOISE * rng.standard_normal()
+            print(f'{tension:g},{length:g},{measured:.5f}', file=stream)
     print(f'wrote {file}')
 
 

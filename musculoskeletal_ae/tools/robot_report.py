@@ -28,7 +28,8 @@ def check(args: Namespace) -> int:
     if not args.quiet:
         print(summary(robot, result, args.seed))
         print(moment_arm_table(robot, result))
-    save_plot(args, f'check_{name}.png', lambda file: plot(robot, result, file))
+    picture = None if args.no_plot else args.plot or Path(f'check_{name}.png')
+    save_plot(picture, lambda file: plot(robot, result, file))
     for warning in result.warnings:
         print(f'warning: {warning.message}; {warning.remedy}')
     for fault in result.faults:
@@ -104,9 +105,8 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     for panel, name, angle, of_joint in zip(axes, robot.joints, result.postures.T, arms):
         for m, muscle in enumerate(robot.muscles):
             if np.abs(of_joint[m]).max() >= 1e3 * MATTERS:
-                panel.scatter(
-                    np.rad2deg(angle), of_joint[m], color=f'C{m % 10}', label=muscle, **dots
-                )
+                look = dots | {'color': f'C{m % 10}', 'label': muscle}
+                panel.scatter(np.rad2deg(angle), of_joint[m], **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
         panel.set(title=name, xlabel='joint angle [deg]', ylabel='moment arm −G [mm]')
         if panel.collections:

@@ -3,16 +3,15 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from musculoskeletal_ae import options
-from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import (
@@ -24,12 +23,12 @@ from musculoskeletal_ae.mae.training import (
     random_states,
 )
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.options import Parser, exit_status, save_plot
 from musculoskeletal_ae.presets import PRESETS
-from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 
-UNSEEN = 5000
+UNSEEN = 5000  # states
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',
@@ -40,19 +39,42 @@ SYMBOLS = {'theta': 'θ', 'tension': 'T', 'length': 'l'}
 
 def main(argv: list[str] | None = None) -> int:
     """Train one network; exit status 1 if the robot or a file is not usable, 2 for bad options."""
-    args = _parse(argv)
-    for file in (args.out, args.plot):
-        if file is not None and (not file.parent.is_dir() or file.is_dir()):
-            print(f'error: {file}: is a directory, or in one that is not there', file=sys.stderr)
-            return 1
-    try:
-        robot = Robot.load(args.robot)
-    except RobotDescriptionError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
+    parser = Parser(
+        'train',
+        'Trains the Musculoskeletal AutoEncoder on the geometric model of a robot and writes a '
+        'checkpoint. Prints the error of each of the nine (mask, output) pairs on unseen data. '
+        'Exit status 1: the robot or a file is not usable, 2: bad options.',
+    )
+    parser.add_robot(default=None)
+    parser.add_out('FILE.safetensors', 'the checkpoint')
+    parser.add_preset('paper: network and training as printed; default: the best measured')
+    parser.add_seed('of data and weights')
+    parser.add_argument('--plot', type=Path, metavar='FILE.png', help='loss and errors')
+    for flag, text in (
+        ('--from-bag', 'learn the real arm from recordings: bag directories or .mcap files'),
+        ('--hold-out', 'with --from-bag: recordings that are only judged, before and after'),
+    ):
+        parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
+    parser.add_checkpoint(
+        'with --from-bag: network to start from (default: train one on the geometric model)'
+    )
+    parser.add_quick('a tenth of the training, to try things out')
+    args = parser.parse_args(argv)
+    if not args.from_bag and (args.hold_out or args.checkpoint):
+        parser.error('--hold-out and --checkpoint go with --from-bag')
+    return exit_status(lambda: _train(args))
+
+
+def _train(args: Namespace) -> None:
+    for file in filter(None, (args.out, args.plot)):
+        if not file.parent.is_dir() or file.is_dir():
+            raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
+    robot = Robot.load(args.robot)
+    steps = PRESETS[args.preset].training.steps // (10 if args.quick else 1)
     if args.from_bag:
-        return _from_bags(robot, args)
-    steps = _steps(args)
+        checkpoint.save(_learned(robot, args, steps).mae, args.out)
+        print(f'checkpoint: {args.out}')
+        return
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
 
@@ -62,143 +84,59 @@ def main(argv: list[str] | None = None) -> int:
                 bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
 
         trained = initial_mae(robot, args.preset, args.seed, progress, steps)
-    seconds = time.perf_counter() - start
-    tension = robot.tension
+    print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
     # Not the stream of the training, so none of these states has been seen.
     rng = np.random.default_rng([args.seed, 2])
-    planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, tension.limit))
-    overload = pair_errors(
-        trained.mae, random_states(robot, UNSEEN, rng, tension.max, tension.limit)
-    )
-    print(f'{trained.mae.training}; {seconds:.1f} s')
-    print(table(planned, f'{UNSEEN} unseen states, T in [0, {tension.limit:g}] N'))
-    if tension.max > tension.limit:
-        beyond = f'the same, T in [{tension.limit:g}, {tension.max:g}] N (overload)'
-        print(table(overload, beyond))
+    limit, most = robot.tension.limit, robot.tension.max
+    planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, limit))
+    print(table(planned, f'{UNSEEN} unseen states, T in [0, {limit:g}] N'))
+    if most > limit:
+        overload = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, most, limit))
+        print(table(overload, f'the same, T in [{limit:g}, {most:g}] N (overload)'))
     print(joint_table(robot, planned))
-    try:
-        checkpoint.save(trained.mae, args.out)
-        print(f'checkpoint: {args.out}')
-        if args.plot is not None:
-            plot(robot, trained, planned, args.plot)
-            print(f'plot: {args.plot}')
-    except (OSError, ValueError) as error:
-        print(f'error: cannot be written: {error}', file=sys.stderr)
-        return 1
-    return 0
-
-
-def _steps(args: argparse.Namespace) -> int:
-    return PRESETS[args.preset].training.steps // (10 if args.quick else 1)
-
-
-def _from_bags(robot: Robot, args: argparse.Namespace) -> int:
-    try:
-        # Before the network is trained, which takes longer than finding a bag unusable.
-        recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
-        if args.checkpoint is not None:
-            mae = checkpoint.load(args.checkpoint, robot)
-        else:
-            print(f'training the network of {robot.description.directory.name} to start from')
-            mae = initial_mae(robot, args.preset, args.seed, steps=_steps(args)).mae
-        learner = Learner(robot, mae, args.preset, args.seed)
-        train_from_bags(learner, recordings, args.hold_out)
-        checkpoint.save(learner.mae, args.out)
-    except (MusculoskeletalError, OSError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
+    checkpoint.save(trained.mae, args.out)
     print(f'checkpoint: {args.out}')
-    return 0
+    save_plot(args.plot, lambda file: plot(robot, trained, planned, file))
 
 
-def _parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog='train',
-        description='Trains the Musculoskeletal AutoEncoder on the geometric model of a robot and '
-        'writes a checkpoint. Prints the error of each of the nine (mask, output) pairs on '
-        'unseen data. Exit status 1: the robot or a file is not usable, 2: bad options.',
-    )
-    names = ', '.join(sorted(shipped_robots()))
-    parser.add_argument(
-        '--robot', required=True, metavar='NAME|DIR', help=f'a directory, or one of: {names}'
-    )
-    parser.add_argument(
-        '--out', required=True, type=Path, metavar='FILE.safetensors', help='the checkpoint'
-    )
-    parser.add_argument(
-        '--preset',
-        choices=tuple(PRESETS),
-        default='default',
-        help='paper: network and training as printed; default: the best measured (default)',
-    )
-    parser.add_argument('--seed', type=options.seed, default=0, help='of data and weights (0)')
-    parser.add_argument('--plot', type=Path, metavar='FILE.png', help='loss and errors')
-    parser.add_argument(
-        '--from-bag',
-        nargs='+',
-        type=Path,
-        default=[],
-        metavar='BAG',
-        help='learn the real arm from recordings: bag directories or .mcap files',
-    )
-    parser.add_argument(
-        '--hold-out',
-        nargs='+',
-        type=Path,
-        default=[],
-        metavar='BAG',
-        help='with --from-bag: recordings that are only judged, before and after',
-    )
-    parser.add_argument(
-        '--checkpoint',
-        type=Path,
-        metavar='FILE',
-        help='with --from-bag: network to start from (default: train one on the geometric model)',
-    )
-    parser.add_argument(
-        '--quick', action='store_true', help='a tenth of the training, to try things out'
-    )
-    args = parser.parse_args(argv)
-    if not args.from_bag and (args.hold_out or args.checkpoint):
-        parser.error('--hold-out and --checkpoint go with --from-bag')
-    return args
+def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
+    # Read before the network is trained, which takes longer than finding a bag unusable.
+    recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
+    if args.checkpoint:
+        mae = checkpoint.load(args.checkpoint, robot)
+    else:
+        print(f'training the network of {robot.description.directory.name} to start from')
+        mae = initial_mae(robot, args.preset, args.seed, steps=steps).mae
+    learner = Learner(robot, mae, args.preset, args.seed)
+    train_from_bags(learner, recordings, args.hold_out)
+    return learner
 
 
 def table(errors: list[PairError], title: str) -> str:
     """Return the nine errors: mean norm of the error vector and mean |error| of an element."""
-    lines = ['', title, f'{"entered by":<12}' + ''.join(f'{_head(o):>26}' for o in OUTPUTS)]
+    heads = [f'{SYMBOLS[output]} [{unit}] norm (each)' for output, unit, _ in OUTPUTS]
+    lines = ['', title, f'{"entered by":<12}' + ''.join(head.rjust(26) for head in heads)]
     for mask, name in ENTERED.items():
-        row = [e for e in errors if e.mask is mask]
-        cells = [f'{e.norm:.4f} ({e.elements.mean():.4f})' for e in row]
+        cells = [f'{e.norm:.4f} ({e.elements.mean():.4f})' for e in errors if e.mask is mask]
         lines.append(f'{name:<12}' + ''.join(cell.rjust(26) for cell in cells))
     return '\n'.join(lines)
 
 
-def _head(output: tuple[str, str, float]) -> str:
-    return f'{SYMBOLS[output[0]]} [{output[1]}] norm (each)'
-
-
-def _estimate(errors: list[PairError]) -> PairError:
-    found = [e for e in errors if e.mask is Mask.TENSION_LENGTH and e.output == 'theta']
-    return found[0]
-
-
 def joint_table(robot: Robot, errors: list[PairError]) -> str:
     """Return the mean absolute error of every joint estimated from (T, l)."""
-    rows = zip(robot.joints, _estimate(errors).elements)
+    estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
+    rows = zip(robot.joints, estimates['theta'])
     lines = [f'{name:<{width}}{error:.4f} rad' for name, error in rows]
     return '\n'.join(['', '② → θ, mean |error| of each joint', *lines, ''])
 
 
 def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) -> None:
     """Draw the loss, the nine errors and every joint's and muscle's error."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(13.0, 8.5), layout='constrained')
-    FigureCanvasAgg(figure)
     figure.suptitle(trained.mae.training)
     curve, text, joints, tensions, lengths = figure.subplot_mosaic(
         [['loss', 'loss', 'loss', 'table', 'table', 'table'],
@@ -224,15 +162,12 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) ->
         cellLoc='center',
     )
     shown.scale(0.8, 2.2)
-    colours = {mask: f'C{i}' for i, mask in enumerate(Mask)}
-    bars = (joints, 'joint'), (tensions, 'muscle'), (lengths, 'muscle')
-    for (axes, one), (output, unit, _) in zip(bars, OUTPUTS):
-        names = robot.joints if one == 'joint' else robot.muscles
+    for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
+        one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
         place = np.arange(len(names))
         for i, error in enumerate(e for e in errors if e.output == output):
             label = f'from {ENTERED[error.mask]}'
-            colour = colours[error.mask]
-            axes.barh(place + 0.27 * (i - 1), error.elements, 0.27, label=label, color=colour)
+            axes.barh(place + 0.27 * (i - 1), error.elements, 0.27, label=label, color=f'C{i}')
         axes.set_yticks(place, names, fontsize=8)
         axes.invert_yaxis()
         axes.set(xlabel=f'mean |error| [{unit}]', title=f'{SYMBOLS[output]} of each {one}')

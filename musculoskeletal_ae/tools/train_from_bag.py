@@ -20,11 +20,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def read(path: Path, robot: Robot) -> Pairs:
-    """Return the paired messages of a bag; says what was left out.
-
-    Raises:
-        BagError: If it is damaged, or holds no θ and (T, l) that belong together.
-    """
+    """Return the paired messages of a bag, at least one, and say what was left out."""
     bag = Bag.open(path, unfinished=True)
     for reason in bag.unfinished:
         print(f'warning: {path}: unfinished: {reason}', file=sys.stderr)
@@ -34,7 +30,7 @@ def read(path: Path, robot: Robot) -> Pairs:
     pairs = streams.pairs()
     if not len(pairs.time):
         problem = 'holds no joint_states and muscle_states that belong together'
-        raise BagError(path, None, problem, 'record both topics of this robot')
+        raise BagError(path, problem, 'record both topics of this robot')
     return pairs
 
 
@@ -43,19 +39,15 @@ def learn(
 ) -> None:
     """Feed a recording to a learner, message by message, as if the arm were moving now.
 
-    Args:
-        learner: Is taught.
-        recording: θ, T, l in the order of time.
-        progress: Told the recorded seconds that have passed since it was last told.
+    `progress` is told the recorded seconds that have passed since it was last told.
     """
     detector = AnomalyDetector(learner.robot)
     mae = learner.mae
     detector.use(mae)
     learner.reset()
     learner.anomaly(False)
-    before = recording.time[0] if len(recording.time) else 0.0
-    for time, theta, length, tension in zip(*recording, strict=True):
-        dt, before = time - before, time
+    steps = np.diff(recording.time, prepend=recording.time[:1])
+    for dt, time, theta, length, tension in zip(steps, *recording, strict=True):
         # The estimator gates live learning; here its detector does the same.
         verdict = detector.step(mae.estimate(tension, length), tension, length, dt)
         if verdict.cause:
@@ -75,20 +67,13 @@ def error(mae: Mae, recording: Pairs) -> float:
 
 
 def train_from_bags(learner: Learner, recordings: dict[Path, Pairs], held_out: list[Path]) -> None:
-    """Learn from recordings in their order; print errors before and after.
-
-    Args:
-        learner: Starts from its network.
-        recordings: As `read` gives them, by path.
-        held_out: Those that are only judged.
-    """
+    """Learn from recordings in their order, those held out judged only; print errors."""
     before = {path: error(learner.mae, pairs) for path, pairs in recordings.items()}
-    for path in recordings:
-        if path in held_out:
-            continue
-        seconds = recordings[path].time[-1] - recordings[path].time[0]
-        with tqdm(total=round(seconds, 1), unit=' s', desc=path.name, disable=None) as bar:
-            learn(learner, recordings[path], bar.update)
+    for path, pairs in recordings.items():
+        if path not in held_out:
+            total = round(pairs.time[-1] - pairs.time[0], 1)
+            with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
+                learn(learner, pairs, bar.update)
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
         kind = 'held out' if path in held_out else 'learned from'

@@ -123,7 +123,7 @@ def test_huge_claimed_sizes_are_refused_without_taking_memory(compression, tmp_p
     chunk = data.index(b'\x06', 8 + 9)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for at, problem in (
-        (chunk + 1, 'exceeds limit'),
+        (chunk + 1, 'exceeds the limit'),
         (chunk + 9 + 16, 'bytes when decompressed'),
     ):
         for huge in (1 << 40, (1 << 64) - 1):

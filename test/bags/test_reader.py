@@ -46,14 +46,13 @@ def test_topics_and_times_can_be_chosen(bag, content):
 def bytes_read(monkeypatch):
     """Count the bytes that are read from files and decompressed chunks."""
     total = [0]
-    original = mcap_file._Source.read
 
-    def read(source, count):
-        data = original(source, count)
-        total[0] += len(data)
-        return data
+    class Record(mcap_file._Record):
+        def __init__(self, data):
+            total[0] += len(data)
+            super().__init__(data)
 
-    monkeypatch.setattr(mcap_file._Source, 'read', read)
+    monkeypatch.setattr(mcap_file, '_Record', Record)
     return total
 
 
@@ -92,7 +91,7 @@ def test_the_fuzzer_starts_from_bags_that_are_read_in_full(tmp_path, content):
 
 
 def test_what_does_not_exist_is_named_so(tmp_path):
-    with pytest.raises(BagError, match='nothing: does not exist'):
+    with pytest.raises(BagError, match=r'nothing: cannot be read: No such file .*name another bag'):
         Bag.open(tmp_path / 'nothing')
     with pytest.raises(BagError, match=r'neither metadata.yaml nor an mcap file'):
         Bag.open(tmp_path)

@@ -50,7 +50,7 @@ def test_theta_is_paired_with_the_nearest_muscle_state(arm, robot, tmp_path):
 @pytest.mark.parametrize(('late', 'paired'), [(0.0049, 20), (0.006, 19), (0.051, 15)])
 def test_pairs_are_no_further_apart_than_half_a_period(late, paired, robot, tmp_path):
     found = streams(Arm(robot, count=20, late=late), robot, tmp_path)
-    pairs = found.pairs(0.01)
+    pairs = found.pairs()
     assert len(pairs.time) == paired
     nearest = np.abs(found.joints.time[:, None] - pairs.time).min(axis=0)
     assert (nearest <= 0.005).all()

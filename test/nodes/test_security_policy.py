@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rights in config/security_policy.xml are those that the running nodes use."""
+
+from __future__ import annotations
+
+import importlib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+POLICY = Path(__file__).parents[2] / 'config' / 'security_policy.xml'
+NODES = ['controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
+
+
+def rights(node: str, kind: str, action: str) -> set[str]:
+    path = f".//profile[@node='{node}']/{kind}[@{action}='ALLOW']/*"
+    return {entry.text for entry in ET.parse(POLICY).findall(path)}
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_a_node_uses_the_rights_that_the_policy_gives_it(graph, name, tmp_path):
+    module = importlib.import_module(f'musculoskeletal_ae.nodes.{name}')
+    kind = getattr(module, ''.join(word.title() for word in name.split('_')))
+    extra = {'state_directory': str(tmp_path)} if name == 'learner' else {}
+    node = graph.host(kind, robot='arm26', **extra)
+    private = f'{graph.namespace}/{name}/'
+
+    def names(entries):
+        return {
+            entry.replace(private, '~/').replace(f'{graph.namespace}/', '') for entry, _ in entries
+        }
+
+    own = name, graph.namespace
+    used = names(node.get_publisher_names_and_types_by_node(*own))
+    allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'publish')}
+    assert used == allowed
+    used = names(node.get_subscriber_names_and_types_by_node(*own))
+    allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'subscribe')}
+    # /clock only where time comes from there; the vision's topic only where joint_source says so.
+    assert allowed - {'/clock', 'vision_joint_states'} <= used <= allowed
+    used = names(node.get_service_names_and_types_by_node(*own))
+    assert used == rights(name, 'services', 'reply')
+
+
+def test_commands_checkpoints_and_targets_have_one_source():
+    for topic, source in (
+        ('muscle_length_command', 'controller'),
+        ('muscle_tension_command', 'controller'),
+        ('mae_checkpoint', 'learner'),
+        ('target_joint_states', 'operator'),
+    ):
+        allowed = [n for n in (*NODES, 'operator') if topic in rights(n, 'topics', 'publish')]
+        assert allowed == [source]
