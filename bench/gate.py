@@ -4,9 +4,9 @@
     python -m bench gate [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 10]
 
 For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
-minute; every checkpoint that it publishes passes a gate that sees the arm's messages as a node does.
-Printed are the largest of every measure over all of them, beside its limit; what was refused (none
-may be); and of the initial networks and the last learned ones under each attack, what the gate says.
+minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
+Printed are the largest of every measure over all of them beside its limit, what was refused (none
+may be), and how many of the initial and the last learned networks are refused under each attack.
 
 Exit status 1 if a healthy network was refused, or an attack was not.
 """
@@ -73,7 +73,7 @@ def _swap(weight: Array, bias: Array, rows: Array) -> None:
     weight[rows], bias[rows] = weight[rows[::-1]], bias[rows[::-1]]
 
 
-def _flip(weight: Array, bias: Array, rows: Array) -> None:
+def _flip(weight: Array, _: Array, rows: Array) -> None:
     weight[rows[0]] *= -1.0
 
 
@@ -184,7 +184,9 @@ def limit(name: str) -> float:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure, attack and print."""
-    parser = Parser('gate', "Prints healthy networks' distance from the gate's limits, and attacks.")
+    parser = Parser(
+        'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
+    )
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_minutes('duration of learning', 10.0)

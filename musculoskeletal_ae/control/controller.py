@@ -76,6 +76,7 @@ class Controller:
         self._exploration = Exploration(robot, seed)
         self._plausibility = Plausibility(robot)
         self._temperatures: deque[Array] = deque(maxlen=5)
+        self._warm: Array | None = None  # their median [°C], (M,)
         self._estimate: Array | None = None
         self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
         self._time = math.nan
@@ -119,13 +120,12 @@ class Controller:
         """
         length, tension, temperature = muscles
         self._plausibility.check_muscles(tension, length, temperature, now)
-        self._muscles_at = now - self._asleep
-        self.safety.muscles(muscles)
+        self._muscles_at = awake = now - self._asleep
         self._temperatures.append(temperature)
-        tension, limits = self.safety.now.tension, self._robot.tension
-        halfway = 0.5 * (limits.limit + limits.max)
-        over = tension > np.array([[limits.limit], [halfway]])
-        self._tense_since = np.where(over, np.minimum(self._tense_since, now), math.inf)
+        self._warm = np.median(np.array(self._temperatures), axis=0)
+        pull, limits = self.safety.muscles(muscles).tension, self._robot.tension
+        over = pull > np.array([[limits.limit], [0.5 * (limits.limit + limits.max)]])
+        self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated_joint_states [rad], shape (D,).
@@ -215,15 +215,15 @@ class Controller:
         for since, allowed, most in zip(
             self._tense_since, longest, (limits.limit, 0.5 * (limits.limit + limits.max))
         ):
-            if now - since.min() > allowed:
+            if now - self._asleep - since.min() > allowed:
                 name = self._robot.muscles[int(since.argmin())]
                 return f'{name}: tension above {most:g} N for {allowed:g} s'
         return ''
 
     def _overheat(self) -> str:
-        if not self._temperatures:
+        if self._warm is None:
             return ''
-        now, bias = np.median(self._temperatures, axis=0), self._robot.tension.bias
+        now, bias = self._warm, self._robot.tension.bias
         highest = self.settings.temperature_limit
         hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
         self._overheated = bool(hot or (self.limit <= bias).all())
@@ -298,13 +298,8 @@ class Controller:
         self._fresh = 0.0 if cause else self._fresh + awake
         if self.safety.passing and self._fresh > RESUME:
             self.safety.cause, self.safety.passing, self._starts = '', False, True
+        self._limit_by_heat(dt)
         desired = None
-        highest = self.settings.temperature_limit
-        if self._temperatures:
-            warm = np.median(self._temperatures, axis=0)
-            limit = safety.thermal_limit(self._robot, warm, highest)
-            fall = self.safety.most_change(TENSION, dt)
-            self.limit = np.maximum(limit, self.limit - fall)
         if not cause and not self.safety.cause:
             try:
                 desired = self._command(dt)
@@ -316,6 +311,12 @@ class Controller:
         if self.safety.cause and not self.safety.passing:
             self.explore(False)
         return command
+
+    def _limit_by_heat(self, dt: float) -> None:
+        """Let no limit fall faster than the rate limit pays out."""
+        if self._warm is not None:
+            limit = safety.thermal_limit(self._robot, self._warm, self.settings.temperature_limit)
+            self.limit = np.maximum(limit, self.limit - self.safety.most_change(TENSION, dt))
 
     def _elapsed(self, now: float, time: float) -> tuple[float, float]:
         """Return how long this step is on the messages' clock, and on the steady one [s]."""

@@ -83,10 +83,11 @@ class SafetyFilter:
         postures = robot.random_postures(200, np.random.default_rng(0))
         self._longest = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
 
-    def muscles(self, muscles: Muscles) -> None:
-        """Take new muscle_states."""
+    def muscles(self, muscles: Muscles) -> Muscles:
+        """Take new muscle_states; return the medians of the last three."""
         self._readings.append(muscles)
-        self.now = Muscles(*(np.median(reading, axis=0) for reading in zip(*self._readings)))
+        self.now = Muscles(*np.median(np.array(self._readings), axis=0))
+        return self.now
 
     def stop(self, cause: str, passing: bool = False) -> None:
         """Latch a stop, or one that may pass; the first cause is kept, if it latched."""

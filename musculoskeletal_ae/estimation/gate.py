@@ -29,7 +29,7 @@ from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import residuals
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
+from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 64
@@ -40,9 +40,16 @@ NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already
 
 #: largest share left unexplained of the fixed postures
 LIMITS = {
-    **{'θ by ①': 0.35, 'T by ①': 1.6, 'l by ①': 1.3},
-    **{'θ by ②': 1.0, 'T by ②': 1.6, 'l by ②': 1.1},
-    **{'θ by ③': 0.35, 'T by ③': 6.0, 'l by ③': 0.35, 'G by ①': 1.3},
+    'θ by ①': 0.35,
+    'T by ①': 1.6,
+    'l by ①': 1.3,
+    'θ by ②': 1.0,
+    'T by ②': 1.6,
+    'l by ②': 1.1,
+    'θ by ③': 0.35,
+    'T by ③': 6.0,
+    'l by ③': 0.35,
+    'G by ①': 1.3,
 }
 WORSE = 2.0
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
@@ -120,7 +127,9 @@ class Gate:
                 spread = np.maximum(true.std(axis=0), 1e-9)
                 errors[f'{name} by {sign}'] = _size(value - true) / spread
         off = mae.muscle_jacobian(*self._postures[:2]) - self._jacobian
-        by_muscle = (part.swapaxes(1, 2).reshape(-1, off.shape[1]) for part in (off, self._jacobian))
+        by_muscle = (
+            part.swapaxes(1, 2).reshape(-1, off.shape[1]) for part in (off, self._jacobian)
+        )
         error, size = map(_size, by_muscle)
         return errors | {'G by ①': error / np.maximum(size, 1e-9)}
 

@@ -58,9 +58,7 @@ class Estimator(Shell):
         self.core.commanded_tension(command, time.monotonic())
 
     def _estimate(self, message: Float64MultiArray) -> None:
-        length, tension, temperature = read_array(
-            message, len(QUANTITIES), self.robot.muscle_count
-        )
+        length, tension, temperature = read_array(message, len(QUANTITIES), self.robot.muscle_count)
         clock, now = self.get_clock().now(), time.monotonic()
         self.plausibility.check_muscles(tension, length, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)

@@ -129,7 +129,6 @@ class Shell(Node):
             use: Takes a checked network.
             unfit: Is told why one that came by topic cannot be used; the one in use stays.
         """
-
         gate = self.gate = Gate(self.robot)
 
         def take(mae: Mae) -> None:

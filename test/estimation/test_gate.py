@@ -14,6 +14,7 @@ from musculoskeletal_ae.estimation.gate import LIMITS, NOTICED, PROOF, Gate
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.training import Update
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -67,7 +68,7 @@ def test_what_the_geometric_model_cannot_tell_is_refused_on_own_messages(trained
     bad = ON_MESSAGES[attack](mae)
     gate.check(bad)
     seeing(gate)
-    with pytest.raises(GateError, match='own messages|muscle cut'):
+    with pytest.raises(GateError, match=r'own messages|muscle cut'):
         gate.check(bad)
 
 
@@ -114,21 +115,14 @@ def test_a_learner_publishes_no_network_that_the_gate_refuses_and_goes_back_on_a
     good = learner.poll(0.0)
     with pytest.raises(GateError):
         learner.replace(ATTACKS['weights × 1.5'](trained['default']))
-    update = replace_mae(learner, ATTACKS['weights × 1.5'](trained['default']))
+    update = Update(ATTACKS['weights × 1.5'](trained['default']), 0.0, 0.0, np.zeros(0))
     learner._take(update)
     assert learner.poll(10.0) is None
     assert learner.refused == 1
     assert 'limit' in learner.report().values['last refused']
     assert learner.checkpoint == good
-    learner._take(replace_mae(learner, trained['paper']))
+    learner._take(Update(trained['paper'], 0.0, 0.0, np.zeros(0)))
     assert learner.poll(20.0) is not None
     learner.anomaly(True)
     assert learner.poll(30.0) is not None
     np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
-
-
-def replace_mae(learner, mae):
-    """Return an update that brings a network."""
-    from musculoskeletal_ae.learning.training import Update
-
-    return Update(mae, 0.0, 0.0, np.zeros(0))
