@@ -31,7 +31,8 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
-from musculoskeletal_ae.learning.learner import STEPS, Learner
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.training import Job, Training
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae

@@ -23,8 +23,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
-from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import fit_body
+from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae

@@ -4,18 +4,16 @@
 from __future__ import annotations
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_array
 
 RATE_LIMIT = 0.2  # [m/s]
-LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 NODES = {
     'hardware_emulator': HardwareEmulator,
     'estimator': Estimator,
@@ -99,13 +97,7 @@ class ControlledArm:
         """Return what a node says of itself: the controller now, others once a second."""
         if node == 'controller' and node not in self.processes:
             return self.controller.report()
-        name = f'{self.graph.namespace}/{node}: state'
-        for message in reversed(self.graph.received['/diagnostics']):
-            for status in message.status:
-                if status.name == name:
-                    values = {pair.key: pair.value for pair in status.values}
-                    return Report(LEVELS[status.level], status.message, values)
-        return Report('warn', 'not heard of', {})
+        return self.graph.report(node)
 
     def said(self, key):
         """Return a value of the controller's diagnostics, once it is there."""

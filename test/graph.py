@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
@@ -21,7 +22,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from musculoskeletal_ae.report import Report
+
 DEADLINE = 60.0  # [s] a wait may take on a loaded machine before the test fails
+LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 
 def executable(name: str) -> list[str]:
@@ -140,6 +144,16 @@ class Graph:
         wanted = len(messages) + count
         self.wait(lambda: len(messages) >= wanted, f'{count} messages on {topic}')
         return messages[-1]
+
+    def report(self, node: str) -> Report:
+        """Return what a node of this namespace said last on /diagnostics, which is listened to."""
+        name = f'{self.namespace}/{node}: state'
+        for message in reversed(self.received['/diagnostics']):
+            for status in message.status:
+                if status.name == name:
+                    values = {pair.key: pair.value for pair in status.values}
+                    return Report(LEVELS[status.level], status.message, values)
+        return Report('warn', 'not heard of', {})
 
     def call(self, kind: type, service: str, request: Any = None) -> Any:
         """Call a service and return its response."""

@@ -34,26 +34,18 @@ DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
 
 
 class Verdict(NamedTuple):
-    """What one message says.
+    """What one message says."""
 
-    Attributes:
-        anomaly: A, scaled units.
-        distance: d, in healthy standard deviations; NaN without statistics.
-        suspect: Index of the most suspect muscle.
-        cause: Why this message completes a detection, or ''.
-    """
-
-    anomaly: float
-    distance: float
-    suspect: int
-    cause: str
+    anomaly: float  # A, scaled units
+    distance: float  # d, in healthy standard deviations; NaN without statistics
+    suspect: int  # index of the most suspect muscle
+    cause: str  # why this message completes a detection, or ''
 
 
 class AnomalyDetector:
     """Decides message by message; keeps only its counters. The caller latches.
 
-    Attributes:
-        threshold: A beyond which an anomaly is detected, 0 for the calibrated detector.
+    A beyond the threshold is an anomaly; with threshold 0 the calibrated detector decides.
     """
 
     def __init__(self, robot: Robot, threshold: float = 0.0) -> None:
@@ -61,19 +53,16 @@ class AnomalyDetector:
         self._robot = robot
         self.threshold = threshold
         self._statistics: AnomalyStatistics | None = None
-        self._whiten: Array | None = None
-        self._demand: Array | None = None
-        self._command: Array | None = None
-        self._torn = np.zeros(robot.muscle_count)
+        self._torn = np.zeros(robot.muscle_count)  # [s]
         self._beyond = 0
+        self.commanded()
 
     def use(self, mae: Mae) -> None:
         """Take the healthy statistics of a checkpoint."""
-        whiten = None
         if mae.anomaly is not None:
-            whiten = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
+            self._whiten: Array = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
             self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
-        self._statistics, self._whiten = mae.anomaly, whiten
+        self._statistics = mae.anomaly
 
     @property
     def calibrated(self) -> bool:
@@ -85,28 +74,18 @@ class AnomalyDetector:
         self._torn[:] = 0.0
         self._beyond = 0
 
-    def commanded_length(self, length: Array | None) -> None:
-        """Note the target lengths [m] (M,) that the modules follow; None when they follow none."""
-        self._command, self._demand = length, None
-
-    def commanded_tension(self, tension: Array) -> None:
-        """Note the target tensions [N] (M,) that the modules follow."""
-        self._command, self._demand = None, tension
+    def commanded(self, length: Array | None = None, tension: Array | None = None) -> None:
+        """Note the targets that the modules follow, [m] or [N] (M,); neither: they follow none."""
+        self._length_command, self._tension_command = length, tension
 
     def step(self, state: State, tension: Array, length: Array, dt: float) -> Verdict:
-        """Judge one message.
+        """Judge measured T [N] and l [m] (M,), from which ② restored the state.
 
-        Args:
-            state: (θ, T, l) restored from it by ②.
-            tension: Measured [N], shape (M,).
-            length: Measured [m], shape (M,).
-            dt: Time since the message before [s].
+        It came dt [s] after the message before.
         """
         error = residuals(state, tension, length)
-        size = float(anomaly(error))
-        distance = float('nan')
-        share = error
-        if self._statistics is not None and self._whiten is not None:
+        size, distance, share = float(anomaly(error)), float('nan'), error
+        if self._statistics is not None:
             centred = error - self._statistics.mean
             white = self._whiten @ centred
             distance = float(np.sqrt(white @ white))
@@ -114,16 +93,16 @@ class AnomalyDetector:
         muscles = len(tension)
         score = share[:muscles] ** 2 + share[muscles:] ** 2
         dead = self._dead(tension, length, dt)
+        if dead is not None:
+            return Verdict(size, distance, dead, 'no tension where the command demands it')
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < DEAD_SHARE * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
-        if dead is not None:
-            return Verdict(size, distance, dead, 'no tension where the command demands it')
         return Verdict(size, distance, suspect, self._beyond_threshold(size, distance))
 
     def _beyond_threshold(self, anomaly: float, distance: float) -> str:
         limit, value, what = self.threshold, anomaly, 'A'
-        if self.threshold <= 0.0:
+        if limit <= 0.0:
             if self._statistics is None or not self._statistics.calibrated:
                 return ''
             limit = self._statistics.thresholds.get(DISTANCE, np.inf)
@@ -134,13 +113,11 @@ class AnomalyDetector:
         return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running'
 
     def _dead(self, tension: Array, length: Array, dt: float) -> int | None:
-        bias = self._robot.tension.bias
-        if self._command is not None:
-            pulled = self._robot.stiffness * (length - self._command)
+        bias, demand = self._robot.tension.bias, self._tension_command
+        if self._length_command is not None:
+            pulled = self._robot.stiffness * (length - self._length_command)
             demand = bias + np.maximum(0.0, pulled)
-        elif self._demand is not None:
-            demand = self._demand
-        else:
+        if demand is None:
             self._torn[:] = 0.0
             return None
         torn = (tension < DEAD_SHARE * demand) & (demand >= bias)

@@ -34,37 +34,25 @@ MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 
 
 class Estimate(NamedTuple):
-    """What one message gives.
+    """What one message gives."""
 
-    Attributes:
-        state: (θ, T, l) as the network restores them.
-        anomaly: A, scaled units.
-        detected: Whether this message completes a detection that was not there before.
-    """
-
-    state: State
-    anomaly: float
-    detected: bool
+    state: State  # (θ, T, l) as the network restores them
+    anomaly: float  # A, scaled units
+    detected: bool  # whether this message completes a detection that was not there before
 
 
 class Estimator:
-    """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s].
-
-    Attributes:
-        mae: The network in use, or None.
-        detector: Judges every message.
-        cause: Why an anomaly is latched, or ''.
-    """
+    """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s]."""
 
     def __init__(self, robot: Robot) -> None:
         """Wait for a network."""
         self._robot = robot
-        self.mae: Mae | None = None
+        self.mae: Mae | None = None  # the network in use
         self.detector = AnomalyDetector(robot)
-        self.cause = self._suspect = ''
+        self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
-        self._time: float | None = None
+        self._time = math.inf  # of the last message; none yet
         self._stepped_at = self._commanded_at = -math.inf
 
     def use(self, mae: Mae) -> None:
@@ -72,27 +60,24 @@ class Estimator:
         self.detector.use(mae)
         self.mae = mae
 
-    def commanded_length(self, length: Array, now: float) -> None:
-        """Note the target lengths [m] (M,) sent to the modules."""
-        self.detector.commanded_length(length)
-        self._commanded_at = now
-
-    def commanded_tension(self, tension: Array, now: float) -> None:
-        """Note the target tensions [N] (M,) sent to the modules."""
-        self.detector.commanded_tension(tension)
+    def commanded(
+        self, now: float, length: Array | None = None, tension: Array | None = None
+    ) -> None:
+        """Note the target lengths [m] or tensions [N] (M,) sent to the modules."""
+        self.detector.commanded(length, tension)
         self._commanded_at = now
 
     def step(self, tension: Array, length: Array, time: float, now: float) -> Estimate | None:
         """Return the estimate from measured T [N] (M,) and l [m] (M,); None without a network."""
         if self.mae is None:
             return None
-        dt = 0.0 if self._time is None else min(max(time - self._time, 0.0), LONGEST_PERIOD)
+        dt = min(max(time - self._time, 0.0), LONGEST_PERIOD)
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
-            self.detector.commanded_length(None)
+            self.detector.commanded()
         state = self.mae.estimate(tension, length)
         self._theta = state.theta
-        self._verdict = verdict = self.detector.step(state, tension, length, dt)
+        verdict = self._verdict = self.detector.step(state, tension, length, dt)
         detected = bool(verdict.cause) and not self.cause
         if detected:
             self._suspect = self._robot.muscles[verdict.suspect]
@@ -119,7 +104,7 @@ class Estimator:
 
     def clock_jumped_back(self) -> None:
         """Start the detector's counts anew; what was detected stays."""
-        self._time = None
+        self._time = math.inf
         self.detector.reset()
 
     def report(self, now: float) -> Report:

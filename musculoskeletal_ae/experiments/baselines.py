@@ -22,25 +22,19 @@ STREAM_STRIDE = 10
 
 
 def baseline_errors(
-    robot: Robot, samples: Rests, stream: Recording, held_out: Recording
+    robot: Robot, rests: Rests, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error on the held-out motion before and after learning [rad].
 
-    Least squares on the geometric model, without weights, has nothing to learn.
-
-    Args:
-        robot: The geometric model, from which all of them start.
-        samples: What the autoencoder learned from.
-        stream: The whole exploration.
-        held_out: The motion to judge by.
+    All start from the geometric model. Least squares on it, without weights, has nothing to learn.
     """
-    part = slice(None, None, STREAM_STRIDE)
-    moving = Rests(stream.theta_sensor[part], stream.tension[part], stream.length[part])
+    part = stream.part(np.s_[::STREAM_STRIDE])
+    moving = Rests(part.theta_sensor, part.tension, part.length)
     error = nominal(robot, tension_noise=0.0).error(held_out)
     table = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
     for kind in (PolynomialFilter, TableSearch):
         before = _error(kind(robot), held_out)
-        for data, name in ((samples, kind.name), (moving, f'{kind.name}, whole stream')):
+        for data, name in ((rests, kind.name), (moving, f'{kind.name}, whole stream')):
             taught = kind(robot)
             if len(data.theta):
                 taught.learn(*data)
@@ -48,11 +42,9 @@ def baseline_errors(
     return table
 
 
-def _error(baseline: PolynomialFilter | TableSearch, recording: Recording) -> float:
-    estimate = baseline.estimate(recording.tension, recording.length)
-    if not np.isfinite(estimate).all():
-        raise FloatingPointError(f'{baseline.name} diverged')
-    return mean_error(estimate, recording.theta)
+def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> float:
+    estimate = baseline.estimate(held_out.tension, held_out.length)
+    return mean_error(estimate, held_out.theta)
 
 
 def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
@@ -62,8 +54,7 @@ def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)
-    compensated: Array = length + robot.series_elastic.elongation(absolute + elongation, tension)
-    return compensated
+    return length + robot.series_elastic.elongation(absolute + elongation, tension)
 
 
 class PolynomialFilter:
@@ -89,6 +80,10 @@ class PolynomialFilter:
         self._robot = robot
         every = product(range(self.DEGREE + 1), repeat=robot.joint_count)
         self._powers = np.array([powers for powers in every if sum(powers) <= self.DEGREE])
+        # Slopes of the monomials, as monomials: k x^(k−1) in each joint's direction, (D, K, K).
+        units = np.eye(robot.joint_count, dtype=int)
+        lower = [(self._powers[:, None] - unit == self._powers).all(axis=-1) for unit in units]
+        self._slopes = np.array(lower) * self._powers.T[:, :, None]
         theta = robot.random_postures(self.MODEL_SAMPLES, np.random.default_rng(0))
         design, target = self._monomials(theta), robot.routes.relative_lengths(theta)
         fit = np.linalg.lstsq(design, target, rcond=None)[0]
@@ -97,14 +92,12 @@ class PolynomialFilter:
 
     def _scaled(self, theta: Array) -> Array:
         low, high = self._robot.lower, self._robot.upper
-        scaled: Array = (2.0 * theta - low - high) / (high - low)
-        return scaled
+        return (2.0 * theta - low - high) / (high - low)
 
     def _monomials(self, theta: Array) -> Array:
         """Return the monomials of θ (N, D), shape (N, K)."""
         table = self._scaled(theta)[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
-        monomials: Array = table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
-        return monomials
+        return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
         """Fit the mapping to samples (N, D), (N, M), (N, M), its own coefficients as the prior."""
@@ -120,19 +113,11 @@ class PolynomialFilter:
 
     def _measurement(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return the mapping's l + L_e [m] (M,) at one (θ, T) and H [m/rad] (M, D)."""
-        x = self._scaled(theta)
-        table = x[:, None] ** np.arange(self.DEGREE + 1)  # (D, DEGREE+1)
-        joints = np.arange(len(x))
-        factors = table[joints, self._powers]  # (K, D)
-        lower = table[joints, np.maximum(self._powers - 1, 0)]
-        slope = np.empty_like(factors)
-        for d in joints:
-            others = np.delete(factors, d, axis=1).prod(axis=1)
-            slope[:, d] = self._powers[:, d] * lower[:, d] * others
+        monomials = self._monomials(theta[None])[0]
         coefficients, elastic = self._coefficients[:-1], self._coefficients[-1]
-        predicted = factors.prod(axis=1) @ coefficients + elastic * self.TENSION_SCALE * tension
+        predicted = monomials @ coefficients + elastic * self.TENSION_SCALE * tension
         turn = 2.0 / (self._robot.upper - self._robot.lower)
-        return predicted, (coefficients.T @ slope) * turn
+        return predicted, coefficients.T @ (self._slopes @ monomials).T * turn
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for successive messages T [N] (N, M), l [m] (N, M)."""
@@ -183,5 +168,4 @@ class TableSearch:
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M)."""
         row = self._lengths.query(unstretched(self._robot, tension, length))[1]
-        nearest: Array = self._theta[row]
-        return nearest
+        return self._theta[row]

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What learning changes in the body.
 
-l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0, through ① of the
+Paper. l against S-p from −120° to 30° at T = 0, and against T from 0 to 500 N at θ = 0: changes up
+to 40 mm, largest in #2, #3 and #7; tension curves from linear to strongly curved.
+
+Here. l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0, through ① of the
 network before and after learning, beside the true body. All other joints are at θ = 0; where that
 lies outside a joint’s limits (the elbow’s, by 5°) it is kept all the same. "Shape" is the error of
 a curve beside the true one after their mean difference is taken off.
@@ -9,125 +12,98 @@ a curve beside the true one after their mean difference is taken off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.roles import shoulder
-from musculoskeletal_ae.experiments.study import Experiment, Individuals, Measured, Progress, Study
-from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 
 SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # [rad]
 POINTS = 101  # of tension
 COLUMNS = 5  # of plots
+LABELS = {'before': 'before learning', 'after': 'after learning', 'true': 'true body'}
 
 
-def measure(study: Study, seed: int, progress: Progress) -> Measured:
+def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
-    robot = study.body()
-    individual = Individual(robot, seed)
-    joint = shoulder(robot)
-    networks = {'before': study.initial(robot), 'after': study.learned(robot, seed)}
+    robot, true = study.robot, study.arm(seed).individual
+    joint, seen = shoulder(robot), study.rests(seed).tension
     tension = np.linspace(0.0, robot.tension.max, POINTS)
     swept = np.zeros((len(SWEEP), robot.joint_count))
     swept[:, joint] = SWEEP
     stretched = np.repeat(tension[:, None], robot.muscle_count, axis=1)
+    # Where something was trained: within the joint's limits, and the tensions of the samples.
+    inside = (robot.lower[joint] <= SWEEP) & (robot.upper[joint] >= SWEEP)
+    low, high = (seen.min(), seen.max()) if seen.size else (0.0, robot.tension.limit)
     sweeps = {
-        'angle': (swept, np.zeros((len(SWEEP), robot.muscle_count))),
-        'tension': (np.zeros((POINTS, robot.joint_count)), stretched),
+        'angle': (np.degrees(SWEEP), inside, swept, np.zeros((len(SWEEP), robot.muscle_count))),
+        'tension': (
+            tension,
+            (tension >= low) & (tension <= high),
+            np.zeros((POINTS, robot.joint_count)),
+            stretched,
+        ),
     }
-    traces: dict[str, Any] = {
-        'angle': SWEEP,
-        'tension': tension,
-        'angle_trained': (robot.lower[joint] <= SWEEP) & (robot.upper[joint] >= SWEEP),
-        'tension_trained': _explored(study.rests(seed).tension, robot, tension),
-    }
+    traces: dict[str, Any] = {}
     numbers: dict[str, Any] = {'joint': robot.joints[joint]}
-    for name, points in sweeps.items():
-        trained, true = traces[f'{name}_trained'], individual.muscle_lengths(*points)
-        curves = {when: mae.lengths(*points) for when, mae in networks.items()}
-        traces[f'by_{name}'] = {**curves, 'true': true}
+    for name, (x, trained, *points) in sweeps.items():
+        curves = {when: mae.lengths(*points) for when, mae in study.networks(seed).items()}
+        curves['true'] = true.muscle_lengths(*points)
+        traces[name] = x, trained, curves
         change = 1e3 * np.abs(curves['after'] - curves['before'])[trained].max(axis=0)
         numbers[f'{name}_change_mm'] = dict(zip(robot.muscles, change.tolist(), strict=True))
-        for when, length in curves.items():
+        for when in plots.WHEN:
             # Beside the zero that each curve has its own: only their shapes are compared.
-            off = (length - true)[trained]
+            off = (curves[when] - curves['true'])[trained]
             shape = 1e3 * (off - off.mean(axis=0)).std(axis=0)
             numbers[f'{name}_{when}_shape_mm'] = float(shape.mean())
-    progress(1.0)
     return Measured(numbers, traces)
 
 
-def _explored(seen: Array, robot: Robot, tension: Array) -> Bools:
-    """Return which tensions the learner's samples (N, M) reached in any muscle."""
-    low, high = (seen.min(), seen.max()) if seen.size else (0.0, robot.tension.limit)
-    explored: Bools = (tension >= low) & (tension <= high)
-    return explored
-
-
-def plot(individuals: Individuals) -> list[plots.Plot]:
-    """Draw l over the shoulder's angle and over tension, one panel for each muscle."""
-    (seed, first), robot = individuals.first, individuals.robot
-    trace, joint = first.traces, first.numbers['joint']
-    degrees, label = np.degrees(trace['angle']), f'θ of {joint} [deg]'
-    angle = _grid(robot, degrees, trace['by_angle'], trace['angle_trained'], label)
-    angle.suptitle(f'individual {seed}: muscle length at T = 0, all other joints at 0')
-    tension = _grid(robot, trace['tension'], trace['by_tension'], trace['tension_trained'], 'T [N]')
-    tension.suptitle(f'individual {seed}: muscle length at θ = 0')
-    return [
-        plots.Plot(
-            'length_against_angle',
-            angle,
-            f'Muscle length against {joint} at no tension. Dotted: outside the joint’s limits, '
-            'where nothing was trained.',
-        ),
-        plots.Plot(
-            'length_against_tension',
-            tension,
-            'Muscle length against tension at θ = 0. Dotted: tensions that no sample of the '
-            'exploration held.',
-        ),
-    ]
-
-
-def _grid(robot: Robot, x: Array, lines: Mapping[str, Array], trained: Bools, xlabel: str) -> Any:
-    columns = min(COLUMNS, robot.muscle_count)
-    rows = -(-robot.muscle_count // columns)
-    figure, axes = plots.new_figure(
-        2.6 * columns + 0.6, 2.4 * rows + 0.9, rows, columns, sharex=True
+def length_against_angle(study: Study, rows: Rows) -> Plot:
+    """Draw l over the shoulder's angle, one panel for each muscle."""
+    joint = first(rows)[1].numbers['joint']
+    title = 'muscle length at T = 0, all other joints at 0'
+    return _panels(study, rows, 'angle', f'θ of {joint} [deg]', title), (
+        f'Muscle length against {joint} at no tension. Dotted: outside the joint’s limits, '
+        'where nothing was trained.'
     )
-    labels = {'before': 'before learning', 'after': 'after learning', 'true': 'true body'}
-    for m, panel in enumerate(axes.flat):
-        if m >= robot.muscle_count:
-            panel.set_axis_off()
-            continue
-        for name, label in labels.items():
-            y, width = 1e3 * lines[name][:, m], 1.0 if name == 'true' else 1.8
-            style = {'color': plots.WHEN.get(name, plots.TRUE), 'lw': width}
+
+
+def length_against_tension(study: Study, rows: Rows) -> Plot:
+    """Draw l over tension, one panel for each muscle."""
+    return _panels(study, rows, 'tension', 'T [N]', 'muscle length at θ = 0'), (
+        'Muscle length against tension at θ = 0. Dotted: tensions that no sample of the '
+        'exploration held.'
+    )
+
+
+def _panels(study: Study, rows: Rows, name: str, xlabel: str, title: str) -> Any:
+    (seed, row), robot = first(rows), study.robot
+    x, trained, curves = row.traces[name]
+    count = min(COLUMNS, robot.muscle_count)
+    height = -(-robot.muscle_count // count)
+    size = 2.6 * count + 0.6, 2.4 * height + 0.9
+    figure, panels = plots.new_figure(*size, height, count, sharex=True)
+    for panel in panels[robot.muscle_count :]:
+        panel.set_axis_off()
+    for m, (muscle, panel) in enumerate(zip(robot.muscles, panels)):  # some stay empty
+        for when, label in LABELS.items():
+            y, width = 1e3 * curves[when][:, m], 1.0 if when == 'true' else 1.8
+            style = {'color': plots.WHEN.get(when, plots.TRUE), 'lw': width}
             panel.plot(x, y, ls=':', **style)
             panel.plot(x, np.where(trained, y, np.nan), label=label if m == 0 else None, **style)
-        plots.tidy(panel, '', '', f'{m + 1} {robot.muscles[m]}')
+        lowest = m + count >= robot.muscle_count
+        ylabel = 'l [mm]' if m % count == 0 else ''
+        plots.tidy(panel, xlabel if lowest else '', ylabel, f'{m + 1} {muscle}')
         panel.title.set_fontsize(9)
-        if m % columns == 0:
-            panel.set_ylabel('l [mm]')
-        if m + columns >= robot.muscle_count:
-            panel.set_xlabel(xlabel)
-            panel.tick_params(labelbottom=True)
+        panel.tick_params(labelbottom=lowest)
     figure.legend(loc='outside lower center', ncols=3, fontsize=9)
+    figure.suptitle(f'individual {seed}: {title}')
     return figure
 
 
-EXPERIMENT = Experiment(
-    description=__doc__,
-    paper=(
-        'l against S-p from −120° to 30° at T = 0, and against T from 0 to 500 N at θ = 0: changes '
-        'up to 40 mm, largest in #2, #3 and #7; tension curves from linear to strongly curved.'
-    ),
-    weight=0.2,
-    measure=measure,
-    plot=plot,
-)
+PLOTS = (length_against_angle, length_against_tension)
+EXPERIMENT = Experiment(__doc__, measure, PLOTS, 0.2)

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control.
 
-The same as in the paper, in closed loop with the estimator and the controller that the nodes run,
-on targets that the true body can hold within [T_bias, T_limit]; read 8 s after the command.
+Paper. Five random θ_eval, each approached from five random postures, by the geometric model, by
+`first`, `second` and `proposed` after learning: all learned ones far better than geometric;
+`proposed` as exact as `second` with less tension than either.
+
+Here. The same as in the paper, in closed loop with the estimator and the controller that the nodes
+run, on targets that the true body can hold within [T_bias, T_limit]; read 8 s after the command.
 `geometric` is the model’s, the others run on the learned network, `proposed_paper` is the printed
 method on the network of preset paper. QP bound: the least ‖T‖ with which the true body holds
 θ_eval. "Bound reached": the same at the posture where the arm came to rest, as an arm that sags
@@ -26,19 +30,19 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, frictionless
-from musculoskeletal_ae.experiments.study import Experiment, Individuals, Measured, Progress, Study
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
 
 class Method(NamedTuple):
-    """A method under test: the controller's, on the network of a preset; its colour in plots."""
+    """A method under test."""
 
-    method: str
-    preset: str
-    colour: str
+    method: str  # the controller's
+    preset: str  # of the network
+    colour: str  # in plots
 
 
 METHODS = {
@@ -48,6 +52,7 @@ METHODS = {
     'proposed': Method('proposed', 'default', '#0072B2'),
     'proposed_paper': Method('proposed', 'paper', '#CC79A7'),
 }
+APPROACHES = 5  # θ_eval, and starts for each
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
 DURATION = 8.0  # [s]
 
@@ -80,39 +85,21 @@ def approach(arm: EmulatedArm, mae: Mae, settings: Settings, start: Array, theta
 
 
 class Approaches(NamedTuple):
-    """Where P targets, each from S starts, left an arm.
+    """Where P targets, each from S starts, left an arm; dictionaries are by method."""
 
-    Attributes:
-        target: θ_eval [rad], shape (P, D).
-        bound: Least ‖T‖ with which the true body holds each [N], shape (P,).
-        offset: θ − θ_eval at the end, by method [rad], each of shape (P, S, D).
-        tension: ‖T‖ there [N], each of shape (P, S).
-        bound_there: Least ‖T‖ that holds the posture reached [N]; nan where none does, as in one
-            that leans on a joint's stop or rests by friction; each of shape (P, S).
-    """
-
-    target: Array
-    bound: Array
-    offset: dict[str, Array]
-    tension: dict[str, Array]
+    target: Array  # θ_eval [rad], (P, D)
+    bound: Array  # least ‖T‖ with which the true body holds each [N], (P,)
+    offset: dict[str, Array]  # θ − θ_eval at the end [rad], (P, S, D)
+    tension: dict[str, Array]  # ‖T‖ there [N], (P, S)
+    #: least ‖T‖ that holds the posture reached [N], (P, S); nan where none does, as in one that
+    #: leans on a joint's stop or rests by friction
     bound_there: dict[str, Array]
 
 
-def protocol(
-    arm: EmulatedArm,
-    networks: Mapping[str, Mae],
-    seed: int,
-    count: int,
-    progress: Progress | None = None,
-) -> Approaches:
-    """Approach random targets from random starts by every method.
+def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
+    """Approach `count` random targets from as many random starts each, by every method.
 
-    Args:
-        arm: The arm.
-        networks: By preset.
-        seed: Draws targets and starts.
-        count: How many targets, and how many starts for each.
-        progress: Told the share of the work done since it was told last.
+    The seed draws targets and starts; networks are by preset.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures = robot.random_postures(TRIES, rng)
@@ -127,8 +114,6 @@ def protocol(
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
                 there[name][p, s] = _bound(arm)
-            if progress:
-                progress(1.0 / count**2)
     bound = np.array([np.linalg.norm(least) for _, least in held])
     return Approaches(np.array([theta for theta, _ in held]), bound, offset, tension, there)
 
@@ -141,11 +126,10 @@ def _bound(arm: EmulatedArm) -> float:
         return float('nan')
 
 
-def measure(study: Study, seed: int, progress: Progress) -> Measured:
+def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
-    robot = study.body()
-    networks = {'default': study.learned(robot, seed), 'paper': study.learned(robot, seed, 'paper')}
-    ended = protocol(EmulatedArm(robot, seed), networks, seed, study.approaches, progress)
+    networks = {'default': study.network(seed), 'paper': study.network(seed, 'paper')}
+    ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
     numbers: dict[str, Any] = {'qp_bound_n': float(ended.bound.mean())}
     for name, tension in ended.tension.items():
@@ -164,92 +148,90 @@ def measure(study: Study, seed: int, progress: Progress) -> Measured:
             'bound_reached_n': float(there[held].mean()) if held.any() else 0.0,
             'reached_holdable_share': float(held.mean()),
         }
-    numbers['proposed_causes'] = _causes(robot, networks['default'], seed, ended)
+    smooth = study.arm(seed, friction=False)
+    numbers['proposed_causes'] = _causes(smooth, networks['default'], ended)
     return Measured(numbers, {'errors': errors, 'tensions': ended.tension, 'bound': ended.bound})
 
 
-def _causes(robot: Robot, mae: Mae, seed: int, ended: Approaches) -> dict[str, float]:
+def _causes(smooth: EmulatedArm, mae: Mae, ended: Approaches) -> dict[str, float]:
     """Return what `proposed` plans, and what comes of it on the same body without friction.
 
     The plan's ‖T‖ beside the bound is the learned body's error; what the frictionless arm has
     beyond it comes from the tensions' being commanded as lengths, and the rest is friction.
     """
-    arm = frictionless(robot, seed)
-    planned, errors, tensions = [], [], []
+    robot, rows = smooth.robot, []
     for theta in ended.target:
         torque = robot.kinematics.holding_torque(theta)
         none = np.full(robot.muscle_count, robot.tension.bias)
         plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
-        planned.append(np.linalg.norm(plan.tension))
-        approach(arm, mae, Settings(method='proposed'), 0.5 * (robot.lower + robot.upper), theta)
-        errors.append(np.linalg.norm(arm.theta - theta))
-        tensions.append(np.linalg.norm(arm.tension))
+        approach(smooth, mae, Settings(method='proposed'), 0.5 * (robot.lower + robot.upper), theta)
+        parts = plan.tension, smooth.tension, smooth.theta - theta
+        rows.append([np.linalg.norm(part) for part in parts])
+    planned, tension, error = np.transpose(rows)
     return {
-        'planned_to_bound': float((np.array(planned) / ended.bound).mean()),
-        'frictionless_to_bound': float((np.array(tensions) / ended.bound).mean()),
-        'frictionless_rad': float(np.mean(errors)),
+        'planned_to_bound': float((planned / ended.bound).mean()),
+        'frictionless_to_bound': float((tension / ended.bound).mean()),
+        'frictionless_rad': float(error.mean()),
     }
 
 
-def plot(individuals: Individuals) -> list[plots.Plot]:
-    """Draw the bars of the first individual, and those of all together."""
-    seed, first = individuals.first
-    traces = [row.traces for row in individuals.rows.values()]
-    targets = [f'θ_eval {p + 1}' for p in range(len(first.traces['bound']))]
-    one = _bars(first.traces, targets, f'individual {seed}')
-    # Each individual has its own θ_eval: in the second plot a group of bars is an individual.
+CAPTION = (
+    'Distance from the target and muscle tension at rest for {}; whiskers: standard deviation over '
+    '{}. Dashed: the least ‖T‖ with which the true body can hold the target. `first` and `second` '
+    'rest elsewhere and so may need less.'
+)
+
+
+def control(_: Study, rows: Rows) -> Plot:
+    """Draw the first individual, a group of bars for each θ_eval."""
+    seed, row = first(rows)
+    labels = [f'θ_eval {p + 1}' for p in range(len(row.traces['bound']))]
+    figure = _bars(row.traces, labels, f'individual {seed}')
+    return figure, CAPTION.format('every target posture', 'starts')
+
+
+def control_all(_: Study, rows: Rows) -> Plot:
+    """Draw all together, a group of bars for each individual, which has its own θ_eval."""
+    traces = [row.traces for row in rows.values()]
     together: dict[str, Any] = {
         key: {name: np.array([trace[key][name].ravel() for trace in traces]) for name in METHODS}
         for key in ('errors', 'tensions')
     }
     together['bound'] = np.array([trace['bound'].mean() for trace in traces])
-    every = _bars(together, [f'individual {seed}' for seed in individuals.rows], 'all individuals')
-    caption = (
-        'Distance from the target and muscle tension at rest for {}; whiskers: standard deviation '
-        'over {}. Dashed: the least ‖T‖ with which the true body can hold the target. `first` and '
-        '`second` rest elsewhere and so may need less.'
-    )
-    both = 'every individual (all its θ_eval together)', 'starts and targets'
-    return [
-        plots.Plot('control', one, caption.format('every target posture', 'starts')),
-        plots.Plot('control_all', every, caption.format(*both)),
-    ]
+    figure = _bars(together, [f'individual {seed}' for seed in rows], 'all individuals')
+    every = 'every individual (all its θ_eval together)'
+    return figure, CAPTION.format(every, 'starts and targets')
 
 
 def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
     """Draw groups of bars, by method (groups, approaches), with the bound of each group."""
-    figure, axes = plots.new_figure(11.0, 6.4, 2, 1, sharex=True)
+    figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']
     whiskers = {'lw': 1, 'capsize': 2}
     for m, (name, method) in enumerate(METHODS.items()):
         at = place + (m - 0.5 * (len(METHODS) - 1)) * width
         for panel, key, form in (
-            (axes[0, 0], 'errors', '{}: {:.3f} rad'),
-            (axes[1, 0], 'tensions', '{}: {:.0f} N'),
+            (upper, 'errors', '{}: {:.3f} rad'),
+            (lower, 'tensions', '{}: {:.0f} N'),
         ):
             mean, spread = trace[key][name].mean(axis=1), trace[key][name].std(axis=1)
             style = {'color': method.colour, 'label': form.format(name, mean.mean())}
             panel.bar(at, mean, 0.92 * width, yerr=spread, error_kw=whiskers, **style)
-    panel = axes[1, 0]
     label = f'QP bound at θ_eval: {bound.mean():.0f} N'
     left, right = place - 0.45, place + 0.45
-    panel.hlines(bound, left, right, color=plots.TRUE, lw=1.5, ls='--', label=label)
-    plots.tidy(axes[0, 0], '', '‖θ_eval − θ‖ [rad]', title)
-    plots.tidy(panel, '', '‖T‖ [N]')
-    panel.set_xticks(place, labels)
-    for each in axes[:, 0]:
-        each.legend(fontsize=9, loc='center left', bbox_to_anchor=(1.0, 0.5))
+    lower.hlines(bound, left, right, color=plots.TRUE, lw=1.5, ls='--', label=label)
+    lower.set_xticks(place, labels)
+    plots.tidy(upper, '', '‖θ_eval − θ‖ [rad]', title, legend='right')
+    plots.tidy(lower, '', '‖T‖ [N]', legend='right')
     return figure
 
 
-EXPERIMENT = Experiment(
-    description=__doc__,
-    paper=(
-        'Five random θ_eval, each approached from five random postures, by the geometric model, '
-        'by `first`, `second` and `proposed` after learning: all learned ones far better than '
-        'geometric; `proposed` as exact as `second` with less tension than either.'
-    ),
-    weight=10.0,
-    measure=measure,
-    plot=plot,
-)
+ROWS = (
+    Row('`proposed`, distance from θ_eval [rad]', 'as `second`',
+        'proposed_paper.error_rad', 'proposed.error_rad', '', 0.06),
+    Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`',
+        'proposed_paper.tension_n', 'proposed.tension_n', 'qp_bound_n', digits=0),
+    Row('`proposed`, ‖T‖ beside the QP bound [ratio]', NOTHING,
+        'proposed_paper.tension_to_bound', 'proposed.tension_to_bound', '', 1.1, 2),
+)  # fmt: skip
+EXPERIMENT = Experiment(__doc__, measure, (control, control_all), 10.0, ROWS)

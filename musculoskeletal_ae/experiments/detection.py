@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import rankdata
+from scipy.stats import mannwhitneyu
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, AnomalyDetector
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, rows_between
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, columns, rows_between
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import residuals
+from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -33,39 +34,21 @@ class GraspAndCut:
 
     A cut comes when the muscle carries tension; if it never does, it is cut all the same at the end
     of its wait, and `carried` says so.
-
-    Attributes:
-        grasp: When the weight comes into the hand [s].
-        order: Muscles in the order of their cuts.
-        cut: When each muscle was cut [s], order of T, shape (M,).
-        carried: Whether it carried tension then, shape (M,).
     """
 
     def __init__(self, robot: Robot, duration: float, seed: int) -> None:
         """Plan a motion of `duration` [s] and the cuts that follow it."""
         count = robot.muscle_count
-        self.grasp, self._motion = 0.5 * duration, duration
+        self.grasp, self._motion = 0.5 * duration, duration  # [s]
+        self.duration = duration + SLOT * count  # of everything [s]
+        # Messages of the motion without weight, and with it before the first cut.
+        self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # The second muscle first: it is the one that the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]
-        self.cut = np.full(count, np.nan)
-        self.carried: Bools = np.zeros(count, dtype=bool)
+        self.cut = np.full(count, np.nan)  # when each muscle was cut [s], (M,)
+        self.carried: Bools = np.zeros(count, dtype=bool)  # whether it carried tension then, (M,)
         self._robot = robot
         self._wait = np.random.default_rng([seed, 0xC7]).uniform(0.0, EARLIEST_CUT, count)
-
-    @property
-    def duration(self) -> float:
-        """Of everything [s]."""
-        return self._motion + SLOT * len(self.order)
-
-    @property
-    def free(self) -> slice:
-        """Messages of the motion without weight."""
-        return rows_between(0.0, self.grasp)
-
-    @property
-    def loaded(self) -> slice:
-        """Messages of the motion with the weight in the hand, before the first cut."""
-        return rows_between(self.grasp, self._motion)
 
     @property
     def counted(self) -> Ints:
@@ -80,8 +63,8 @@ class GraspAndCut:
     def disturbed(self, count: int) -> Bools:
         """Return in which of so many messages a muscle is cut, or was until a moment ago."""
         disturbed = np.zeros(count, dtype=bool)
-        for cut in self.cut:
-            disturbed[rows_between(float(cut), float(cut) + CUT_TIME + RECOVERED)] = True
+        for cut in self.cut.tolist():
+            disturbed[rows_between(cut, cut + CUT_TIME + RECOVERED)] = True
         return disturbed
 
     def __call__(self, arm: EmulatedArm, time: float) -> None:
@@ -110,38 +93,26 @@ def grasp_and_release(arm: EmulatedArm, time: float) -> None:
 
 
 class Watched(NamedTuple):
-    """The detector's answers to N messages.
+    """The detector's answers to N messages."""
 
-    Attributes:
-        theta: Estimated [rad], shape (N, D).
-        anomaly: A, scaled units, shape (N,).
-        distance: d, in healthy standard deviations, shape (N,).
-        suspect: Index of the most suspect muscle, shape (N,).
-        alarm: Whether the message completes a detection, shape (N,).
-    """
-
-    theta: Array
-    anomaly: Array
-    distance: Array
-    suspect: Ints
-    alarm: Bools
+    theta: Array  # estimated [rad], (N, D)
+    anomaly: Array  # A, scaled units, (N,)
+    distance: Array  # d, in healthy standard deviations, (N,)
+    suspect: Ints  # the most suspect muscle, (N,)
+    alarm: Bools  # whether the message completes a detection, (N,)
 
 
 def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     """Run estimator and detector over a recording as the node does; nothing is latched."""
-    detector = AnomalyDetector(robot)
+    detector, rows = AnomalyDetector(robot), []
     detector.use(mae)
     estimated = mae.estimate(recording.tension, recording.length)
-    count = len(recording.theta)
-    anomaly, distance = np.empty(count), np.empty(count)
-    suspect, alarm = np.empty(count, dtype=int), np.empty(count, dtype=bool)
-    for n in range(count):
-        detector.commanded_length(recording.command[n])
+    for n, (tension, length) in enumerate(zip(recording.tension, recording.length, strict=True)):
+        detector.commanded(length=recording.command[n])
         restored = State(*(part[n] for part in estimated))
-        verdict = detector.step(restored, recording.tension[n], recording.length[n], SAMPLE_TIME)
-        anomaly[n], distance[n], suspect[n] = verdict.anomaly, verdict.distance, verdict.suspect
-        alarm[n] = bool(verdict.cause)
-    return Watched(estimated.theta, anomaly, distance, suspect, alarm)
+        verdict = detector.step(restored, tension, length, SAMPLE_TIME)
+        rows.append((*verdict[:3], bool(verdict.cause)))
+    return Watched(estimated.theta, *columns(rows))
 
 
 def detection(
@@ -149,25 +120,21 @@ def detection(
 ) -> dict[str, Any]:
     """Return how soon and how rightly cuts were noticed, and how many alarms were false.
 
-    A cut that was not noticed counts with the time it lasted.
-
-    Args:
-        robot: Names the muscles.
-        plan: When they were cut.
-        seen: The recording with the cuts, as the detector sees it.
-        well: The healthy recording.
-        mae: Whose detector it was.
+    `seen` is the recording with the cuts and `well` the healthy one, as the network's detector sees
+    them. A cut that was not noticed counts with the time it lasted.
     """
     delay = np.full(len(plan.cut), CUT_TIME)
     named, noticed = np.zeros((2, len(plan.cut)), dtype=bool)
-    for muscle, cut in enumerate(plan.cut):
-        rows = rows_between(float(cut), float(cut) + CUT_TIME)
-        alarms = np.flatnonzero(_begun(seen.alarm)[rows])
-        if len(alarms):
-            noticed[muscle] = True
-            delay[muscle] = SAMPLE_TIME * (alarms[0] + 1)
-            named[muscle] = seen.suspect[rows][alarms[0]] == muscle
+    begun, false = begins(seen.alarm), begins(seen.alarm & ~plan.disturbed(len(seen.alarm)))
+    for muscle, cut in enumerate(plan.cut.tolist()):
+        rows = rows_between(cut, cut + CUT_TIME)
+        noticed[muscle] = begun[rows].any()
+        if noticed[muscle]:
+            at = int(begun[rows].argmax())
+            delay[muscle] = SAMPLE_TIME * (at + 1)
+            named[muscle] = seen.suspect[rows][at] == muscle
     statistics, counted = mae.anomaly, plan.counted
+    by_muscle = {'carried': plan.carried, 'detected': noticed, 'detection_s': delay, 'named': named}
     return {
         'threshold': float(statistics.thresholds.get(DISTANCE, 0.0)) if statistics else 0.0,
         'calibrated': bool(statistics and statistics.calibrated),
@@ -177,22 +144,17 @@ def detection(
         'named_share': float(named[counted].mean()),
         'counted_cuts': len(counted),
         'cuts': {
-            name: {
-                'carried': bool(plan.carried[m]),
-                'detected': bool(noticed[m]),
-                'detection_s': float(delay[m]),
-                'named': bool(named[m]),
-            }
+            name: {key: values[m].item() for key, values in by_muscle.items()}
             for m, name in enumerate(robot.muscles)
         },
-        'false_alarms': alarms_begun(well.alarm),
-        'false_alarms_beside_cuts': alarms_begun(seen.alarm & ~plan.disturbed(len(seen.alarm))),
+        'false_alarms': int(begins(well.alarm).sum()),
+        'false_alarms_beside_cuts': int(false.sum()),
         'healthy_s': SAMPLE_TIME * len(well.alarm),
     }
 
 
 def anomaly_levels(
-    plan: GraspAndCut, watched: dict[str, Watched], well: dict[str, Watched]
+    plan: GraspAndCut, watched: Mapping[str, Watched], well: Mapping[str, Watched]
 ) -> dict[str, Any]:
     """Return A and d: the largest of the healthy messages, the smallest level of a cut.
 
@@ -205,12 +167,15 @@ def anomaly_levels(
             calm = np.concatenate([seen[plan.free], seen[plan.loaded], healthy])
             cuts = [seen[plan.while_cut(m)] for m in range(len(plan.cut))]
             levels = [float(np.median(cut)) for cut in cuts]
-            numbers[f'{letter}{prefix}_healthy_max'] = float(calm.max())
-            numbers[f'{letter}{prefix}_healthy_median'] = float(np.median(calm))
-            numbers[f'{letter}{prefix}_ruptured_min'] = min(levels[m] for m in plan.counted)
-            numbers[f'{letter}{prefix}_ruptured'] = levels
             faulty = np.concatenate([cuts[m] for m in plan.counted])
-            numbers[f'{letter}{prefix}_auroc'] = auroc(calm, faulty)
+            values = {
+                'healthy_max': float(calm.max()),
+                'healthy_median': float(np.median(calm)),
+                'ruptured_min': min(levels[m] for m in plan.counted),
+                'ruptured': levels,
+                'auroc': auroc(calm, faulty),
+            }
+            numbers |= {f'{letter}{prefix}_{key}': value for key, value in values.items()}
     numbers['auroc'] = numbers['d_auroc']
     return numbers
 
@@ -222,38 +187,26 @@ def slack_auroc(robot: Robot, mae: Mae, taken: Recording, plan: GraspAndCut) -> 
     wires let the module wind in, which no network can overlook. So what the paper did is judged
     on messages of the loaded motion in which one muscle's tension is replaced by none.
     """
-    part = slice(plan.loaded.start, plan.loaded.stop, 10)
-    tension, length = taken.tension[part], taken.length[part]
+
+    def size(tension: Array, length: Array) -> Array:
+        return anomaly(residuals(mae.estimate(tension, length), tension, length))
+
+    part = taken.part(slice(plan.loaded.start, plan.loaded.stop, 10))
     slack = []
     for muscle in range(robot.muscle_count):
-        carried = tension[:, muscle] > robot.tension.bias + CARRYING
-        off = tension[carried].copy()
+        carried = part.tension[:, muscle] > robot.tension.bias + CARRYING
+        off = part.tension[carried]
         off[:, muscle] = 0.0
-        slack.append(_anomaly(mae, off, length[carried]))
-    return auroc(_anomaly(mae, tension, length), np.concatenate(slack))
+        slack.append(size(off, part.length[carried]))
+    return auroc(size(part.tension, part.length), np.concatenate(slack))
 
 
-def _anomaly(mae: Mae, tension: Array, length: Array) -> Array:
-    """Return A of messages (N, M), scaled units, shape (N,)."""
-    halves = np.split(residuals(mae.estimate(tension, length), tension, length), 2, axis=1)
-    total: Array = sum((np.linalg.norm(half, axis=1) for half in halves), np.zeros(len(tension)))
-    return total
-
-
-def _begun(alarm: Bools) -> Bools:
-    """Return which messages begin an alarm: one that was on before has noticed nothing."""
+def begins(alarm: Bools) -> Bools:
+    """Return which messages begin an alarm, as an operator has to reset it; none that goes on."""
     return alarm & ~np.append(False, alarm[:-1])
-
-
-def alarms_begun(alarm: Bools) -> int:
-    """Return how often a detection began: what an operator would have had to reset."""
-    return int(np.count_nonzero(_begun(alarm)))
 
 
 def auroc(healthy: Array, faulty: Array) -> float:
     """Return the chance that a faulty message scores above a healthy one (ties count half)."""
-    if not len(healthy) or not len(faulty):
-        return 0.5
-    ranks = rankdata(np.concatenate([healthy, faulty]))
-    faulty_ranks = ranks[len(healthy) :].sum() - len(faulty) * (len(faulty) + 1) / 2
-    return float(faulty_ranks / (len(healthy) * len(faulty)))
+    pairs = len(healthy) * len(faulty)
+    return float(mannwhitneyu(faulty, healthy).statistic / pairs) if pairs else 0.5

@@ -12,11 +12,12 @@ samples leave open from what the network adds.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import LENGTH_NOISE, TENSION_NOISE
+from musculoskeletal_ae.emulator.arm import LENGTH_NOISE, TENSION_NOISE, EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
 from musculoskeletal_ae.learning.body import CorrectedBody
@@ -25,53 +26,41 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 ITERATIONS = 30
 DAMPING = 1e-3  # of the normal matrix's diagonal
-STRIDE = 10  # of a recording's messages; least squares is slow
+EVERY = np.s_[::10]  # of a recording's messages; least squares is slow
 DIFFERENCE = 1e-4  # [rad]
 
 
+@dataclass(frozen=True)
 class LeastSquares:
-    """Levenberg–Marquardt over many samples at once, within the joint limits.
+    """Levenberg–Marquardt on a body model, over many samples at once, within the joint limits."""
 
-    Attributes:
-        muscle_jacobian: Of the body model, θ (N, D) to G [m/rad] (N, M, D).
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        lengths: Callable[[Array, Array], Array],
-        muscle_jacobian: Callable[[Array], Array],
-        length_at_zero: Array,
-        elastic: SeriesElastic,
-        tension_noise: float = TENSION_NOISE,
-    ) -> None:
-        """Take the body model: l [m] (N, M) of θ (N, D) and T [N] (N, M), G, l_abs(0) and L_e.
-
-        Without noise of the tension sensors [N] all muscles have one weight.
-        """
-        self._lower, self._upper, self._lengths = robot.lower, robot.upper, lengths
-        self.muscle_jacobian = muscle_jacobian
-        self._at_zero, self._elastic, self._noise = length_at_zero, elastic, tension_noise
+    robot: Robot
+    lengths: Callable[[Array, Array], Array]  # l [m] (N, M) of θ (N, D) and T [N] (N, M)
+    muscle_jacobian: Callable[[Array], Array]  # G [m/rad] (N, M, D) of θ (N, D)
+    length_at_zero: Array  # l_abs(0) [m], (M,)
+    elastic: SeriesElastic
+    tension_noise: float = TENSION_NOISE  # [N]; without it all muscles have one weight
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M), started at mid-range."""
-        theta = np.tile(0.5 * (self._lower + self._upper), (len(tension), 1))
-        absolute = self._at_zero + self._lengths(theta, np.zeros_like(tension))
-        compliance = self._elastic.compliance(absolute, tension)
-        weight = 1.0 / (LENGTH_NOISE**2 + (compliance * self._noise) ** 2)
+        lower, upper = self.robot.lower, self.robot.upper
+        theta = np.tile(0.5 * (lower + upper), (len(tension), 1))
+        absolute = self.length_at_zero + self.lengths(theta, np.zeros_like(tension))
+        compliance = self.elastic.compliance(absolute, tension)
+        weight = 1.0 / (LENGTH_NOISE**2 + (compliance * self.tension_noise) ** 2)
         damping = np.full(len(tension), DAMPING)
-        residual = length - self._lengths(theta, tension)
+        residual = length - self.lengths(theta, tension)
         cost = np.sum(weight * residual**2, axis=1)
         for _ in range(ITERATIONS):
             jacobian = self.muscle_jacobian(theta)
             weighted = jacobian * weight[:, :, None]
             normal = np.einsum('nmi,nmj->nij', weighted, jacobian)
             diagonal = np.einsum('nii->ni', normal) * damping[:, None]
-            normal += np.einsum('ni,ij->nij', diagonal, np.eye(theta.shape[1]))
+            normal += diagonal[:, :, None] * np.eye(theta.shape[1])
             gradient = np.einsum('nmi,nm->ni', weighted, residual)
             step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-            tried = np.clip(theta + step, self._lower, self._upper)
-            tried_residual = length - self._lengths(tried, tension)
+            tried = np.clip(theta + step, lower, upper)
+            tried_residual = length - self.lengths(tried, tension)
             tried_cost = np.sum(weight * tried_residual**2, axis=1)
             better = tried_cost < cost
             theta[better], residual[better] = tried[better], tried_residual[better]
@@ -79,16 +68,10 @@ class LeastSquares:
             damping = np.clip(np.where(better, damping * 0.3, damping * 10.0), 1e-6, 1e6)
         return theta
 
-    def error(self, recording: Recording, length: Array | None = None) -> float:
-        """Return the mean error on every `STRIDE`-th message [rad].
-
-        Args:
-            recording: Messages and truth.
-            length: Of those messages [m], in place of the recorded one.
-        """
-        theta, tension = recording.theta[::STRIDE], recording.tension[::STRIDE]
-        length = recording.length[::STRIDE] if length is None else length
-        return mean_error(self.estimate(tension, length), theta)
+    def error(self, recording: Recording) -> float:
+        """Return the mean error on every tenth message [rad]."""
+        part = recording.part(EVERY)
+        return mean_error(self.estimate(part.tension, part.length), part.theta)
 
 
 def oracle(robot: Robot, true: Individual) -> LeastSquares:
@@ -113,27 +96,26 @@ def learned(robot: Robot, body: CorrectedBody) -> LeastSquares:
     def jacobian(theta: Array) -> Array:
         none = np.zeros((len(theta), robot.muscle_count))
         steps = DIFFERENCE * np.eye(robot.joint_count)
-        columns = [lengths(theta + step, none) - lengths(theta - step, none) for step in steps]
-        return np.stack(columns, axis=-1) / (2.0 * DIFFERENCE)
+        rise = [lengths(theta + step, none) - lengths(theta - step, none) for step in steps]
+        return np.stack(rise, axis=-1) / (2.0 * DIFFERENCE)
 
     at_zero, elastic = robot.routes.length_at_zero, robot.series_elastic
     return LeastSquares(robot, lengths, jacobian, at_zero, elastic)
 
 
-def oracle_errors(robot: Robot, seed: int, recording: Recording) -> dict[str, float]:
-    """Return the errors of least squares on the true body, with and without friction [rad].
+def oracle_errors(arm: EmulatedArm, seed: int, recording: Recording) -> dict[str, float]:
+    """Return the errors of least squares on an arm's true body [rad].
 
     `oracle_rad` is on the messages as they came; `sensor_rad` on messages made anew without
     friction, so that noise and bias of the sensors act alone.
     """
-    individual = Individual(robot, seed)
-    estimator = oracle(robot, individual)
-    theta, tension = recording.theta[::STRIDE], recording.tension[::STRIDE]
+    body, part = arm.individual, recording.part(EVERY)
+    estimator = oracle(arm.robot, body)
     rng = np.random.default_rng([seed, 0x11])
-    true = np.maximum(tension - individual.tension_bias, 0.0) / individual.tension_gain
-    frictionless = individual.muscle_lengths(theta, true) + individual.length_bias
-    frictionless = frictionless + rng.normal(0.0, LENGTH_NOISE, frictionless.shape)
+    tension = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain
+    length = body.muscle_lengths(part.theta, tension) + body.length_bias
+    length = length + rng.normal(0.0, LENGTH_NOISE, length.shape)
     return {
         'oracle_rad': estimator.error(recording),
-        'sensor_rad': estimator.error(recording, frictionless),
+        'sensor_rad': mean_error(estimator.estimate(part.tension, length), part.theta),
     }

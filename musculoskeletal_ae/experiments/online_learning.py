@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Online learning.
 
-The initial network knows the geometric model only. One stream of sensor messages of each
+Paper. Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s random tension,
+T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from 0.324 to
+0.154 rad.
+
+Here. The initial network knows the geometric model only. One stream of sensor messages of each
 individual, commanded by the initial default network, feeds both presets. The held-out motion
 follows one fixed list of commands from a random stream that is never used for learning; its error
 is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all joints,
@@ -12,13 +16,12 @@ routes, elastic constants and noise, friction taken as zero.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import curve_fit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import learned, oracle_errors
 from musculoskeletal_ae.experiments.recording import (
@@ -30,15 +33,10 @@ from musculoskeletal_ae.experiments.recording import (
     record,
     times,
 )
-from musculoskeletal_ae.experiments.study import (
-    Experiment,
-    Individuals,
-    Measured,
-    Progress,
-    Rests,
-    Study,
-)
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
+from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
@@ -55,38 +53,28 @@ See = Callable[[int, Mae], Array | None]
 
 
 class Curve(NamedTuple):
-    """Learning over one stream.
+    """Learning over one stream of N messages."""
 
-    Attributes:
-        samples: Number of samples before learning and after each update.
-        errors: Held-out error then [rad].
-        running: Error of each message, by the network of the moment, beside the sensor [rad].
-    """
-
-    samples: list[int]
-    errors: list[float]
-    running: Array
+    samples: list[int]  # before learning and after each update
+    errors: list[float]  # held-out error then [rad]
+    running: Array  # ‖θ_est − θ_sensor‖ of each message, by the network of the moment [rad], (N,)
 
 
 def follow(
     learner: Learner, stream: Recording, held_out: Recording, see: See | None = None
 ) -> Curve:
-    """Feed a recorded stream to a learner, as the node would.
+    """Feed a recorded stream to a learner, as the node would, and judge it on the held-out motion.
 
-    Args:
-        learner: Goes on from what it knows.
-        stream: What to learn from.
-        held_out: What to judge by.
-        see: Where θ comes from; the joint sensors by default.
+    θ comes from `see`; from the joint sensors by default.
     """
-    mae, start = learner.mae, 0
+    mae, start, end = learner.mae, 0, len(stream.theta)
     samples = [len(learner.samples)]
     errors = [estimation_error(mae, held_out, CURVE_STRIDE)]
-    running = np.empty(len(stream.theta))
-    for n in range(len(stream.theta)):
+    running = np.empty(end)
+    for n in range(end):
         theta = stream.theta_sensor[n] if see is None else see(n, mae)
         learner.step(n * SAMPLE_TIME, theta, stream.tension[n], stream.length[n])
-        if learner.mae is not mae or n == len(running) - 1:
+        if learner.mae is not mae or n == end - 1:
             part = slice(start, n + 1)
             estimate = mae.estimate(stream.tension[part], stream.length[part]).theta
             running[part] = np.linalg.norm(estimate - stream.theta_sensor[part], axis=1)
@@ -98,50 +86,37 @@ def follow(
 
 def train_initial(study: Study, preset: str) -> None:
     """Train a network on the geometric model and keep it."""
-    trained = initial_mae(study.body(), preset, steps=study.initial_steps)
+    trained = initial_mae(study.robot, preset, steps=300 if study.quick else None)
     checkpoint.save(trained.mae, study.network_file(preset, None))
 
 
-def measure(study: Study, seed: int, progress: Progress) -> Measured:
+def measure(study: Study, seed: int) -> Measured:
     """Record an individual, learn of it with both presets, and keep all."""
-    robot = study.body()
-    initial = {preset: study.initial(robot, preset) for preset in PRESETS}
-    driven_by, stream = initial['default'], EXPLORATION_STREAM + seed
-    exploring = record(EmulatedArm(robot, seed), driven_by, stream, 60.0 * study.minutes)
-    held_out = record(EmulatedArm(robot, seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
-    study.keep_stream(seed, 'exploring', exploring)
-    study.keep_stream(seed, 'held_out', held_out)
-    progress(0.2)
-    limits, numbers = oracle_errors(robot, seed, held_out), {}
-    traces: dict[str, Any] = {}
-    for preset, share in (('default', 0.5), ('paper', 0.2)):
-        learner = Learner(robot, initial[preset], preset, seed, steps=study.update_steps)
+    driven_by, stream = study.network(None, 'default'), EXPLORATION_STREAM + seed
+    exploring = record(study.arm(seed), driven_by, stream, 60.0 * study.minutes)
+    held_out = record(study.arm(seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
+    study.keep(seed, exploring=exploring, held_out=held_out)
+    numbers, traces = oracle_errors(study.arm(seed), seed, held_out), {}
+    steps = STEPS // 5 if study.quick else STEPS
+    for preset in PRESETS:
+        initial = study.network(None, preset)
+        learner = Learner(study.robot, initial, preset, seed, steps=steps)
         curve = follow(learner, exploring, held_out)
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         if learner.training.body is not None:
-            study.keep_rests(seed, _rests(learner))
-            body = learned(robot, learner.training.body)
-            limits = {'body_rad': body.error(held_out), **limits}
-        values = _numbers(curve, learner, initial[preset], held_out)
-        for prefix, named in (('', study.preset), ('paper_', 'paper')):
-            if preset == named:
-                numbers.update({prefix + key: value for key, value in values.items()})
-        traces[preset] = {
-            'running': _by_second(curve.running),
-            'curve_samples': np.array(curve.samples),
-            'curve_errors': np.array(curve.errors),
-            'fit_start_rad': values['fit_start_rad'],
-            'fit_end_rad': values['fit_end_rad'],
-        }
-        progress(share)
-    return Measured({**limits, **numbers}, traces)
+            study.keep(seed, rests=_rests(learner))
+            body = learned(study.robot, learner.training.body)
+            numbers = {'body_rad': body.error(held_out), **numbers}
+        values = _numbers(curve, learner, initial, held_out)
+        numbers |= study.keyed(preset, values)
+        traces[preset] = curve, values
+    return Measured(numbers, traces)
 
 
 def _rests(learner: Learner) -> Rests:
-    store = learner.samples
-    if not len(store):
+    if not len(learner.samples):
         return Rests(*np.empty((3, 0, 0)))
-    seen = store.observations()
+    seen = learner.samples.observations()
     return Rests(seen.theta, seen.tension, seen.length)
 
 
@@ -181,63 +156,58 @@ def exponential_fit(time: Array, error: Array) -> Array:
     return model(time, *curve_fit(model, time, error, guess, bounds=bounds)[0])
 
 
-def _by_second(values: Array) -> Array:
-    every = round(1.0 / SAMPLE_TIME)
-    whole = len(values) // every * every
-    means: Array = values[:whole].reshape(-1, every).mean(axis=1)
-    return means
-
-
-def plot(individuals: Individuals) -> list[plots.Plot]:
+def online_learning(study: Study, rows: Rows) -> Plot:
     """Draw the running error with its exponential fit, and the held-out error over samples."""
-    rows = list(individuals.rows.values())
-    figure, axes = plots.new_figure(12.0, 4.6, 1, 2, width_ratios=(3, 2))
-    left, right = axes[0]
+    figure, (left, right) = plots.new_figure(12.0, 5.2, 1, 2, width_ratios=(3, 2))
+    every = round(1.0 / SAMPLE_TIME)
     for preset, colour in COLOURS.items():
-        traces = [row.traces[preset] for row in rows]
-        running = np.array([trace['running'] for trace in traces])
-        seconds = np.linspace(0.5, running.shape[1] - 0.5, running.shape[1])
+        curves, values = zip(*(row.traces[preset] for row in rows.values()), strict=True)
+        whole = len(curves[0].running) // every * every
+        running = np.array([c.running[:whole].reshape(-1, every).mean(axis=1) for c in curves])
+        seconds = np.arange(0.5, running.shape[1])
         mean: Array = running.mean(axis=0)
         for each in running if len(running) > 1 else ():
             plots.line(left, seconds / 60, each, 10, color=colour, lw=0.5, alpha=0.25)
         label = f'preset {preset}'
         plots.line(left, seconds / 60, mean, 10, color=colour, lw=1.2, label=label)
-        start, end = (np.mean([t[f'fit_{at}_rad'] for t in traces]) for at in ('start', 'end'))
+        start, end = (
+            np.mean([each[f'fit_{at}_rad'] for each in values]) for at in ('start', 'end')
+        )
         fit = f'exponential fit: {start:.3f} → {end:.3f} rad'
         fitted = exponential_fit(seconds, mean)
         left.plot(seconds / 60, fitted, color=colour, lw=2.5, ls='--', label=fit)
-        for trace in traces:
-            points = trace['curve_samples'], trace['curve_errors']
-            right.plot(*points, color=colour, lw=1.2, alpha=0.7, label=label)
+        for curve in curves:
+            right.plot(curve.samples, curve.errors, color=colour, lw=1.2, alpha=0.7, label=label)
             label = ''
-    ends = f'paper, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
-    long_enough = individuals.study.minutes >= PRINTED_MINUTES
-    at = [0.0, PRINTED_MINUTES] if long_enough else [np.nan, np.nan]
-    left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=ends)
-    oracle = float(np.mean([numbers['oracle_rad'] for numbers in individuals.numbers]))
+    if study.minutes >= PRINTED_MINUTES:
+        label = f'paper, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
+        at = 0.0, PRINTED_MINUTES
+        left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=label)
+    oracle = float(np.mean([row.numbers['oracle_rad'] for row in rows.values()]))
     right.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
-    plots.tidy(left, 'time of exploration [min]', '‖θ_est − θ_sensor‖ [rad]', 'while exploring')
-    plots.tidy(right, 'samples at rest', 'mean error [rad]', 'held-out motion, each individual')
+    xlabel, ylabel = 'time of exploration [min]', '‖θ_est − θ_sensor‖ [rad]'
+    plots.tidy(left, xlabel, ylabel, 'while exploring', legend='below')
+    title = 'held-out motion, each individual'
+    plots.tidy(right, 'samples at rest', 'mean error [rad]', title, legend='below')
     for panel in (left, right):
         panel.set_ylim(bottom=0.0)
-        panel.legend(fontsize=9)
-    seeds = ', '.join(map(str, individuals.rows))
-    caption = (
+    return figure, (
         'Left: error of the estimate during online learning (10 s running means; bold: mean over '
-        f'individuals {seeds}, pale: each), with the exponential fit of the paper. Right: error on '
-        'the motion never used for learning, after every update.'
+        f'individuals {", ".join(map(str, rows))}, pale: each), with the exponential fit of the '
+        'paper. Right: error on the motion never used for learning, after every update.'
     )
-    return [plots.Plot('online_learning', figure, caption)]
 
 
-EXPERIMENT = Experiment(
-    description=__doc__,
-    paper=(
-        'Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s random tension, '
-        'T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from '
-        '0.324 to 0.154 rad.'
-    ),
-    weight=12.0,
-    measure=measure,
-    plot=plot,
-)
+ROWS = (
+    Row('estimate, held-out motion, before learning [rad]', '0.414',
+        'paper_before_rad', 'before_rad', 'oracle_rad'),
+    Row('estimate, held-out motion, after learning [rad]', '0.186',
+        'paper_after_rad', 'after_rad', 'oracle_rad', 0.10),
+    Row('error while exploring, exponential fit, start [rad]', '0.324',
+        'paper_fit_start_rad', 'fit_start_rad'),
+    Row('error while exploring, exponential fit, end [rad]', '0.154',
+        'paper_fit_end_rad', 'fit_end_rad'),
+    Row('samples at rest until the error is halved', NOTHING,
+        'paper_samples_to_halve', 'samples_to_halve', digits=0),
+)  # fmt: skip
+EXPERIMENT = Experiment(__doc__, measure, (online_learning,), 12.0, ROWS)

@@ -10,9 +10,9 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from musculoskeletal_ae.experiments.results import read
+from musculoskeletal_ae.experiments.results import read, table
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.experiments.table import ROWS
+from musculoskeletal_ae.experiments.table import NOTHING
 
 TEMPLATE = 'report.html.jinja'  # beside this file
 
@@ -27,22 +27,15 @@ def write_report(folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(command=_command, flat=_flat, cell=_cell)
-    about = next(iter(results.values()))['about']
-    table = [row for row in ROWS if row.number(results, row.default) is not None]
+    environment.filters.update(flat=_flat, cell=_cell)
     page = environment.get_template(TEMPLATE).render(
         results=results,
         experiments=EXPERIMENTS,
-        about=about,
-        mixed=any(result['about'] != about for result in results.values()),
-        quick=any(result['about']['quick'] for result in results.values()),
-        table=table,
-        missed=[row.quantity for row in table if (row.missed(results) or 0.0) > 0.0],
+        about=next(iter(results.values()))['about'],
+        table=[line for line in table(results) if line.default != NOTHING],
         images={
-            (name, plot['file']): base64.b64encode(file.read_bytes()).decode('ascii')
-            for name, result in results.items()
-            for plot in result['plots']
-            if (file := folder / name / plot['file']).is_file()
+            f'{file.parent.name}/{file.name}': base64.b64encode(file.read_bytes()).decode('ascii')
+            for file in folder.glob('*/*.png')
         },
     )
     file = folder / 'report.html'
@@ -50,18 +43,8 @@ def write_report(folder: Path) -> Path:
     return file
 
 
-def _command(name: str, about: Mapping[str, Any]) -> str:
-    """Return the command that repeats a result."""
-    seeds = ','.join(map(str, about['seeds']))
-    quick = ' --quick' if about['quick'] else ''
-    return (
-        f'ros2 run musculoskeletal_ae experiment {name} --robot {about["robot"]} '
-        f'--preset {about["preset"]} --seeds {seeds} --minutes {about["minutes"]:g}{quick}'
-    )
-
-
 def _flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
-    """Return nested numbers by their path, without what is not a number of the experiment."""
+    """Return nested numbers by their path."""
     rows: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

@@ -1,10 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the numbers of individuals to result.json: means over them, and each of them."""
+"""What a call leaves in its folder: result.json and plots of every experiment, the README's table.
+
+python -m musculoskeletal_ae.experiments.results README.md
+
+writes the README's table anew from the result.json files in doc/results beside it; `experiment …
+--readme README.md` first puts what it measured there.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +21,9 @@ import numpy as np
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
-from musculoskeletal_ae.experiments.runner import EXPERIMENTS, Everything
-from musculoskeletal_ae.experiments.study import Individuals, Study
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS
+from musculoskeletal_ae.experiments.study import Rows, Study
+from musculoskeletal_ae.experiments.table import Cells, markdown
 
 #: result.json of every experiment that was run, by name
 Results = Mapping[str, Mapping[str, Any]]
@@ -22,27 +31,27 @@ Results = Mapping[str, Mapping[str, Any]]
 #: counted in all, not per individual: the hour of healthy motion is spread over the seeds
 TOTALS = ('false_alarms', 'false_alarms_beside_cuts', 'healthy_s', 'counted_cuts')
 DIGITS = 6  # significant; more is noise
+BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the README's table
+KEPT = Path('doc/results')
 
 
-def write(study: Study, measured: Everything, out: Path) -> list[Path]:
+def write(study: Study, measured: Mapping[str, Rows], out: Path) -> list[Path]:
     """Write result.json and plots of every experiment below a folder; return the files.
 
     Raises:
         MusculoskeletalError: If a number is not finite.
     """
-    robot, files = study.body(), []
+    files = []
     for name, rows in measured.items():
-        folder = out / name
-        result = combined(study, {seed: row.numbers for seed, row in rows.items()})
-        plots = EXPERIMENTS[name].plot(Individuals(study, robot, rows))
-        result['plots'] = [{'file': f'{p.name}.png', 'caption': p.caption} for p in plots]
+        folder, result = out / name, combined(study, rows)
+        drawn = {f'{draw.__name__}.png': draw(study, rows) for draw in EXPERIMENTS[name].plots}
+        result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
         folder.mkdir(parents=True, exist_ok=True)
-        files.append(folder / 'result.json')
         text = json.dumps(result, indent=1, ensure_ascii=False)
-        files[-1].write_text(text + '\n', encoding='utf-8')
-        for plot in plots:
-            files.append(folder / f'{plot.name}.png')
-            plot.figure.savefig(files[-1], dpi=DPI)
+        (folder / 'result.json').write_text(text + '\n', encoding='utf-8')
+        for file, (figure, _) in drawn.items():
+            figure.savefig(folder / file, dpi=DPI)
+        files += [folder / file for file in ('result.json', *drawn)]
     return files
 
 
@@ -56,18 +65,19 @@ def read(folder: Path) -> Results:
     }
 
 
-def combined(study: Study, by_seed: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+def combined(study: Study, rows: Rows) -> dict[str, Any]:
     """Return result.json of one experiment, without its plots."""
-    result: dict[str, Any] = _mean(list(by_seed.values()))
-    result['about'] = {
-        'robot': Path(study.robot).name,
+    numbers = {str(seed): row.numbers for seed, row in rows.items()}
+    about = {
+        'robot': study.robot.description.directory.name,
         'preset': study.preset,
         'minutes': study.minutes,
         'quick': study.quick,
-        'seeds': list(by_seed),
+        'seeds': list(rows),
     }
-    result['seeds'] = {str(seed): numbers for seed, numbers in by_seed.items()}
-    rounded: dict[str, Any] = _rounded(result)
+    rounded: dict[str, Any] = _rounded(
+        {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
+    )
     return rounded
 
 
@@ -81,10 +91,8 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             result[key] = first if len(set(values)) == 1 else sorted(set(values))
         elif key in TOTALS:
             result[key] = sum(values)
-        elif isinstance(first, list):
-            result[key] = np.mean(values, axis=0).tolist()
         else:
-            result[key] = float(np.mean(values))
+            result[key] = np.mean(values, axis=0).tolist()
     return result
 
 
@@ -99,3 +107,45 @@ def _rounded(value: Any) -> Any:
             raise MusculoskeletalError('an experiment brought a number that is not finite')
         return float(f'{value:.{DIGITS}g}')
     return value
+
+
+def table(results: Results) -> list[Cells]:
+    """Return the lines of the results table."""
+    return [
+        row.cells(results.get(name, {}))
+        for name, experiment in EXPERIMENTS.items()
+        for row in experiment.rows
+    ]
+
+
+def readme_table(results: Results) -> str:
+    """Return what stands between the README's markers."""
+    if not results:
+        return '\n\nNothing measured yet: `experiment all --readme README.md`.\n\n'
+    return f'\n\n{markdown(next(iter(results.values()))["about"], table(results))}\n\n'
+
+
+def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
+    """Write the table of a README from the results kept beside it; return the files written.
+
+    The result.json files of the folder `measured` are kept first.
+
+    Raises:
+        MusculoskeletalError: If the README has no place between markers.
+    """
+    text, kept, files = readme.read_text(encoding='utf-8'), readme.parent / KEPT, []
+    if text.count(BEGIN) != 1 or text.count(END) != 1:
+        raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and one {END}')
+    if measured is not None and measured.resolve() != kept.resolve():
+        for name in read(measured):
+            files.append(kept / name / 'result.json')
+            files[-1].parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(measured / name / 'result.json', files[-1])
+    head, rest = text.split(BEGIN)
+    table_text = readme_table(read(kept))
+    readme.write_text(f'{head}{BEGIN}{table_text}{END}{rest.split(END)[1]}', encoding='utf-8')
+    return [*files, readme]
+
+
+if __name__ == '__main__':
+    update_readme(Path(sys.argv[1]))

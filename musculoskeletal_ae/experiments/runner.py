@@ -37,65 +37,52 @@ EXPERIMENTS = {
     'body_change': body_change.EXPERIMENT,
 }
 LEARNING = 'online_learning'
-TRAINING_WEIGHT = 1.0
-POLL = 0.5  # [s] between looks at the progress
-
-#: by name of the experiment, then by seed
-Everything = dict[str, dict[int, Measured]]
+POLL = 0.5  # [s] between two reports
 
 # Threads of the numeric libraries would fight with the processes for the cores.
 SINGLE = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}
 
-_done: Any = None  # shared counter of finished work, in a worker
-
-
-def total_weight(study: Study, names: Sequence[str]) -> float:
-    """Return the work of a call, in the units of the progress bar."""
-    each = sum(EXPERIMENTS[name].weight for name in {LEARNING, *names})
-    return len(PRESETS) * TRAINING_WEIGHT + len(study.seeds) * each
-
 
 def run(
     study: Study, names: Sequence[str], jobs: int, report: Callable[[float, str], None]
-) -> Everything:
-    """Measure experiments on all individuals.
+) -> dict[str, dict[int, Measured]]:
+    """Measure experiments on all individuals; return what they say by experiment, then by seed.
 
     Args:
         study: What is measured.
         names: Of experiments.
         jobs: Processes.
-        report: Told from time to time how much work is done, and what is running.
+        report: Told from time to time which share of the work is done, and what is running.
     """
-    os.environ.update({name: os.environ.get(name, value) for name, value in SINGLE.items()})
-    context = multiprocessing.get_context('spawn')
-    done = context.Value('d', 0.0)
-    pool = ProcessPoolExecutor(jobs, context, _start, (done,))
+    os.environ.update(SINGLE | dict(os.environ))
+    weights = {name: experiment.weight for name, experiment in EXPERIMENTS.items()}
+    total = len(PRESETS) + len(study.seeds) * sum(weights[name] for name in {LEARNING, *names})
     # The longest first, so that none of them is alone at the end.
-    later = sorted({*names} - {LEARNING}, key=lambda name: -EXPERIMENTS[name].weight)
-    untrained = set(PRESETS)
-    measured: Everything = {name: {} for name in names}
-    running: dict[Future[Any], tuple[str, int]] = {}
+    others = sorted(set(names) - {LEARNING}, key=weights.__getitem__, reverse=True)
+    measured: dict[str, dict[int, Measured]] = {name: {} for name in names}
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start)
+    done, running = 0.0, dict[Future[Any], tuple[str, int]]()
 
-    def submit(parts: Sequence[str], seed: int) -> None:
-        running.update({pool.submit(_measure, study, name, seed): (name, seed) for name in parts})
+    def submit(name: str, seed: int) -> None:
+        running[pool.submit(EXPERIMENTS[name].measure, study, seed)] = name, seed
 
     try:
         for preset in PRESETS:
-            running[pool.submit(_train, study, preset)] = preset, -1
+            running[pool.submit(online_learning.train_initial, study, preset)] = preset, -1
         while running:
             ended, _ = wait(running, POLL, FIRST_COMPLETED)
             for future in ended:
                 (name, seed), result = running.pop(future), future.result()
-                if name in untrained:
-                    untrained.remove(name)
-                    for each in () if untrained else study.seeds:
-                        submit([LEARNING], each)
-                    continue
+                done += weights.get(name, 1.0)  # initial training: 1
                 if name in measured:
                     measured[name][seed] = result
                 if name == LEARNING:
-                    submit(later, seed)
-            report(done.value, ', '.join(sorted({name for name, _ in running.values()})))
+                    for other in others:
+                        submit(other, seed)
+                elif name in PRESETS and not running:  # both are trained
+                    for each in study.seeds:
+                        submit(LEARNING, each)
+            report(done / total, ', '.join(sorted({name for name, _ in running.values()})))
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         for child in multiprocessing.active_children():
@@ -105,37 +92,9 @@ def run(
     return {name: {seed: measured[name][seed] for seed in study.seeds} for name in names}
 
 
-# -- in a worker --------------------------------------------------------------------------------
-
-
-def _start(done: Any) -> None:
-    global _done  # a process pool hands its workers nothing else
-    _done = done
+def _start() -> None:
     # Ctrl-C reaches the whole group; the parent ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     import torch
 
     torch.set_num_threads(1)
-
-
-def _count(work: float) -> None:
-    with _done.get_lock():
-        _done.value += work
-
-
-def _train(study: Study, preset: str) -> None:
-    online_learning.train_initial(study, preset)
-    _count(TRAINING_WEIGHT)
-
-
-def _measure(study: Study, name: str, seed: int) -> Measured:
-    experiment, counted = EXPERIMENTS[name], 0.0
-
-    def progress(share: float) -> None:
-        nonlocal counted
-        counted += share
-        _count(share * experiment.weight)
-
-    measured = experiment.measure(study, seed, progress)
-    _count((1.0 - counted) * experiment.weight)
-    return measured

@@ -1,184 +1,126 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one call of `experiment` measures, what an experiment is, and what its parts hand on.
+"""What one call of `experiment` measures, what an experiment is, and what experiments share.
 
 An individual's sensor streams and learned networks are made once (`online_learning`) and kept in a
 folder; the other experiments read them there, each in its own process if cores allow.
+
+A new experiment is a file beside this one that ends in `EXPERIMENT = Experiment(__doc__, …)`, and a
+line in `runner.EXPERIMENTS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.experiments.plots import Plot
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.learning.learner import STEPS
+from musculoskeletal_ae.experiments.table import Row
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-HEALTHY_HOUR = 3600.0  # [s] of motion for false alarms, over all individuals
-
-Stream = Literal['exploring', 'held_out']
-#: told which share of an experiment's work has been done since it was told last
-Progress = Callable[[float], None]
-
 
 class Rests(NamedTuple):
-    """The samples at rest that a learner stored: θ [rad] (N, D), T [N] (N, M), l [m] (N, M)."""
+    """The N samples at rest that a learner stored."""
 
-    theta: Array
-    tension: Array
-    length: Array
+    theta: Array  # [rad], (N, D)
+    tension: Array  # [N], (N, M)
+    length: Array  # [m], (N, M)
 
 
 @dataclass(frozen=True)
 class Study:
-    """Options of one call.
+    """Options of one call, and what its experiments hand each other."""
 
-    Attributes:
-        robot: Name or directory.
-        preset: Of the networks that are shown as `before` and `after`.
-        seeds: Individuals.
-        minutes: Duration of the exploration.
-        quick: A fraction of everything, to try things out.
-        folder: Where streams and networks are kept.
-    """
-
-    robot: str
-    preset: str
-    seeds: tuple[int, ...]
-    minutes: float
-    quick: bool
-    folder: Path
+    robot: Robot
+    preset: str  # of the networks that are shown as `before` and `after`
+    seeds: tuple[int, ...]  # individuals
+    minutes: float  # duration of the exploration
+    quick: bool  # a fraction of everything, to try things out
+    folder: Path  # where streams and networks are kept
 
     @property
     def held_out_time(self) -> float:
         """Duration of the motion never used for learning [s]."""
         return 20.0 if self.quick else 300.0
 
-    @property
-    def healthy_time(self) -> float:
-        """Healthy motion of each individual [s]; an hour in all."""
-        return 20.0 if self.quick else HEALTHY_HOUR / len(self.seeds)
+    def arm(self, seed: int, friction: bool = True) -> EmulatedArm:
+        """Return an individual at rest; this is the one place where experiments get their arms.
 
-    @property
-    def initial_steps(self) -> int | None:
-        """Mini-batches of initial training; None for the preset's own number."""
-        return 300 if self.quick else None
-
-    @property
-    def update_steps(self) -> int:
-        """Training steps of one online update."""
-        return STEPS // 5 if self.quick else STEPS
-
-    @property
-    def approaches(self) -> int:
-        """How many θ_eval, and how many starts for each."""
-        return 1 if self.quick else 5
-
-    def body(self) -> Robot:
-        """Return the geometric model."""
-        return Robot.load(self.robot)
-
-    # -- what parts hand each other -------------------------------------------------------------
+        Without friction, in wires and joints, it is the same body otherwise.
+        """
+        individual = Individual(self.robot, seed)
+        if not friction:
+            individual.cable_friction[:] = 0.0
+            individual.joint_friction[:] = 0.0
+        return EmulatedArm(self.robot, seed, individual)
 
     def network_file(self, preset: str, seed: int | None) -> Path:
-        """Return the file of a network: initial, or learned on an individual."""
+        """Return the file of a network: initial (None), or learned on an individual."""
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
-    def initial(self, robot: Robot, preset: str | None = None) -> Mae:
-        """Return the network before any learning."""
-        return checkpoint.load(self.network_file(preset or self.preset, None), robot)
+    def network(self, seed: int | None, preset: str = '') -> Mae:
+        """Return a network: initial (None), or learned on an individual."""
+        return checkpoint.load(self.network_file(preset or self.preset, seed), self.robot)
 
-    def learned(self, robot: Robot, seed: int, preset: str | None = None) -> Mae:
-        """Return the network after exploration by an individual."""
-        return checkpoint.load(self.network_file(preset or self.preset, seed), robot)
+    def networks(self, seed: int, preset: str = '') -> dict[str, Mae]:
+        """Return the networks `before` and `after` learning on an individual."""
+        return {'before': self.network(None, preset), 'after': self.network(seed, preset)}
 
-    def keep_stream(self, seed: int, name: Stream, recording: Recording) -> None:
-        """Keep a recording of an individual."""
-        np.savez(self.folder / f'{name}_{seed}.npz', *recording)
+    def keep(self, seed: int, **arrays: Recording | Rests) -> None:
+        """Keep an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
+        for name, values in arrays.items():
+            np.savez(self.folder / f'{name}_{seed}.npz', *values)
 
-    def stream(self, seed: int, name: Stream) -> Recording:
-        """Return a recording that was kept."""
-        with np.load(self.folder / f'{name}_{seed}.npz') as arrays:
-            return Recording(*arrays.values())
-
-    def keep_rests(self, seed: int, rests: Rests) -> None:
-        """Keep what a learner stored of an individual."""
-        np.savez(self.folder / f'rests_{seed}.npz', *rests)
+    def stream(self, seed: int, name: str) -> Recording:
+        """Return a stream that was kept."""
+        return Recording(*self._kept(seed, name))
 
     def rests(self, seed: int) -> Rests:
-        """Return what the learner stored."""
-        with np.load(self.folder / f'rests_{seed}.npz') as arrays:
-            return Rests(*arrays.values())
+        """Return the samples at rest that were kept."""
+        return Rests(*self._kept(seed, 'rests'))
+
+    def _kept(self, seed: int, name: str) -> list[Array]:
+        with np.load(self.folder / f'{name}_{seed}.npz') as arrays:
+            return list(arrays.values())
+
+    def keyed(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a preset's numbers as result.json names them: those of preset paper `paper_…`."""
+        named = ('', self.preset), ('paper_', 'paper')
+        prefixes = [prefix for prefix, name in named if name == preset]
+        return {prefix + key: value for prefix in prefixes for key, value in numbers.items()}
 
 
-@dataclass
-class Measured:
-    """What an experiment says of one individual.
+class Measured(NamedTuple):
+    """What an experiment says of one individual."""
 
-    Attributes:
-        numbers: For result.json; nested dictionaries of finite numbers, text or lists.
-        traces: Arrays for the plots, by name.
-    """
-
-    numbers: dict[str, Any]
-    traces: dict[str, Any] = field(default_factory=dict)
+    numbers: dict[str, Any]  # for result.json: nested dictionaries of finite numbers, text or lists
+    traces: dict[str, Any]  # for the plots
 
 
-class Individuals(NamedTuple):
-    """What an experiment says of all individuals, for its plots.
+Rows = Mapping[int, Measured]  # what an experiment says of its individuals, by seed
+Plot = tuple[Figure, str]  # and its caption
 
-    Attributes:
-        study: Which call measured it.
-        robot: The geometric model.
-        rows: By seed.
-    """
 
-    study: Study
-    robot: Robot
-    rows: Mapping[int, Measured]
-
-    @property
-    def first(self) -> tuple[int, Measured]:
-        """Seed and measurements of the individual that plots of a single one show."""
-        return next(iter(self.rows.items()))
-
-    @property
-    def numbers(self) -> list[dict[str, Any]]:
-        """Numbers of every individual."""
-        return [row.numbers for row in self.rows.values()]
+def first(rows: Rows) -> tuple[int, Measured]:
+    """Return the individual that plots of a single one show, with its seed."""
+    return next(iter(rows.items()))
 
 
 class Experiment(NamedTuple):
-    """One experiment: how it is measured on an individual, drawn and explained.
+    """One experiment: how it is measured on an individual, drawn and explained."""
 
-    Attributes:
-        description: Its heading in the report and how it is measured: its module's docstring.
-        paper: What the paper did and found, on Musashi.
-        weight: How long it takes beside the others; for order and progress bar only.
-        measure: Returns numbers and traces of the individual of a seed.
-        plot: Draws them.
-    """
-
-    description: str | None
-    paper: str
-    weight: float
-    measure: Callable[[Study, int, Progress], Measured]
-    plot: Callable[[Individuals], list[Plot]]
-
-    @property
-    def title(self) -> str:
-        """Heading in the report."""
-        return (self.description or '').partition('\n')[0].rstrip('.')
-
-    @property
-    def here(self) -> str:
-        """How it is measured here."""
-        return (self.description or '').partition('\n')[2].strip()
+    #: the module's docstring: heading; "Paper. …", what the paper did and found; "Here. …"
+    text: str | None
+    measure: Callable[[Study, int], Measured]  # of the individual of a seed
+    plots: tuple[Callable[[Study, Rows], Plot], ...]  # functions named as the files they draw
+    weight: float  # how long it takes beside the others; for order and progress bar only
+    rows: tuple[Row, ...] = ()  # of the results table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The corrected body: the geometric model with other constants, plus a smooth rest.
+"""The corrected body: the geometric model with other constants, plus a smooth rest; and its fit.
 
     l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o + ψ(θ)ᵀ v
 
@@ -8,13 +8,30 @@ sensor by its zero (o), wires wrap round bones that the straight lines do not kn
 Fourier features over the joints that the muscle crosses), and a wire that slides reads a tension
 that differs from the one at its elastic unit (μ: friction of the route, s: direction of the last
 sliding, +1 wound in, −1 paid out). All parameters zero is the geometric model itself.
+
+The fit to samples is maximum a posteriori, muscle by muscle, robustly:
+
+    min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k (w_k / s_k)²
+
+by Gauss–Newton from where the last fit ended. The prior spreads s are physical: how far a hand
+places an attachment, how far elastic units of one kind differ. The weights ω are those of a
+Student distribution, so that a sample taken while the arm was touched, or a glitch, counts little.
+
+The torque balance at rest, g(θ) + Gᵀ T = 0 (PIMBS), is not fitted: what is learned from the lengths
+alone meets it as well as the true body does, which is as well as friction lets anyone
+(`bench/torque_residual` measures both).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -27,45 +44,23 @@ LARGEST_LOG = 1.5
 
 
 class Layout:
-    """Where the parameters of one muscle are.
-
-    Attributes:
-        points: Its route points.
-        attachment: δ, three per route point [m].
-        elastic: κ: logarithms of force, rate, wire_stretch over the nominal ones.
-        friction: μ.
-        offset: o [m].
-        rest: v [m].
-        size: Number of parameters.
-    """
+    """Where the parameters of one muscle are: δ (three per route point), κ, μ, o, v."""
 
     def __init__(self, points: Ints, features: int) -> None:
-        """Lay out δ, κ, μ, o, v in this order."""
         end = 3 * len(points)
-        self.points = points
-        self.attachment, self.elastic = slice(0, end), slice(end, end + 3)
-        self.friction, self.offset = end + 3, end + 4
+        self.points = points  # its route points
+        self.attachment = slice(0, end)  # δ [m]
+        self.elastic = slice(end, end + 3)  # κ: log of force, rate, wire_stretch over nominal ones
+        self.friction, self.offset = end + 3, end + 4  # μ; o [m]
         self.size = end + 5 + features
-        self.rest = slice(end + 5, self.size)
+        self.rest = slice(end + 5, self.size)  # v [m]
 
 
 class CorrectedBody:
-    """Lengths of the corrected body, and how they change with its parameters.
-
-    Attributes:
-        robot: The geometric model that is corrected.
-        layouts: Where each muscle's parameters are.
-        parameters: One vector per muscle.
-    """
+    """Lengths of the corrected body, and how they change with its `parameters`."""
 
     def __init__(self, robot: Robot, parameters: list[Array] | None = None, seed: int = 0) -> None:
-        """Start from the geometric model, or from given parameters.
-
-        Args:
-            robot: The geometric model.
-            parameters: One vector per muscle; zero by default.
-            seed: Draws the smooth features.
-        """
+        """Correct `robot` by one vector per muscle, zero by default; `seed` draws the features."""
         self.robot = robot
         routes, kin = robot.routes, robot.kinematics
         span = robot.upper - robot.lower
@@ -84,8 +79,6 @@ class CorrectedBody:
             self._frequency.append(frequency * crossed / (WIDTH * span))
             self._phase.append(rng.uniform(0.0, 2.0 * np.pi, features))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
-
-    # -- parts ----------------------------------------------------------------------------------
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the constants of one muscle, arrays of shape ()."""
@@ -120,15 +113,10 @@ class CorrectedBody:
         values = np.cos(theta @ self._frequency[m].T + self._phase[m]) - np.cos(self._phase[m])
         return scale * values
 
-    # -- lengths --------------------------------------------------------------------------------
-
     def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
         """Return l [m] (N, M) at θ [rad] (N, D) and the motors' T [N] (N, M).
 
-        Args:
-            theta: θ.
-            tension: T where the modules measure it.
-            direction: For each result s in [−1, 1], shape (N, M); 0 is the mean of both directions.
+        One result for each direction s in [−1, 1], shape (N, M); 0 is the mean of both directions.
         """
         result = tuple(np.empty_like(tension) for _ in direction)
         poses = self.poses(theta)
@@ -149,12 +137,7 @@ class CorrectedBody:
     ) -> tuple[Array, Array]:
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
-        Args:
-            poses: Of θ, from `poses`.
-            theta: θ [rad], shape (N, D).
-            tension: T_i at the motor [N], shape (N,).
-            direction: s_i in [−1, 1], shape (N,).
-            m: The muscle.
+        θ [rad] (N, D) comes with its `poses`; T_i [N] and s_i are the muscle's own, shape (N,).
         """
         layout, parameters = self.layouts[m], self.parameters[m]
         world, turn = self._world(poses, m)
@@ -186,3 +169,161 @@ class CorrectedBody:
         jacobian[:, layout.offset] = 1.0
         jacobian[:, layout.rest] = smooth
         return length, jacobian
+
+
+# -- the fit --------------------------------------------------------------------------------------
+
+FREEDOM = 4.0  # of the Student distribution
+ROUNDS = 6  # of Gauss–Newton per fit
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a Gauss–Newton step, tried until one lowers the cost
+FIRST_NOISE = 0.002  # [m], before anything is known
+LEAST_NOISE = 0.0003  # [m] of a length at rest, beyond what all the rest explains
+#: samples from before a muscle changed that are enough to start from what they said
+LEAST_ANCHOR = 8
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How much a body differs from its geometric model (one standard deviation each)."""
+
+    attachment: float = 0.007  # each coordinate of each route point [m]
+    elastic: float = 0.2  # logarithm of each elastic constant
+    friction: float = 0.05  # relative tension loss along the route, around its mean
+    friction_mean: float = 0.05
+    offset: float = 0.001  # zero of the length sensor [m]
+    smooth: float = 0.002  # the smooth rest [m]
+
+    def spread(self, layout: Layout) -> Array:
+        """Return s of every parameter of a muscle."""
+        spread = np.empty(layout.size)
+        spread[layout.attachment] = self.attachment
+        spread[layout.elastic] = self.elastic
+        spread[layout.friction] = self.friction
+        spread[layout.offset] = self.offset
+        spread[layout.rest] = self.smooth
+        return spread
+
+    def mean(self, layout: Layout) -> Array:
+        """Return the prior mean of every parameter of a muscle."""
+        mean = np.zeros(layout.size)
+        mean[layout.friction] = self.friction_mean
+        return mean
+
+
+PRIOR = Prior()
+#: of a muscle that was replaced or re-wired, around what it was before
+REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
+
+
+class Fit(NamedTuple):
+    """What a fit says of the samples."""
+
+    residual: Array  # l − l(θ, T; w) [m], (N, M)
+    noise: Array  # σ of each muscle [m], (M,)
+    weight: Array  # ω in (0, 1], (N, M); 0 where a sample says nothing about a muscle
+
+
+def fit_body(
+    body: CorrectedBody,
+    seen: Observations,
+    prior_mean: list[Array] | None = None,
+    least_noise: float = LEAST_NOISE,
+) -> Fit:
+    """Fit the parameters of a body in place, from the present ones.
+
+    A muscle with samples that say nothing about it any more was changed: what they said is where
+    its new parameters are looked for. In the place of the geometric model come the parameters
+    `prior_mean` where some were learned before, without the samples that they came from.
+    """
+    poses = body.poses(seen.theta)
+    parts = []
+    for m, layout in enumerate(body.layouts):
+        known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
+        if prior_mean is not None:
+            mean = prior_mean[m]
+        if (~known).sum() >= LEAST_ANCHOR:
+            _fit_muscle(body, poses, seen, ~known, mean, spread, least_noise, m)
+            mean, spread = body.parameters[m], REOPENED.spread(layout)
+        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, least_noise, m))
+    residual, noise, weight = zip(*parts, strict=True)
+    return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
+
+
+def _fit_muscle(
+    body: CorrectedBody,
+    poses: JointPoses,
+    seen: Observations,
+    used: Bools,
+    mean: Array,
+    spread: Array,
+    least_noise: float,
+    m: int,
+) -> tuple[Array, float, Array]:
+    precision, known = 1.0 / spread**2, used.astype(float)
+    noise, weight = FIRST_NOISE, known
+
+    def linearised(parameters: Array) -> tuple[Array, Array]:
+        body.parameters[m] = parameters
+        tension, direction = seen.tension[:, m], seen.direction[:, m]
+        length, jacobian = body.linearised(poses, seen.theta, tension, direction, m)
+        return seen.length[:, m] - length, jacobian
+
+    def cost() -> float:
+        deviation = body.parameters[m] - mean
+        return float(weight / noise**2 @ residual**2 + precision @ deviation**2)
+
+    residual, jacobian = linearised(body.parameters[m])
+    for _ in range(ROUNDS):
+        at = body.parameters[m]
+        target = residual + jacobian @ at
+        # The robust weights are iterated within one linearisation.
+        for _ in range(3):
+            weighted = jacobian * (weight / noise**2)[:, None]
+            curvature = weighted.T @ jacobian
+            normal = curvature + np.diag(precision)
+            best = np.linalg.solve(normal, weighted.T @ target + precision * mean)
+            determined = np.trace(np.linalg.solve(normal, curvature))
+            freedom = max(1.0, float(known.sum() - determined))
+            left = target - jacobian @ best
+            noise, weight = _noise_and_weight(left, known, noise, freedom, least_noise)
+
+        highest = cost()
+        for share in SHARES:
+            residual, jacobian = linearised(at + share * (best - at))
+            if cost() <= highest:
+                break
+        else:
+            residual, jacobian = linearised(at)
+            break
+    noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
+    return residual, noise, weight
+
+
+def _noise_and_weight(
+    residual: Array, known: Array, noise: float, freedom: float, least: float
+) -> tuple[float, Array]:
+    """One step of the EM algorithm for the scale and weights of a Student distribution."""
+    weight = known * (FREEDOM + 1.0) / (FREEDOM + (residual / noise) ** 2)
+    variance = (weight @ residual**2 + 4.0 * least**2) / (freedom + 4.0)
+    return max(least, float(np.sqrt(variance))), weight
+
+
+NETWORK_STATES = 400  # that a network is asked for
+NETWORK_ERROR = 0.001  # [m] by which its lengths may err
+
+
+def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
+    """Fit a body in place to the lengths that a network restores which has learned a real arm.
+
+    A checkpoint carries what was learned of an arm, but not the samples (`train --from-bag`,
+    another machine, a lost state). The first samples after that then correct the body that the
+    network knows instead of replacing it by the geometric model.
+    """
+    robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
+    theta = robot.random_postures(NETWORK_STATES, rng)
+    shape = NETWORK_STATES, robot.muscle_count
+    tension = rng.uniform(robot.tension.bias, robot.tension.limit, shape)
+    everything = np.ones(shape, dtype=bool)
+    lengths = mae.lengths(theta, tension)
+    seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
+    fit_body(body, seen, least_noise=NETWORK_ERROR)

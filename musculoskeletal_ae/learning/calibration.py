@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, residuals
+from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept
@@ -41,38 +42,29 @@ GLITCHES, GLITCH = 0.002, 3.0
 
 
 class Healthy(NamedTuple):
-    """What was seen of the healthy arm since it was last changed.
+    """What was seen of the healthy arm since it was last changed."""
 
-    Attributes:
-        messages: (T, l), shape (N, 2M).
-        time: Time that they were drawn from [s].
-        rests: How many different rests there were within.
-    """
-
-    messages: NDArray[np.float32]
-    time: float
-    rests: int
+    messages: NDArray[np.float32]  # (T, l), (N, 2M)
+    time: float  # that they were drawn from [s]
+    rests: int  # how many different ones there were within
 
 
 class Reservoir:
-    """A uniform draw of bounded size from all messages of the healthy arm.
-
-    Attributes:
-        time: Healthy time seen [s].
-    """
+    """A uniform draw of bounded size from all messages of the healthy arm, and its rests."""
 
     def __init__(
         self,
         muscles: int,
         seed: int = 0,
-        novelty: Novelty | None = None,
+        settings: Settings = DEFAULT,
         capacity: int = CAPACITY,
     ) -> None:
-        """Start empty; rests differ by `novelty`."""
+        """Start empty; rests differ as samples do."""
         self._rng = np.random.default_rng([seed, 0x4E])
         self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
-        self._rests = SampleStore(novelty)
-        self._seen, self._since, self.time = 0, 0.0, 0.0
+        self._rests = SampleStore(settings)
+        self._seen, self._since = 0, 0.0
+        self.time = 0.0  # healthy time seen [s]
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
         """Take a message."""
@@ -107,13 +99,7 @@ def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, s
     """Return a network with statistics of its residuals, at least as trusted as those before.
 
     After a restart the messages are few, and the calibrated statistics of the network that was
-    saved serve its successors until there are enough.
-
-    Args:
-        mae: The network.
-        before: Statistics of its predecessor.
-        healthy: What the healthy arm showed.
-        samples: How many samples the network has learned.
+    saved (`before`) serve its successors until there are enough. `samples` is the number learned.
     """
     statistics = calibrate(mae, healthy, samples)
     keep = before is not None and before.calibrated
@@ -135,10 +121,7 @@ def is_calibrated(mae: Mae) -> bool:
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
-    """Return statistics of a network's residuals, or None where there is too little.
-
-    Arguments as `recalibrated`.
-    """
+    """Return statistics of a network's residuals, or None where there is too little."""
     if len(healthy.messages) < 2:
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
@@ -148,16 +131,15 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
     # Each message has its part whatever is left out, so that a glitch moves no other one.
     first = np.arange(len(error)) % 2 == 0
-    part = _regularised(AnomalyStatistics.of(error[sound & first], calibrated))
-    statistics = _regularised(AnomalyStatistics.of(error[sound], calibrated))
+    part = _statistics(error[sound & first], calibrated)
+    statistics = _statistics(error[sound], calibrated)
     largest = max(
         distances(part, error[sound & ~first]).max(initial=0.0),
         distances(statistics, error[sound]).max(),
     )
-    norm = sum(np.linalg.norm(half, axis=1) for half in np.split(error[sound], 2, axis=1))
     thresholds = {
         DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
-        'norm': float(np.max(norm)),
+        'norm': float(anomaly(error[sound]).max()),
     }
     return replace(statistics, thresholds=thresholds)
 
@@ -170,10 +152,8 @@ def _glitches(error: Array) -> Bools:
     middle = np.median(error, axis=0)
     spread = np.median(np.abs(error - middle), axis=0) + FLOOR
     order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
-    distance = distances(_regularised(AnomalyStatistics.of(error[order[:-few]], False)), error)
-    rest = np.sort(distance)[-few - 1]
-    glitches: Bools = distance > GLITCH * rest
-    return glitches
+    distance = distances(_statistics(error[order[:-few]]), error)
+    return np.greater(distance, GLITCH * np.sort(distance)[-few - 1])
 
 
 def distances(statistics: AnomalyStatistics, error: Array) -> Array:
@@ -183,7 +163,8 @@ def distances(statistics: AnomalyStatistics, error: Array) -> Array:
     return np.sqrt(squares)
 
 
-def _regularised(statistics: AnomalyStatistics) -> AnomalyStatistics:
+def _statistics(error: Array, calibrated: bool = False) -> AnomalyStatistics:
+    statistics = AnomalyStatistics.of(error, calibrated)
     covariance = statistics.covariance
     mixed = (1.0 - DIAGONAL_SHARE) * covariance + DIAGONAL_SHARE * np.diag(np.diag(covariance))
     return replace(statistics, covariance=mixed)

@@ -14,7 +14,6 @@ that, so that a recording steps exactly what runs on a robot, but that training 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +22,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
-from musculoskeletal_ae.learning.rest import RestCollector, RestSettings
-from musculoskeletal_ae.learning.samples import Novelty, Sample, SampleStore
+from musculoskeletal_ae.learning.rest import RestCollector
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
 from musculoskeletal_ae.learning.state import State
 from musculoskeletal_ae.learning.training import Job, Training, Update
 from musculoskeletal_ae.mae import checkpoint
@@ -33,52 +33,27 @@ from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.report import Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 
-STEPS = 100  # of training in one update of preset default
 #: between the beginnings of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
 
 
 class Learner:
-    """Learns the body of one arm.
-
-    Attributes:
-        robot: The geometric model.
-        samples: What is learned from.
-        checkpoint: The network as learned so far; None without.
-        enabled: Whether it learns.
-        training: Where updates are made.
-        updates: How many updates there were.
-        last_update: What came of the last one; None before.
-        published: How many checkpoints `poll` has given out.
-    """
+    """Learns the body of one arm."""
 
     def __init__(
         self,
         robot: Robot,
-        mae: Mae | None = None,
+        mae: Mae | None = None,  # fits the robot; None: wait for one
         preset: str = 'default',
         seed: int = 0,
         *,
-        steps: int = STEPS,
-        period: float = 0.01,
-        rest: RestSettings | None = None,
-        novelty: Novelty | None = None,
+        steps: int = STEPS,  # of training per update, in preset default
+        period: float = 0.01,  # of the messages of the muscle modules [s]
+        settings: Settings = DEFAULT,  # what counts as rest, and as new
         training: Callable[[Robot, str, int], Training] = Training,
-        directory: Path | None = None,
+        directory: Path | None = None,  # where samples and network are kept; None for nowhere
     ) -> None:
         """Go on from the saved state, if there is one that fits, else from a network.
-
-        Args:
-            robot: The geometric model.
-            mae: Fits the robot; None: wait for one.
-            preset: How to learn, 'default' or 'paper'.
-            seed: Random seed.
-            steps: Of training per update, in preset default.
-            period: Of the messages of the muscle modules [s].
-            rest: What counts as rest.
-            novelty: What counts as new.
-            training: Makes what makes the updates.
-            directory: Where samples and network are kept; None for nowhere.
 
         Raises:
             MusculoskeletalError: If there is no such preset.
@@ -86,15 +61,16 @@ class Learner:
         """
         self.robot = robot
         self.training = training(robot, preset, seed)
-        self.samples = SampleStore(novelty)
+        self.samples = SampleStore(settings)  # what is learned from
         self._mae: Mae | None = None
-        self.checkpoint: bytes | None = None
+        self.checkpoint: bytes | None = None  # the network as learned so far
         self.enabled = True
         self.last_update: Update | None = None
-        self.updates = self.published = 0
+        self.updates = self.published = 0  # updates made, checkpoints given out
         self._pairing = Pairing(period)
-        self._healthy = Reservoir(robot.muscle_count, seed, novelty)
-        self._rests = RestCollector(robot, rest or RestSettings(), self._healthy)
+        self._healthy = Reservoir(robot.muscle_count, seed, settings)
+        self._rests = RestCollector(robot, settings, self._healthy)
+        self.rejected = self._rests.rejected  # what was not learned from, by reason
         self._steps = steps
         self._news = True  # to learn from, since the last update began
         self._begun = self._given = -math.inf  # the last update, the last checkpoint [s]
@@ -171,35 +147,27 @@ class Learner:
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Begin and end updates; return a checkpoint if one is to be published.
-
-        Args:
-            now: Time [s] on the clock of the messages.
-        """
-        if self._may_begin(now):
-            self._news, self._begun, self._forgot = False, now, False
-            seen, healthy = self.samples.observations(), self._healthy.healthy()
-            self.training.submit(Job(seen, healthy, self._statistics_hold, self._steps))
-        update = self.training.poll()
-        if update is not None:
-            self._take(update)
-        if self._state is not None:
-            self._state.keep(self.samples, self.checkpoint, changed=False)
-        if not self._to_publish or _lately(self._given, now):
-            return None
-        self._to_publish, self._given = False, now
-        self.published += 1
-        return self.checkpoint
-
-    def _may_begin(self, now: float) -> bool:
-        return (
+        """Begin and end updates at `now` [s]; return a checkpoint if one is to be published."""
+        if (
             self._news
             and not _lately(self._begun, now)
             and self.enabled
             and not self._rests.anomaly
             and len(self.samples) >= self.training.preset.least_samples
             and self.training.ready
-        )
+        ):
+            self._news, self._begun, self._forgot = False, now, False
+            seen, healthy = self.samples.observations(), self._healthy.healthy()
+            self.training.submit(Job(seen, healthy, self._statistics_hold, self._steps))
+        update = self.training.poll()
+        if update is not None:
+            self._take(update)
+        self._keep(changed=False)
+        if not self._to_publish or _lately(self._given, now):
+            return None
+        self._to_publish, self._given = False, now
+        self.published += 1
+        return self.checkpoint
 
     def _take(self, update: Update) -> None:
         """Use what came of an update."""
@@ -298,9 +266,9 @@ class Learner:
         self._state.save(self.samples, self.checkpoint)
         return self._state.directory
 
-    def _keep(self) -> None:
+    def _keep(self, changed: bool = True) -> None:
         if self._state is not None:
-            self._state.keep(self.samples, self.checkpoint)
+            self._state.keep(self.samples, self.checkpoint, changed)
 
     def close(self) -> None:
         """End the training process and release the directory."""
@@ -315,11 +283,6 @@ class Learner:
         """The network as learned so far; only where there is a `checkpoint`."""
         assert self._mae is not None
         return self._mae
-
-    @property
-    def rejected(self) -> Counter[str]:
-        """Messages and rests that were not learned from, by reason."""
-        return self._rests.rejected
 
     def report(self) -> Report:
         """Return how it is, for /diagnostics."""
@@ -353,26 +316,22 @@ class Learner:
             values['state directory'] = str(self._state.directory)
             if self._state.not_used:
                 values['saved state not used'] = self._state.not_used
-        if self.last_update is not None:
-            values |= self._values_of(self.last_update)
-        return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}
-
-    def _values_of(self, update: Update) -> dict[str, str]:
-        values = {
-            'error at newest samples': f'{update.error:.4f} rad',
-            'loss': f'{update.loss:.4f}',
-            'update': f'{update.seconds:.2f} s',
-            'anomaly calibrated': str(is_calibrated(update.mae)),
-        }
         muscles = self.robot.muscles
-        if len(update.noise):
-            worst = int(update.noise.argmax())
-            values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({muscles[worst]})'
-        if update.contradicted:
-            names = ', '.join(muscles[m] for m in update.contradicted)
-            what = 'newest samples contradict several muscles'
-            values[what] = f'{names}; look at the joint sensors'
-        return values
+        if (update := self.last_update) is not None:
+            values |= {
+                'error at newest samples': f'{update.error:.4f} rad',
+                'loss': f'{update.loss:.4f}',
+                'update': f'{update.seconds:.2f} s',
+                'anomaly calibrated': str(is_calibrated(update.mae)),
+            }
+            if len(update.noise):
+                worst = int(update.noise.argmax())
+                values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({muscles[worst]})'
+            if update.contradicted:
+                names = ', '.join(muscles[m] for m in update.contradicted)
+                what = 'newest samples contradict several muscles'
+                values[what] = f'{names}; look at the joint sensors'
+        return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}
 
 
 def _lately(then: float, now: float) -> bool:

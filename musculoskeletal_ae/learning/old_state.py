@@ -41,7 +41,7 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
     data = log.read_bytes() if log.exists() else b''
     size = HEAD.size + 8 * (robot.joint_count + 4 * robot.muscle_count)
     records = [data[at : at + size] for at in range(len(header), len(data) - size + 1, size)]
-    whole = [record for record in records if zlib.crc32(record[:4] + record[8:]) == _sum(record)]
+    whole = [r for r in records if zlib.crc32(r[:4] + r[8:]) == HEAD.unpack_from(r)[1]]
     # A header that the disk has damaged costs no sample: whole records where this robot's would be
     # are its own. Another robot's header is whole itself.
     if data and data[: len(header)] != header and (_whole_header(data) or not whole):
@@ -50,10 +50,6 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
         for record in whole:
             _replay(record, robot, samples)
     return problem, network.read_bytes() if network.exists() else None
-
-
-def _sum(record: bytes) -> int:
-    return int(HEAD.unpack_from(record)[1])
 
 
 def _replay(record: bytes, robot: Robot, samples: SampleStore) -> None:

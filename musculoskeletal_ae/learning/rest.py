@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,35 +20,20 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
 MOST = 5000  # readings of one rest: an end where the clock stands still
+LEAST_READINGS = 2  # of θ in half of `rest_time`
 SURE = 3.0  # standard errors that a difference of means may have by chance
-
-
-@dataclass(frozen=True)
-class RestSettings:
-    """What counts as rest.
-
-    Attributes:
-        window: How long the arm has to be still [s].
-        joint_rate: Highest rate of a joint [rad/s].
-        length_rate: Highest rate of a muscle length [m/s].
-        least_readings: Of θ in half a window.
-    """
-
-    window: float = 0.3
-    joint_rate: float = 0.02
-    length_rate: float = 0.002
-    least_readings: int = 2
 
 
 class RestDetector:
     """Turns the stream of readings into one mean per rest."""
 
-    def __init__(self, settings: RestSettings) -> None:
+    def __init__(self, settings: Settings) -> None:
         """Start with an empty window."""
         self.settings = settings
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
@@ -63,15 +47,13 @@ class RestDetector:
         self._still = False
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Take one reading; return the mean of a rest that ended or is long enough.
+        """Take a message, `dt` [s] after the one before, with θ NaN where none was measured.
 
-        Args:
-            reading: One message; its θ is NaN where none was measured.
-            dt: Time since the message before [s].
+        Returns the mean of a rest that ended or is long enough.
         """
         self._time += dt
         self._window.append((self._time, reading))
-        while self._time - self._window[0][0] > self.settings.window + 1e-9:
+        while self._time - self._window[0][0] > self.settings.rest_time + 1e-9:
             self._window.popleft()
         was_still, self._still = self._still, self._is_still()
         if not self._still and not was_still:
@@ -79,24 +61,24 @@ class RestDetector:
         if self._still:
             new = [reading] if was_still else [reading for _, reading in self._window]
             self._rest += filter(_measured, new)
-            self._span = self._span + dt if was_still else self.settings.window
+            self._span = self._span + dt if was_still else self.settings.rest_time
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
         rest, self._rest, self._span = self._rest, [], 0.0
         return Sample(*(np.mean(column, axis=0) for column in zip(*rest))) if rest else None
 
     def _is_still(self) -> bool:
-        half = 0.5 * self.settings.window
-        if self._time - self._window[0][0] < 0.9 * self.settings.window:
+        half = 0.5 * self.settings.rest_time
+        if self._time - self._window[0][0] < 0.9 * self.settings.rest_time:
             return False
         middle = self._time - half
         halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]
         angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
-        if min(map(len, angles)) < self.settings.least_readings:
+        if min(map(len, angles)) < LEAST_READINGS:
             return False
         lengths = [np.array([r.length for r in part]) for part in halves]
-        return _unmoved(angles, self.settings.joint_rate * half) and _unmoved(
-            lengths, self.settings.length_rate * half
+        return _unmoved(angles, self.settings.rest_joint_rate * half) and _unmoved(
+            lengths, self.settings.rest_length_rate * half
         )
 
 
@@ -134,7 +116,6 @@ class FrictionDirection:
     """
 
     def __init__(self) -> None:
-        """Know nothing yet: s = 0."""
         self._length: Array | None = None
 
     def step(self, length: Array, dt: float) -> Array:
@@ -172,20 +153,16 @@ class Waiting(NamedTuple):
 
 
 class RestCollector:
-    """Steps through the messages and gives out the rests that may be learned from.
+    """Steps through the messages and gives out the rests that may be learned from."""
 
-    Attributes:
-        anomaly: Whether an anomaly closes the gate.
-        rejected: Messages that no sensor measures, and rests that are not learned from, by reason.
-    """
-
-    def __init__(self, robot: Robot, settings: RestSettings, healthy: Reservoir) -> None:
+    def __init__(self, robot: Robot, settings: Settings, healthy: Reservoir) -> None:
         """Watch `robot`; messages of the healthy arm go to `healthy`."""
         self._robot, self._healthy = robot, healthy
-        self.anomaly = False
+        self.anomaly = False  # closes the gate
+        # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
         self._detector = RestDetector(settings)
-        self._hole = max(HOLE, settings.window)
+        self._hole = max(HOLE, settings.rest_time)
         self._plausibility = Plausibility(robot)
         self._direction = FrictionDirection()
         self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
@@ -195,13 +172,9 @@ class RestCollector:
     def step(
         self, tension: Array, length: Array, dt: float, theta: Array | None = None
     ) -> list[Sample]:
-        """Take one message of the muscle modules; return the rests that count from now on.
+        """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
 
-        Args:
-            tension: T [N], shape (M,).
-            length: l [m], shape (M,).
-            dt: Time since the message before [s].
-            theta: θ measured at the same time [rad], shape (D,); None without.
+        Returns the rests that count from now on.
         """
         dt += self._skipped
         if dt > self._hole:

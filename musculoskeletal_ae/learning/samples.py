@@ -14,87 +14,62 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.learning.settings import DEFAULT, Settings
+from musculoskeletal_ae.mae.units import State
 
 CAPACITY = 400
 
 
 class Sample(NamedTuple):
-    """Means over a rest.
+    """Means over a rest."""
 
-    Attributes:
-        theta: θ [rad], shape (D,).
-        tension: T [N], shape (M,).
-        length: l [m], shape (M,).
-        direction: s of every wire's friction, +1 wound in last, −1 paid out last, shape (M,).
-    """
-
-    theta: Array
-    tension: Array
-    length: Array
-    direction: Array
+    theta: Array  # θ [rad], (D,)
+    tension: Array  # T [N], (M,)
+    length: Array  # l [m], (M,)
+    direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (M,)
 
 
 @dataclass(frozen=True)
 class Observations:
-    """N samples as arrays.
+    """N samples as arrays."""
 
-    Attributes:
-        theta: θ [rad], shape (N, D).
-        tension: T at the motors [N], shape (N, M).
-        length: l [m], shape (N, M).
-        direction: s in [−1, 1], shape (N, M).
-        known: Which of them say something about which muscle, shape (N, M).
-    """
-
-    theta: Array
-    tension: Array
-    length: Array
-    direction: Array
-    known: Bools
+    theta: Array  # θ [rad], (N, D)
+    tension: Array  # T at the motors [N], (N, M)
+    length: Array  # l [m], (N, M)
+    direction: Array  # s in [−1, 1], (N, M)
+    known: Bools  # which of them say something about which muscle, (N, M)
 
     def __len__(self) -> int:
-        """N."""
         return len(self.theta)
 
+    def __getitem__(self, rows: slice | Ints) -> Observations:
+        return Observations(*(values[rows] for values in vars(self).values()))
 
-@dataclass(frozen=True)
-class Novelty:
-    """By how much a sample has to differ from every stored one.
-
-    Attributes:
-        joint: In one joint [rad].
-        tension: In one muscle [N].
-    """
-
-    joint: float = 0.05
-    tension: float = 10.0
+    def state(self) -> State:
+        """Return (θ, T, l)."""
+        return State(self.theta, self.tension, self.length)
 
 
 class SampleStore:
-    """Samples in the order in which they came, at most `capacity`.
+    """Samples in the order in which they came, at most `capacity`."""
 
-    Attributes:
-        samples: The oldest first.
-        known: For each sample the muscles that it says something about, shape (M,).
-        numbers: Each sample's place among all that were ever accepted, from 1.
-        accepted: How many were ever accepted.
-    """
-
-    def __init__(self, novelty: Novelty | None = None, capacity: int = CAPACITY) -> None:
+    def __init__(self, settings: Settings = DEFAULT, capacity: int = CAPACITY) -> None:
         """Start empty."""
-        self.novelty = novelty or Novelty()
+        self._settings = settings
         self.capacity = capacity
-        self.accepted = 0
+        self.accepted = 0  # ever
         self.clear()
 
     def __len__(self) -> int:
-        """Samples stored."""
         return len(self.samples)
 
     def is_new(self, sample: Sample) -> bool:
         """Whether a sample differs enough from every stored one."""
-        return not self.samples or bool(self._distances(sample).min() > 1.0)
+        stored = np.array([self._scaled(s) for s in self.samples])
+        return not self.samples or bool(
+            np.abs(stored - self._scaled(sample)).max(axis=1).min() > 1.0
+        )
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
         """Store a sample, as the newest; `known` and `number` are given to one stored before."""
@@ -113,9 +88,9 @@ class SampleStore:
 
     def clear(self) -> None:
         """Forget all samples."""
-        self.samples: list[Sample] = []
-        self.known: list[Bools] = []
-        self.numbers: list[int] = []
+        self.samples: list[Sample] = []  # the oldest first
+        self.known: list[Bools] = []  # the muscles that each says something about, (M,)
+        self.numbers: list[int] = []  # each one's place among all ever accepted, from 1
         self.accepted = 0
 
     def observations(self) -> Observations:
@@ -124,13 +99,8 @@ class SampleStore:
         return Observations(theta, tension, length, direction, np.array(self.known))
 
     def _scaled(self, sample: Sample) -> Array:
-        return np.concatenate(
-            [sample.theta / self.novelty.joint, sample.tension / self.novelty.tension]
-        )
-
-    def _distances(self, sample: Sample) -> Array:
-        stored = np.array([self._scaled(s) for s in self.samples])
-        return np.abs(stored - self._scaled(sample)).max(axis=1)
+        theta = sample.theta / self._settings.new_joint_distance
+        return np.concatenate([theta, sample.tension / self._settings.new_tension_distance])
 
     def _dispensable(self) -> int:
         points = np.array([self._scaled(s) for s in self.samples])

@@ -50,13 +50,7 @@ LOOK, PAUSE = 0.5, 2.0
 
 
 class State:
-    """The directory of one robot's learner.
-
-    Attributes:
-        directory: Where it is.
-        not_used: What was found at the start and could not be used, or ''.
-        trouble: Why the disk is not in line with memory, or ''.
-    """
+    """The directory of one robot's learner."""
 
     def __init__(self, directory: str | Path, robot: Robot) -> None:
         """Open a directory, made if missing, for this process alone.
@@ -65,11 +59,13 @@ class State:
             StateError: If it cannot be written, or another learner works there.
         """
         self.directory = Path(directory).expanduser()
-        self.not_used = self.trouble = ''
+        self.not_used = ''  # what was found at the start and could not be used
+        self.trouble = ''  # why the disk is not in line with memory
         self._file = self.directory / FILE
         self._robot = robot
         names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
         self._seed = zlib.crc32(names.encode())  # of checksums: another robot's records do not fit
+        self._size = HEAD.size + 8 * (1 + robot.joint_count + 4 * robot.muscle_count)
         self._connection: sqlite3.Connection | None = None
         self._next_look = 0.0
         try:
@@ -82,7 +78,11 @@ class State:
                 raise StateError(
                     f'{name} is used by another learner; give each its own, or stop the other'
                 ) from error
-            if not self._writable():
+            try:
+                writable = all(os.access(path, os.W_OK) for path in (self.directory, self._file))
+            except ValueError:  # a name that no file can have
+                writable = False
+            if not writable:
                 raise StateError(
                     f"{name} cannot be written ({error}); give a directory that can, or ''"
                 ) from error
@@ -90,28 +90,17 @@ class State:
                 self._failed(error)  # with a full disk, a new learner goes on and says so
             # Else it is damaged: `load` sees what can be used.
 
-    def _writable(self) -> bool:
-        try:
-            return all(os.access(path, os.W_OK) for path in (self.directory, self._file))
-        except ValueError:  # a name that no file can have
-            return False
-
     def _empty(self) -> bool:
         return self._file.stat().st_size == 0
 
     def _files(self) -> list[Path]:
-        return [
-            file for file in (self._file, self._file.with_name(f'{FILE}-journal')) if file.exists()
-        ]
+        names = FILE, f'{FILE}-journal'
+        return [file for name in names if (file := self.directory / name).exists()]
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._connection = _connect(self._file)
-        self._opened = self._identity()
-
-    def _identity(self) -> tuple[int, int]:
-        status = self._file.stat()
-        return status.st_dev, status.st_ino
+        self._opened = self._file.stat()
 
     def close(self) -> None:
         """Release the directory; all is on disk already."""
@@ -182,10 +171,6 @@ class State:
             problem = f'{self._file}: made by a learner of other joints and muscles'
         return problem, data
 
-    @property
-    def _size(self) -> int:
-        return HEAD.size + 8 * (1 + self._robot.joint_count + 4 * self._robot.muscle_count)
-
     def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
         values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
         return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
@@ -206,18 +191,17 @@ class State:
     def keep(self, samples: SampleStore, checkpoint: bytes | None, changed: bool = True) -> None:
         """Bring the disk in line with memory; it is on return, or there is `trouble`.
 
-        Args:
-            samples: All samples.
-            checkpoint: The newest network; None for none.
-            changed: Whether there is something new; else it is enough to look now and then whether
-                the file is still there.
+        Unless something `changed`, it is enough to look now and then whether the file is there.
         """
         now = time.monotonic()
         if now < self._next_look and (self.trouble or not changed):
             return
         self._next_look = now + LOOK
         try:
-            self._look()
+            if self._connection and not os.path.samestat(self._file.stat(), self._opened):
+                raise FileNotFoundError(f'{self._file} was replaced')
+            if self.directory.exists() and not os.access(self.directory, os.W_OK):
+                raise PermissionError(f'{self.directory} is read-only')
             if self._connection is None:
                 self._open()
             if changed or self.trouble:
@@ -238,12 +222,6 @@ class State:
         if self.trouble:
             raise StateError(self.trouble)
 
-    def _look(self) -> None:
-        if self._connection is not None and self._identity() != self._opened:
-            raise FileNotFoundError(f'{self._file} was replaced')
-        if self.directory.exists() and not os.access(self.directory, os.W_OK):
-            raise PermissionError(f'{self.directory} is read-only')
-
     def _failed(self, error: Exception) -> None:
         self.close()
         self.trouble = f'samples and network cannot be saved: {error}'
@@ -259,12 +237,8 @@ class State:
             connection.execute('BEGIN IMMEDIATE')
             for (table,) in TABLES - set(connection.execute(MADE)):
                 connection.execute(table)
-            wanted = {
-                number: self._packed(number, sample, known)
-                for number, sample, known in zip(
-                    samples.numbers, samples.samples, samples.known, strict=True
-                )
-            }
+            stack = zip(samples.numbers, samples.samples, samples.known, strict=True)
+            wanted = {n: self._packed(n, sample, known) for n, sample, known in stack}
             stored = dict(connection.execute(SAMPLES))
             gone = [(n,) for n, record in stored.items() if wanted.get(n) != record]
             new = [(n, record) for n, record in wanted.items() if stored.get(n) != record]

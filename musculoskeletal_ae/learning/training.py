@@ -2,7 +2,7 @@
 """Where updates are made: here (experiments, recordings) or in a process of their own (the node).
 
 A job goes in, an update comes out, and the caller looks now and then whether it has. What an update
-does is in `update` (preset default) and `paper`; torch is imported only where something trains.
+does is in `update`, which imports torch and is itself imported only where something trains.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Observations
@@ -36,77 +38,42 @@ if TYPE_CHECKING:
 
 
 class Job(NamedTuple):
-    """What an update may use.
+    """What an update may use."""
 
-    Attributes:
-        seen: The samples, the oldest first.
-        healthy: What was seen of the healthy arm.
-        statistics_hold: Whether the statistics so far are of the arm as it is now; not after a
-            muscle was changed.
-        steps: Steps of training.
-    """
-
-    seen: Observations
-    healthy: Healthy
-    statistics_hold: bool
-    steps: int
+    seen: Observations  # the samples, the oldest first
+    healthy: Healthy  # what was seen of the healthy arm
+    statistics_hold: bool  # the statistics so far are of the arm as it is: no muscle has changed
+    steps: int  # of training
 
 
 class Update(NamedTuple):
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        mae: The network.
-        loss: Of the training.
-        error: Mean ‖θ_est − θ‖₂ over the newest samples, before they were learned [rad].
-        noise: Standard deviation of each length that the body does not explain [m], (M,); empty
-            where no body is fitted.
-        changed: The muscle, if any, whose newest samples contradict all older ones, with how many.
-        contradicted: Muscles that newest samples contradict together: θ is wrong there, not they.
-        seconds: How long it took.
-    """
-
-    mae: Mae
-    loss: float
-    error: float
-    noise: Array
+    mae: Mae  # the network
+    loss: float  # of the training
+    noise: Array = np.empty(0)  # σ of each length that the body does not explain [m], (M,) or none
+    # The muscle, if any, whose newest samples contradict all older ones, with how many they are.
     changed: tuple[tuple[int, int], ...] = ()
-    contradicted: tuple[int, ...] = ()
-    seconds: float = 0.0
-
-
-def make_updater(robot: Robot, mae: Mae, preset: str, seed: int = 0) -> Updater:
-    """Return the way of learning that a preset names.
-
-    Raises:
-        MusculoskeletalError: If it names none.
-    """
-    if preset_named(preset).corrected_body:
-        from musculoskeletal_ae.learning.update import BodyUpdater
-
-        return BodyUpdater(robot, mae, seed)
-    from musculoskeletal_ae.learning.paper import PaperUpdater
-
-    return PaperUpdater(robot, mae, seed)
+    contradicted: tuple[int, ...] = ()  # muscles that they contradict together: θ is wrong there
+    error: float = 0.0  # mean ‖θ_est − θ‖₂ over the newest samples before they were learned [rad]
+    seconds: float = 0.0  # how long it took
 
 
 class Training:
-    """Makes an update at once, where it is submitted; one job at a time.
-
-    Attributes:
-        trouble: Why there is no update, or ''.
-    """
+    """Makes an update at once, where it is submitted; one job at a time."""
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
         """Learn as `preset` says; `seed` draws what is random."""
         self.robot, self.preset, self.seed = robot, preset_named(preset), seed
-        self.trouble = ''
+        self.trouble = ''  # why there is no update
         self._updater: Updater | None = None
         self._update: Update | None = None
 
     def begin(self, mae: Mae) -> None:
         """Go on from a network; what was submitted before is forgotten."""
-        self._updater = make_updater(self.robot, mae, self.preset.name, self.seed)
+        from musculoskeletal_ae.learning.update import make_updater
+
+        self._updater = make_updater(self.robot, mae, self.preset, self.seed)
         self._update = None
 
     @property
@@ -122,7 +89,7 @@ class Training:
     def submit(self, job: Job) -> None:
         """Take a job."""
         assert self._updater is not None
-        self._update = _timed(self._updater, job)
+        self._update = self._updater.update(job)
 
     def poll(self) -> Update | None:
         """Return what came of the job, if that is known by now."""
@@ -136,11 +103,6 @@ class Training:
     def close(self) -> None:
         """End it."""
         self._updater = self._update = None
-
-
-def _timed(updater: Updater, job: Job) -> Update:
-    begun = time.perf_counter()
-    return updater.update(job)._replace(seconds=time.perf_counter() - begun)
 
 
 # -- a process of its own -------------------------------------------------------------------------
@@ -158,16 +120,11 @@ class TrainingProcess(Training):
     """Makes updates in another process, and in the next one if that dies or hangs.
 
     No call waits for the process: a thread does. A job that was lost with one is given to the next.
-
-    Attributes:
-        restarts: How often a process was lost.
-        pid: Id of the process; None while there is none.
     """
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
-        """Start nothing yet; arguments as `Training`."""
         super().__init__(robot, preset, seed)
-        self.restarts = 0
+        self.restarts = 0  # how often a process was lost
         self._mae: Mae | None = None
         self._job: Job | None = None
         self._process: SpawnProcess | None = None
@@ -204,7 +161,7 @@ class TrainingProcess(Training):
 
     @property
     def pid(self) -> int | None:
-        """Id of the process."""
+        """Id of the process; None while there is none."""
         return None if self._process is None else self._process.pid
 
     @property
@@ -308,11 +265,13 @@ def serve(connection: Connection, directory: Path, preset: str, seed: int) -> No
 
     torch.set_num_threads(1)
     robot = Robot.load(directory)
+    training = Training(robot, preset, seed)
     try:
-        mae = checkpoint.from_bytes(connection.recv(), robot)
-        updater = make_updater(robot, mae, preset, seed)
+        training.begin(checkpoint.from_bytes(connection.recv(), robot))
         while True:
-            update = _timed(updater, connection.recv())
+            training.submit(connection.recv())
+            update = training.poll()
+            assert update is not None
             # A checkpoint, so that it is checked where it arrives.
             connection.send((checkpoint.to_bytes(update.mae), *update[1:]))
     except (EOFError, BrokenPipeError, ConnectionResetError):

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An update of preset `default`: find out the body from the samples, then let the network learn it.
+"""An update: what the network learns from the samples so far, in either preset.
 
-1. Fit the corrected body to the samples (`body_fit`).
+Preset `default` finds out the body from the samples, then lets the network learn that:
+
+1. Fit the corrected body to the samples (`body`).
 2. Draw synthetic samples of it, and put real ones in the place of a tenth of them.
 3. Train the network on them for a bounded number of steps.
 4. Take the residuals' statistics of healthy messages (`calibration`).
 
 The body needs few samples because the geometric model and its tolerances are known; the network
-needs many, and gets them from the body.
+needs many, and gets them from the body. Preset `paper` trains on the samples alone.
 """
 
 from __future__ import annotations
 
 import copy
 import re
+import time
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -22,28 +25,17 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import OUTLIER, Fit, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body import CorrectedBody, Fit, fit_body, fit_to_network
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.training import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
-from musculoskeletal_ae.mae.training import OVERLOAD_SHARE, TINY, one_thread
-from musculoskeletal_ae.mae.units import scale_vector
+from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
+from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
-
-REAL_SHARE = 0.1
-#: how often a synthetic sample is used before it is forgotten
-USES = 3
-#: a real sample that fits the body worse than this weight is not shown to the network
-TRUSTED = 0.3
-#: so many newest samples in a row that contradict the body mean that a muscle has changed …
-IN_A_ROW = 4
-#: … by more than this [m], provided that there were this many before
-LEAST_CHANGE, LEAST_BEFORE = 0.004, 8
-
 
 #: between how the network was made and what it learned since, in `Mae.training`
 LEARNED = '; learned online: '
@@ -51,27 +43,24 @@ NEWEST = 20  # samples that tell how good the estimates are
 
 
 class Updater(ABC):
-    """A way of learning online; keeps network and optimiser from update to update.
+    """A way of learning online; keeps network and optimiser from update to update."""
 
-    Attributes:
-        body: The corrected body as it was fitted last; None where none is.
-    """
+    body: CorrectedBody | None = None  # as it was fitted last; None where none is
 
-    body: CorrectedBody | None = None
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
+        """Go on from a network; `seed` draws what is random."""
+        self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
-        """Go on from a network."""
-        self._robot, self._origin, self._mae = robot, mae, mae
-
-    @abstractmethod
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
+        begun, newest = time.perf_counter(), job.seen[-NEWEST:]
+        estimate = self._mae.estimate(newest.tension, newest.length).theta
+        error = float(np.linalg.norm(estimate - newest.theta, axis=1).mean())
+        update = self._learn(job)
+        return update._replace(error=error, seconds=time.perf_counter() - begun)
 
-    def _newest_error(self, seen: Observations) -> float:
-        """Return the mean of ‖θ_est − θ‖₂ over the newest samples [rad]."""
-        newest = slice(-NEWEST, None)
-        estimate = self._mae.estimate(seen.tension[newest], seen.length[newest]).theta
-        return float(np.linalg.norm(estimate - seen.theta[newest], axis=1).mean())
+    @abstractmethod
+    def _learn(self, job: Job) -> Update: ...
 
     def _published(self, network: Network, preset: str, steps: int, job: Job) -> Mae:
         """Return the network that runs, with its statistics, and with what it has learned."""
@@ -86,10 +75,79 @@ class Updater(ABC):
         return self._mae
 
 
+def make_updater(robot: Robot, mae: Mae, preset: Preset, seed: int = 0) -> Updater:
+    """Return the preset's way of learning."""
+    return (BodyUpdater if preset.corrected_body else PaperUpdater)(robot, mae, seed)
+
+
 def learned_steps(mae: Mae) -> int:
     """Return how many steps of preset `default` a network has learned on a real arm, or 0."""
     said = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
     return int(said[1]) if said else 0
+
+
+# -- preset paper ---------------------------------------------------------------------------------
+
+BATCHES = 10  # C_batch
+EPOCHS = 10  # C_epoch
+DATA = 10  # C_data
+
+
+class PaperUpdater(Updater):
+    """The procedure as printed (section "Online Learning"), by Adam of the initial training.
+
+        batch = {newest, (0, 0, 0), C_data random stored ones} × {①, ②, ③},   3 (C_data + 2) entries
+
+    from C_thre samples on, with C_thre = 20, C_data = 10, number of batches 10 and epochs 10.
+
+    "The number of batches C_batch = 10" can be read as ten such batches, each with its own random
+    samples, gone through ten times: 100 steps of 36 entries. Or as mini-batches of ten within one
+    batch of 36: 4 × 10 steps. The first is chosen: the text calls the 36 entries "a batch", so
+    their number counts such batches; and with the second an update would see only ten stored
+    samples.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
+        super().__init__(robot, mae, seed)
+        self._network = from_mae(mae)
+        self._optimiser = Optimiser(self._network, PAPER.training.step_size, muon=False)
+        self._rng = np.random.default_rng([seed, 0x9A])
+        self._steps = 0
+
+    def _learn(self, job: Job) -> Update:
+        """Learn one newest sample among stored ones; `job.steps` is the paper's own here."""
+        # The print knows no changed muscle: a sample that says nothing about one is none.
+        whole = np.flatnonzero(job.seen.known.all(axis=1))
+        values = job.seen[whole].state().scaled()
+        batches = []
+        for _ in range(BATCHES if len(values) >= PAPER.least_samples else 0):
+            stored = self._rng.choice(len(values) - 1, DATA, replace=False)
+            rows = np.vstack([values[-1], np.zeros(values.shape[1]), values[stored]])
+            batches.append(torch.as_tensor(np.tile(rows, (3, 1)), dtype=torch.float32))
+        mask = torch.arange(3).repeat_interleave(DATA + 2)
+        losses = []
+        with one_thread():
+            for batch in EPOCHS * batches:
+                value = loss(self._network, batch, mask, PAPER.training)
+                value.backward()
+                self._optimiser.step(1.0)
+                losses.append(value.item())
+        self._steps += len(losses)
+        last = float(np.mean(losses[-BATCHES:])) if losses else np.nan
+        return Update(self._published(self._network, 'paper', self._steps, job), last)
+
+
+# -- preset default -------------------------------------------------------------------------------
+
+REAL_SHARE = 0.1
+#: how often a synthetic sample is used before it is forgotten
+USES = 3
+#: a real sample that fits the body worse than this weight is not shown to the network
+TRUSTED = 0.3
+#: so many newest samples in a row that contradict the body mean that a muscle has changed …
+IN_A_ROW = 4
+#: … by more than this [m] and this many σ, provided that there were so many samples before
+LEAST_CHANGE, OUTLIER, LEAST_BEFORE = 0.004, 6.0, 8
 
 
 class BodyUpdater(Updater):
@@ -99,9 +157,8 @@ class BodyUpdater(Updater):
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network, and from the body that it knows if it has learned one."""
-        super().__init__(robot, mae)
+        super().__init__(robot, mae, seed)
         self.body = CorrectedBody(robot, seed=seed)
-        self._seed = seed
         #: what the network knew of the body, in the place of the geometric model
         self._prior_mean: list[Array] | None = None
         if learned_steps(mae):
@@ -112,9 +169,8 @@ class BodyUpdater(Updater):
         self._rng = np.random.default_rng([seed, 0xD2])
         self._statistics_held = True
 
-    def update(self, job: Job) -> Update:
-        """Learn a little."""
-        seen, error = job.seen, self._newest_error(job.seen)
+    def _learn(self, job: Job) -> Update:
+        seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
         fit = fit_body(body, seen, prior_mean=self._prior_mean)
         contradicted = contradicted_muscles(seen, fit)
@@ -126,12 +182,11 @@ class BodyUpdater(Updater):
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
         data = synthetic_samples(body, fit.noise, count, self._rng)
-        self._mix_in_real(data, body, seen, fit)
-        loss = self._trainer.train(data, job.steps)
+        self._mix_in_real(data, seen, fit)
+        loss_now = self._trainer.train(data, job.steps)
         return Update(
             self._published(self._trainer.network, 'default', self._trainer.steps, job),
-            loss,
-            error,
+            loss_now,
             fit.noise,
             contradicted if alone else (),
             () if alone else tuple(muscle for muscle, _ in contradicted),
@@ -153,21 +208,18 @@ class BodyUpdater(Updater):
         self._trainer.restart()
         return CorrectedBody(self._robot, seed=self._seed)
 
-    def _mix_in_real(
-        self, data: TrainingData, body: CorrectedBody, seen: Observations, fit: Fit
-    ) -> None:
+    def _mix_in_real(self, data: TrainingData, seen: Observations, fit: Fit) -> None:
         """Put real samples, freed of friction as the body knows it, in the place of some."""
         trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
         if len(trusted) == 0:
             return
         rows = trusted[self._rng.integers(len(trusted), size=int(REAL_SHARE * len(data.seen)))]
-        theta, tension, direction = seen.theta[rows], seen.tension[rows], seen.direction[rows]
-        with_friction, without = body.lengths(theta, tension, direction, np.zeros_like(direction))
-        for values, length in (
-            (data.seen, seen.length[rows]),
-            (data.true, seen.length[rows] + without - with_friction),
-        ):
-            values[: len(rows)] = _scaled(theta, tension, length)
+        real = seen[rows]
+        still = np.zeros_like(real.direction)
+        with_friction, without = self.body.lengths(real.theta, real.tension, real.direction, still)
+        length = real.length + without - with_friction
+        data.seen[: len(rows)] = real.state().scaled()
+        data.true[: len(rows)] = real.state()._replace(length=length).scaled()
 
 
 def contradicted_muscles(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
@@ -193,33 +245,22 @@ MARGIN = 0.02
 
 
 class TrainingData(NamedTuple):
-    """N samples in scaled units, shape (N, D+2M) each.
+    """N samples in scaled units, shape (N, D+2M) each."""
 
-    Attributes:
-        seen: With scattered lengths.
-        true: What the network is to restore.
-    """
-
-    seen: Array
-    true: Array
+    seen: Array  # with scattered lengths
+    true: Array  # what the network is to restore
 
 
 def synthetic_samples(
     body: CorrectedBody, noise: Array, count: int, rng: np.random.Generator
 ) -> TrainingData:
-    """Draw samples of a body.
+    """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
 
         (θ, T, l) = (θ_r, T_r, l(θ_r, T_r; s = 0)),   seen as (θ_r, T_r, l(θ_r, T_r; s_r) + ε)
 
     Which way each wire slid last, s_r, is not known to an estimator, so that the network sees
     lengths with the friction's and the sensors' scatter and is asked for those without: ② then
     learns to weigh muscles by how far their lengths can be trusted, as weighted least squares do.
-
-    Args:
-        body: The corrected body.
-        noise: Standard deviation of each muscle's length beside friction [m], shape (M,).
-        count: N.
-        rng: Source of randomness.
     """
     robot = body.robot
     shape = count, robot.muscle_count
@@ -229,26 +270,16 @@ def synthetic_samples(
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), direction)
     scattered = scattered + noise * rng.standard_normal(shape)
-    return TrainingData(_scaled(theta, tension, scattered), _scaled(theta, tension, length))
+    true, seen = State(theta, tension, length), State(theta, tension, scattered)
+    return TrainingData(seen.scaled(), true.scaled())
 
 
 def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    tension = robot.tension
-    shape = count, robot.muscle_count
-    overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
-    highest = np.where(
-        overloaded, rng.uniform(tension.limit, tension.max, (count, 1)), tension.limit
-    )
+    shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest
-    lowest = tension.bias * rng.uniform(0.7, 1.0, shape)
+    lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
     held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
     return np.where(rng.uniform(size=(count, 1)) < HELD_SHARE, held, anywhere)
-
-
-def _scaled(theta: Array, tension: Array, length: Array) -> Array:
-    values = np.concatenate([theta, tension, length], axis=1)
-    scaled: Array = values * scale_vector(theta.shape[1], tension.shape[1])
-    return scaled
 
 
 # -- the network ----------------------------------------------------------------------------------
@@ -269,24 +300,19 @@ class Trainer:
     step size falls as steps add up, so that the network follows a body that is still being found
     out and becomes calm when it is known. (At a constant step size even the average wanders: ±10 %
     of the error of an arm over hours.)
-
-    Attributes:
-        network: The average: what is published.
-        steps: Steps taken so far, in former lives too.
     """
 
     def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
         """Go on from a network's weights, as calmly as after so many `steps`."""
-        self.network = network
+        self.network = network  # the average: what is published
         self._restless = copy.deepcopy(network)
         self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
         self._rng = np.random.default_rng([seed, 0x7A])
-        self.steps = steps
+        self.steps = steps  # taken so far, in former lives too
 
     def train(self, data: TrainingData, steps: int) -> float:
-        """Take steps on batches of the data; returns the mean loss of the last half of them."""
-        seen = torch.as_tensor(data.seen, dtype=torch.float32)
-        true = torch.as_tensor(data.true, dtype=torch.float32)
+        """Take steps on batches of the data; return the mean loss of the last half of them."""
+        seen, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
         mask = torch.arange(3).repeat_interleave(BATCH)
         losses = []
         with one_thread():
@@ -313,7 +339,7 @@ class Trainer:
 
 def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
     """Return the three norms, each in units of the spread of the data, all three masks entered."""
-    error = network.decode_standard(network.encode(seen.repeat(3, 1), mask))
+    error = network.decoder(network.encode(seen.repeat(3, 1), mask))
     error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
     return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

@@ -40,12 +40,13 @@ SMALLEST_STD = 1e-9
 SMALLEST_EIGENVALUE = 1e-12  # of the largest one
 #: beyond what a trained network says of a posture at rest: θ [rad], T [N], l [m], G [m/rad]
 ABSURD = (100.0, 1e5, 100.0, 1e5)
-REMEDY = 'use another checkpoint, or make one with `train`'
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+#: what network and metadata call the same
+SHARED = ('joints', 'muscles', 'activation', 'preset', 'version', 'training')
 
 
 class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,16 +110,9 @@ def to_bytes(mae: Mae) -> bytes:
             tensors |= {f'{name}.{i}.weight': weight, f'{name}.{i}.bias': bias}
     if anomaly is not None:
         tensors |= {'anomaly.mean': anomaly.mean, 'anomaly.covariance': anomaly.covariance}
-    entries = {
+    entries = {name: getattr(mae, name) for name in (*SHARED, 'layer_sizes')} | {
         'format_version': FORMAT_VERSION,
-        'joints': mae.joints,
-        'muscles': mae.muscles,
-        'layer_sizes': mae.layer_sizes,
-        'activation': mae.activation,
         'units': UNITS,
-        'preset': mae.preset,
-        'version': mae.version,
-        'training': mae.training,
         'anomaly_calibrated': None if anomaly is None else anomaly.calibrated,
         'anomaly_samples': 0 if anomaly is None else anomaly.samples,
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
@@ -142,8 +136,12 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
         if robot is not None:
             _check_fit(mae, robot)
     except CheckpointError as error:
-        raise CheckpointError(f'{source}: {error}; {REMEDY}') from error.__cause__
+        raise _refused(source, str(error)) from error.__cause__
     return mae
+
+
+def _refused(source: str | Path, problem: str) -> CheckpointError:
+    return CheckpointError(f'{source}: {problem}; use another checkpoint, or make one with `train`')
 
 
 def _parsed(data: bytes) -> tuple[dict[str, Any], Metadata]:
@@ -163,9 +161,8 @@ def _parsed(data: bytes) -> tuple[dict[str, Any], Metadata]:
     # Before all else: a newer format may differ in everything that is checked below.
     version = _json(entries.get('format_version'), 'format_version')
     if version is True or version != FORMAT_VERSION:
-        raise CheckpointError(
-            f'format_version {version!r:.100}; this program reads {FORMAT_VERSION}'
-        )
+        told = f'format_version {version!r:.100}'
+        raise CheckpointError(f'{told}; this program reads {FORMAT_VERSION}')
     values = {key: _json(text, key) for key, text in entries.items()}
     try:
         return header, msgspec.convert(values, Metadata)
@@ -185,26 +182,21 @@ def _json(text: Any, what: str) -> Any:
 
 
 def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, Array]:
-    legal = meta.tensor_shapes()
-    if odd := header.keys() ^ legal.keys():
+    shapes = meta.tensor_shapes()
+    if odd := header.keys() ^ shapes.keys():
         raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
-    for name, shape in legal.items():
+    for name, shape in shapes.items():
         entry = header[name] if isinstance(header[name], dict) else {}
-        for what, given, right in (
-            ('type', entry.get('dtype'), 'F64'),
-            ('shape', entry.get('shape'), list(shape)),
-        ):
-            if given != right:
-                raise CheckpointError(f'tensor {name} has {what} {given!r}; legal: {right!r}')
+        for what, legal in (('dtype', 'F64'), ('shape', list(shape))):
+            if (given := entry.get(what)) != legal:
+                raise CheckpointError(f'tensor {name} has {what} {given!r}; legal: {legal!r}')
     try:
         tensors: dict[str, Array] = load_tensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f'not valid safetensors ({error})') from error
     for name, value in tensors.items():
         if not (np.abs(value) <= LARGEST).all():
-            raise CheckpointError(
-                f'tensor {name} holds a value that is not finite or beyond ±{LARGEST:g}'
-            )
+            raise CheckpointError(f'tensor {name} holds a value beyond ±{LARGEST:g}, or not finite')
     if (least := tensors['std'].min()) < SMALLEST_STD:
         raise CheckpointError(f'tensor std holds {least:g}; at least {SMALLEST_STD:g} is legal')
     if 'anomaly.covariance' in tensors:
@@ -242,17 +234,12 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
             meta.anomaly_thresholds,
         )
     return Mae(
-        joints=meta.joints,
-        muscles=meta.muscles,
-        preset=meta.preset,
-        activation=meta.activation,
         encoder=stack('encoder'),
         decoder=stack('decoder'),
         mean=tensors['mean'],
         std=tensors['std'],
-        version=meta.version,
-        training=meta.training,
         anomaly=anomaly,
+        **{name: getattr(meta, name) for name in SHARED},
     )
 
 
@@ -261,10 +248,8 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
     for what in ('joints', 'muscles'):
         ours, theirs = getattr(mae, what), getattr(robot, what)
         if ours != theirs:
-            raise CheckpointError(
-                f'made for {what} {", ".join(ours)}; '
-                f'this robot has {", ".join(theirs)}, in this order'
-            )
+            had, needed = ', '.join(ours), ', '.join(theirs)
+            raise CheckpointError(f'made for {what} {had}; this robot has {needed}, in this order')
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)
     with np.errstate(all='ignore'):
@@ -301,14 +286,5 @@ def save(mae: Mae, path: str | Path) -> None:
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:
-    """Read a checkpoint file; see `from_bytes`.
-
-    Raises:
-        CheckpointError: If it cannot be read, is damaged or does not fit the robot.
-    """
-
-    def refuse(file: Path, problem: str) -> CheckpointError:
-        return CheckpointError(f'{file}: {problem}; {REMEDY}')
-
-    data = read_bytes(Path(path), refuse, MAX_BYTES)
-    return from_bytes(data, robot, str(path))
+    """Read a checkpoint file as `from_bytes` does, with a CheckpointError if it cannot be read."""
+    return from_bytes(read_bytes(Path(path), _refused, MAX_BYTES), robot, str(path))

@@ -54,13 +54,9 @@ class Network(nn.Module):
         x = torch.cat([standard * rows[:, :width], rows[:, width:]], dim=-1)  # (N, D+2M+3)
         return self.encoder(x)  # (N, D+M)
 
-    def decode_standard(self, z: Tensor) -> Tensor:
-        """Return the output before mean and spread are put back, shape (N, D+2M)."""
-        return self.decoder(z)
-
     def decode(self, z: Tensor) -> Tensor:
-        """Return scaled (θ, T, l), shape (N, D+2M)."""
-        return self.decode_standard(z) * self.std + self.mean
+        """Return scaled (θ, T, l), shape (N, D+2M); `decoder` gives them standardised."""
+        return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:
         """Return what the network restores of scaled (θ, T, l) from two of the three."""
@@ -75,11 +71,7 @@ class Network(nn.Module):
 
 
 def to_mae(
-    network: Network,
-    joints: tuple[str, ...],
-    muscles: tuple[str, ...],
-    preset: str,
-    training: str,
+    network: Network, joints: tuple[str, ...], muscles: tuple[str, ...], preset: str, training: str
 ) -> Mae:
     """Return the numpy network that runs, with float64 copies of a trained network's weights."""
 

@@ -72,10 +72,15 @@ def random_states(
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
     """Return random states mostly within tension.limit, some beyond it, up to tension.max."""
+    highest = highest_tensions(robot, count, rng)
+    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+
+
+def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Return tension.limit (count, 1) [N], or in some rows more, up to tension.max."""
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
-    highest = np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
-    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+    return np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
@@ -112,7 +117,7 @@ def loss(
     The last `twins` rows are neighbours of the first `twins`, all of them entered by ①.
     """
     joints, muscles = network.joints, network.muscles
-    error = network.decode_standard(network.encode(values, mask))
+    error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std  # (N, D+2M)
     result = error.new_zeros(())
     if twins:
@@ -199,9 +204,7 @@ def initial_mae(
     Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
     """
     chosen = preset_named(preset)
-    settings = chosen.training
-    if steps is not None:
-        settings = replace(settings, steps=steps)
+    settings = chosen.training if steps is None else replace(chosen.training, steps=steps)
     rng = np.random.default_rng(seed)
     if chosen.network.standardise:
         samples = overload_states(robot, settings.samples, rng).scaled()

@@ -6,12 +6,13 @@ RViz and Foxglove draw bones and muscles from markers in the root link's frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -21,8 +22,11 @@ from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line
+from musculoskeletal_ae.validity import read_wrench
 
 MARKER_RATE = 10.0  # [Hz]
+# After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
+LONGEST_STEP = 0.1  # [s]
 
 
 class Arm(Shell):
@@ -31,19 +35,19 @@ class Arm(Shell):
     def __init__(self, name: str, **options: Any) -> None:
         """Advertise NAME/markers; options are those of Node."""
         super().__init__(name, **options)
+        self._arm = name
         self._markers = self.create_publisher(MarkerArray, f'{name}/markers', RELIABLE)
         self.create_timer(1.0 / MARKER_RATE, self._publish_markers)
 
-    def advertise(self, prefix: str, joints: bool, description: bool) -> None:
-        """Advertise the states below a prefix.
+    def follow_wrench(self, follow: Callable[[Array], object]) -> None:
+        """Give `follow` what comes on NAME/external_wrench, (6,) [N, N·m] in root link axes."""
+        topic, frame = f'{self._arm}/external_wrench', self.robot.root_link
+        self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
-        Args:
-            prefix: '' for the robot's own topics.
-            joints: Whether there are joint sensors.
-            description: Whether this is the robot, which describes itself.
-        """
+    def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
+        """Advertise the states below a prefix; the description is the robot's own to publish."""
         self._joints = None
-        if joints:
+        if joint_sensors:
             self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
         self._muscles = self.create_publisher(Float64MultiArray, f'{prefix}muscle_states', RELIABLE)
         if description:
@@ -65,22 +69,17 @@ class Arm(Shell):
         raise NotImplementedError
 
     def _publish_markers(self) -> None:
-        if self._markers.get_subscription_count() > 0 and (lines := self.lines()):
-            stamp = self.get_clock().now().to_msg()
-            self._markers.publish(arm_markers(lines, self.robot.root_link, stamp))
-
-
-def arm_markers(lines: Sequence[Line], frame: str, stamp: Time) -> MarkerArray:
-    """Return one line strip for each bone and muscle."""
-    markers: list[Marker] = []
-    for line in lines:
-        number = sum(marker.ns == line.kind for marker in markers)
-        marker = Marker(ns=line.kind, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
-        marker.header.frame_id, marker.header.stamp = frame, stamp
-        marker.pose.orientation.w = 1.0
-        marker.scale.x = line.width
-        red, green, blue = line.colour
-        marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
-        marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
-        markers.append(marker)
-    return MarkerArray(markers=markers)
+        if self._markers.get_subscription_count() == 0 or not (lines := self.lines()):
+            return
+        numbers: defaultdict[str, count[int]] = defaultdict(count)
+        message, stamp = MarkerArray(), self.get_clock().now().to_msg()
+        for line in lines:
+            marker = Marker(ns=line.kind, id=next(numbers[line.kind]), type=Marker.LINE_STRIP)
+            marker.header.frame_id, marker.header.stamp = self.robot.root_link, stamp
+            marker.pose.orientation.w = 1.0
+            marker.scale.x = line.width
+            red, green, blue = line.colour
+            marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+            marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
+            message.markers.append(marker)
+        self._markers.publish(message)

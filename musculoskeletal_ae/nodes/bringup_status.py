@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.validity import read_posture
 
 
 class BringupStatus(Shell):
@@ -37,24 +36,17 @@ class BringupStatus(Shell):
         self.checkpoints = 0
         self.samples = self.suspect = self.stopped = ''
         self.started: float | None = None
-        self.listen(JointState, 'joint_states', self._measured, SENSOR)
-        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
+        self.follow_posture('joint_states', partial(setattr, self, 'theta'))
+        self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        self.listen(Bool, 'anomaly_detected', self._detected, LATCHED)
+        self.listen(Bool, 'anomaly_detected', lambda m: setattr(self, 'detected', m.data), LATCHED)
         self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
         self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
 
-    def _measured(self, message: JointState) -> None:
-        self.theta = read_posture(message, self.robot.joints)
-
-    def _estimated(self, message: JointState) -> None:
+    def _estimated(self, theta: Array) -> None:
         if self.theta is not None:
-            estimate = read_posture(message, self.robot.joints)
-            self.errors.append(float(np.linalg.norm(estimate - self.theta)))
-
-    def _detected(self, message: Bool) -> None:
-        self.detected = message.data
+            self.errors.append(float(np.linalg.norm(theta - self.theta)))
 
     def _count_checkpoint(self, _: UInt8MultiArray) -> None:
         self.checkpoints += 1
@@ -72,10 +64,9 @@ class BringupStatus(Shell):
 
     def _print(self) -> None:
         now = time.monotonic()
-        if self.started is None:
-            if not self.anomalies:
-                return
-            self.started = now
+        if self.started is None and not self.anomalies:
+            return
+        self.started = self.started or now
         error, anomaly = (
             np.mean(values) if values else math.nan for values in (self.errors, self.anomalies)
         )

@@ -16,18 +16,19 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.messages import array_message, serve
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_posture
+from musculoskeletal_ae.validity import read_joints
 
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
-RESUMED = 'going on to the last target, if any; controller/explore explores again'
 
 
 class Controller(Shell):
@@ -41,19 +42,19 @@ class Controller(Shell):
             self.follow_parameter(name, partial(self._configure, name))
         self.logged: list[str] = []
         self.publishers_of = {
-            LENGTH: self.create_publisher(Float64MultiArray, 'muscle_length_command', RELIABLE),
-            TENSION: self.create_publisher(Float64MultiArray, 'muscle_tension_command', RELIABLE),
+            kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
+            for kind in (LENGTH, TENSION)
         }
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
-        self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
-        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
+        self.follow_muscle_states(self._muscles)
+        self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
-        self.create_service(SetBool, 'controller/explore', self._explore)
-        self.create_service(Trigger, 'controller/stop', self._stop)
-        self.create_service(Trigger, 'controller/reset', self._reset)
+        serve(self, SetBool, 'controller/explore', self._explore)
+        serve(self, Trigger, 'controller/stop', self._stop)
+        serve(self, Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
@@ -63,63 +64,53 @@ class Controller(Shell):
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
 
-    def _muscles(self, message: Float64MultiArray) -> None:
-        now, count = time.monotonic(), self.robot.muscle_count
-        muscles = Muscles(*read_array(message, len(QUANTITIES), count))
+    def _muscles(self, states: Array) -> None:
+        muscles, now = Muscles(*states), time.monotonic()
         self.core.muscles(muscles, now)
         self.gate.message(muscles.tension, muscles.length, now)
-
-    def _estimated(self, message: JointState) -> None:
-        self.core.estimated(read_posture(message, self.robot.joints), time.monotonic())
-        # The estimate is made from the newest muscle states: now everything is fresh.
-        self._step()
 
     def _anomaly(self, message: Bool) -> None:
         self.core.anomaly(message.data)
         self.take_anomaly(message.data)
 
+    def _estimated(self, theta: Array) -> None:
+        self.core.estimated(theta, time.monotonic())
+        # The estimate is made from the newest muscle states: now everything is fresh.
+        self._step()
+
     def _target(self, message: JointState) -> None:
         self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
-        if self.core.safety.cause:
-            self.get_logger().warning(
-                f'stopped ({self.core.safety.cause}): the target waits for controller/reset'
-            )
-        if self.core.clamped:
-            clamped = ', '.join(self.core.clamped)
-            self.get_logger().warning(f'target clamped to the joint limits: {clamped}')
+        warn = self.get_logger().warning
+        if cause := self.core.safety.cause:
+            warn(f'stopped ({cause}): the target waits for controller/reset')
+        if clamped := ', '.join(self.core.clamped):
+            warn(f'target clamped to the joint limits: {clamped}')
 
-    def _explore(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        reason = self.core.explore(request.data)
-        response.success = not reason
+    def _explore(self, request: SetBool.Request) -> str:
+        if reason := self.core.explore(request.data):
+            raise MusculoskeletalError(reason)
         stopped = self.core.safety.cause
         holding = f'stopped: {stopped}' if stopped else 'holding'
-        response.message = reason or ('exploring' if request.data else holding)
-        return response
+        return 'exploring' if request.data else holding
 
-    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _stop(self, _: Trigger.Request) -> str:
         self.core.stop('controller/stop was called')
-        response.success, response.message = True, 'stopped; controller/reset ends it'
-        return response
+        return 'stopped; controller/reset ends it'
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        reason = self.core.reset(time.monotonic())
-        response.success = not reason
-        response.message = f'refused: {reason}' if reason else RESUMED
-        return response
+    def _reset(self, _: Trigger.Request) -> str:
+        if reason := self.core.reset(time.monotonic()):
+            raise MusculoskeletalError(f'refused: {reason}')
+        return 'going on to the last target, if any; controller/explore explores again'
 
     def _look_around(self) -> None:
         """Let nobody else say how the muscles are."""
-        topic = self.resolve_topic_name('muscle_states')
-        if self.count_publishers(topic) <= 1:
-            self.core.intruder = ''
-            return
-        names = sorted(
-            f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
-            for publisher in self.get_publishers_info_by_topic(topic)
-        )
+        topic, names = self.resolve_topic_name('muscle_states'), list[str]()
+        if self.count_publishers(topic) > 1:
+            for publisher in self.get_publishers_info_by_topic(topic):
+                names.append(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
         # One name twice: a node that was killed stays known for a while beside its successor.
-        several = len(set(names)) > 1
-        self.core.intruder = f'muscle_states come from {" and ".join(names)}' if several else ''
+        several = sorted(set(names)) if len(set(names)) > 1 else []
+        self.core.intruder = f'muscle_states come from {" and ".join(several)}' if several else ''
 
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:

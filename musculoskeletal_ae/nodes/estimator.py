@@ -17,13 +17,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
+from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_pose
+from musculoskeletal_ae.validity import read_pose
 
 
 class Estimator(Shell):
@@ -43,22 +44,17 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.follow_checkpoints(self.core.use)
-        self.listen(Float64MultiArray, 'muscle_states', self._estimate, SENSOR)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._length_command, RELIABLE)
-        self.listen(Float64MultiArray, 'muscle_tension_command', self._tension_command, RELIABLE)
+        self.follow_muscle_states(self._estimate)
+        for kind in ('length', 'tension'):
+            self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
-        self.create_service(Trigger, 'estimator/reset', self._reset)
+        serve(self, Trigger, 'estimator/reset', self._reset)
 
-    def _length_command(self, message: Float64MultiArray) -> None:
-        command = read_array(message, 1, self.robot.muscle_count)
-        self.core.commanded_length(command, time.monotonic())
+    def _commanded(self, kind: str, command: Array) -> None:
+        self.core.commanded(time.monotonic(), **{kind: command})
 
-    def _tension_command(self, message: Float64MultiArray) -> None:
-        command = read_array(message, 1, self.robot.muscle_count)
-        self.core.commanded_tension(command, time.monotonic())
-
-    def _estimate(self, message: Float64MultiArray) -> None:
-        length, tension, temperature = read_array(message, len(QUANTITIES), self.robot.muscle_count)
+    def _estimate(self, states: Array) -> None:
+        length, tension, temperature = states
         clock, now = self.get_clock().now(), time.monotonic()
         self.plausibility.check_muscles(tension, length, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
@@ -79,14 +75,12 @@ class Estimator(Shell):
         theta = self.core.see(read_pose(message, self.robot.root_link))
         self.seen.publish(joint_message(self.robot.joints, theta, message.header.stamp))
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
-        response.success = True
-        response.message = f'cleared: {cause}' if cause else 'nothing was detected'
         self.core.reset()
         self.take_anomaly(False)
         self.detected.publish(Bool(data=False))
-        return response
+        return f'cleared: {cause}' if cause else 'nothing was detected'
 
     def clock_jumped_back(self) -> None:
         """Start the detector's counts anew; what was detected stays."""

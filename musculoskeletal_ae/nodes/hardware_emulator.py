@@ -11,19 +11,15 @@ from functools import partial
 from typing import Any
 
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from std_msgs.msg import Float64MultiArray
+from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.nodes.arm import Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
+from musculoskeletal_ae.nodes.messages import serve
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.validity import read_array, read_wrench
-
-# After a pause (a debugger, a suspended machine) the arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
 
 
 class HardwareEmulator(Arm):
@@ -42,30 +38,19 @@ class HardwareEmulator(Arm):
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)
         self.follow_parameter('marker_rate', partial(setattr, self, 'marker_rate'))
-        self.advertise('', joints=self.parameter('joint_sensors'), description=True)
+        self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._follow_length, RELIABLE)
-        self.listen(Float64MultiArray, 'muscle_tension_command', self._follow_tension, RELIABLE)
-        self.listen(WrenchStamped, 'hardware_emulator/external_wrench', self._push, RELIABLE)
-        self.create_service(Trigger, 'hardware_emulator/reset', self._reset)
+        self.follow_muscles('muscle_length_command', self.arm.command_length)
+        self.follow_muscles('muscle_tension_command', self.arm.command_tension)
+        self.follow_wrench(self.arm.set_wrench)
+        serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
         self.create_timer(1.0 / self.rate, self._tick)
 
-    def _follow_length(self, message: Float64MultiArray) -> None:
-        self.arm.command_length(read_array(message, 1, self.robot.muscle_count))
-
-    def _follow_tension(self, message: Float64MultiArray) -> None:
-        self.arm.command_tension(read_array(message, 1, self.robot.muscle_count))
-
-    def _push(self, message: WrenchStamped) -> None:
-        self.arm.set_wrench(read_wrench(message, self.robot.root_link))
-
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        response.success = True
-        response.message = 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
-        return response
+        return 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
 
     def _tick(self) -> None:
         now = time.monotonic()

@@ -10,25 +10,23 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
+from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import learner
-from musculoskeletal_ae.learning.rest import RestSettings
-from musculoskeletal_ae.learning.samples import Novelty
+from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import bytes_message
-from musculoskeletal_ae.nodes.qos import LATCHED, SENSOR
+from musculoskeletal_ae.nodes.messages import bytes_message, serve
+from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 POLL = 0.05  # [s] between looks at the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
-AUTO = 'auto'
 
 
 class Learner(Shell):
@@ -44,10 +42,7 @@ class Learner(Shell):
             seed=value('seed'),
             steps=value('update_steps'),
             period=1.0 / self.rate,
-            rest=RestSettings(
-                value('rest_time'), value('rest_joint_rate'), value('rest_length_rate')
-            ),
-            novelty=Novelty(value('new_joint_distance'), value('new_tension_distance')),
+            settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
             training=TrainingProcess,
             directory=self._directory(value('state_directory')),
         )
@@ -57,17 +52,17 @@ class Learner(Shell):
         self.follow_parameter('checkpoint', self._take_checkpoint)
         self.follow_parameter('relearn_muscles', self._relearn)
         self.running = True
-        self.listen(JointState, JOINT_TOPICS[value('joint_source')], self._joints, SENSOR)
-        self.listen(Float64MultiArray, 'muscle_states', self._muscles, SENSOR)
-        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
-        self.create_service(SetBool, 'learner/enable', self._enable)
-        self.create_service(Trigger, 'learner/save', self._save)
+        self.follow_posture(JOINT_TOPICS[value('joint_source')], self._joints)
+        self.follow_muscle_states(self._muscles)
+        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        serve(self, SetBool, 'learner/enable', self._enable)
+        serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
         self.create_timer(POLL, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
 
     def _directory(self, value: str) -> Path | None:
-        if value != AUTO:
+        if value != 'auto':
             return Path(value) if value else None
         home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
@@ -98,28 +93,16 @@ class Learner(Shell):
     def _now(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
-    def _joints(self, message: JointState) -> None:
-        self.core.joints(self._now(), read_posture(message, self.robot.joints))
+    def _joints(self, theta: Array) -> None:
+        self.core.joints(self._now(), theta)
 
-    def _muscles(self, message: Float64MultiArray) -> None:
-        length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
+    def _muscles(self, states: Array) -> None:
+        length, tension, _ = states
         self.core.muscles(self._now(), tension, length)
 
-    def _anomaly(self, message: Bool) -> None:
-        self.core.anomaly(message.data)
-
-    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)
-        response.success = True
-        response.message = 'learning' if request.data else 'stopped; samples and network stay'
-        return response
-
-    def _save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.success, response.message = True, f'saved in {self.core.save()}'
-        except MusculoskeletalError as error:
-            response.success, response.message = False, str(error)
-        return response
+        return 'learning' if request.data else 'stopped; samples and network stay'
 
     def _poll(self) -> None:
         data = self.core.poll(self._now())

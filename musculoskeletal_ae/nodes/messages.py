@@ -1,33 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays to ROS messages; `musculoskeletal_ae.validity` reads them."""
+"""Arrays to ROS messages, which `musculoskeletal_ae.validity` reads; answers to services."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_msgs.msg import (
-    Float64MultiArray,
-    MultiArrayDimension,
-    MultiArrayLayout,
-    UInt8MultiArray,
-)
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 
 def array_message(values: Array, *labels: str) -> Float64MultiArray:
     """Return a multi-array of values (…) with one label per dimension."""
     sizes = values.shape
-    layout = MultiArrayLayout(
-        dim=[
-            MultiArrayDimension(label=label, size=size, stride=int(np.prod(sizes[i:])))
-            for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
-        ]
-    )
+    dimensions = [
+        MultiArrayDimension(label=label, size=size, stride=int(np.prod(sizes[i:])))
+        for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
+    ]
+    layout = MultiArrayLayout(dim=dimensions)
     return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
 
 
@@ -41,3 +38,19 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
 def bytes_message(data: bytes) -> UInt8MultiArray:
     """Return a byte array message."""
     return UInt8MultiArray(data=array('B', data))
+
+
+def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
+    """Offer a Trigger or SetBool service: `work` takes the request and says what it did.
+
+    It raises a `MusculoskeletalError` to refuse.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            response.success, response.message = True, work(request)
+        except MusculoskeletalError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    node.create_service(kind, name, answer)

@@ -16,6 +16,8 @@ from collections import Counter
 from dataclasses import replace
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
+from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
     PRESET,
@@ -27,6 +29,7 @@ from musculoskeletal_ae.parameters import (
 )
 
 SHARED = {'robot': ROBOT, 'rate': RATE}
+NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 #: by node, then by name
 PARAMETERS: dict[str, dict[str, Parameter]] = {
@@ -38,9 +41,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **parameters_of(ControlSettings),
     },
     'estimator': {
-        **SHARED,
-        'checkpoint': CHECKPOINT,
-        'preset': PRESET,
+        **NETWORK,
         'anomaly_threshold': Parameter(
             0.0,
             'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
@@ -55,27 +56,18 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(
-            (0.0,),
-            'error of the length sensors, one for all or one each',
-            'm',
-            settable=True,
+            (0.0,), 'error of the length sensors, one for all or one each', 'm', settable=True
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
         'marker_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
         'command_timeout': Parameter(
-            0.5,
-            'without a command for this long the modules go safe',
-            's',
-            (0.01, 60.0),
-            settable=True,
+            0.5, 'time without a command until the modules go safe', 's', (0.01, 60), settable=True
         ),
     },
     'sim': {
-        **SHARED,
-        'checkpoint': CHECKPOINT,
-        'preset': PRESET,
+        **NETWORK,
         'as_robot': Parameter(False, 'publish joint_states and muscle_states instead of sim/…'),
     },
     'learner': {
@@ -98,17 +90,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'state_directory': Parameter(
             'auto', 'of samples and network (auto: below XDG_STATE_HOME; empty: keep nothing)'
         ),
-        'rest_time': Parameter(0.3, 'how long the arm has to be still', 's', (0.0, 10.0)),
-        'rest_joint_rate': Parameter(0.02, 'fastest joint of a resting arm', 'rad/s', (0.0, 1.0)),
-        'rest_length_rate': Parameter(0.002, 'fastest muscle of a resting arm', 'm/s', (0.0, 1.0)),
-        'new_joint_distance': Parameter(
-            0.05, 'least distance of a new sample in one joint', 'rad', (0.0, 3.0)
-        ),
-        'new_tension_distance': Parameter(
-            10.0, 'least distance of a new sample in one tension', 'N', (0.0, 500.0)
-        ),
+        **parameters_of(LearningSettings),
         'update_steps': Parameter(
-            100, 'mini-batches of one update, preset default', '', (1, 100_000)
+            STEPS, 'mini-batches of one update, preset default', '', (1, 100_000)
         ),
     },
     'bringup_status': {

@@ -14,30 +14,22 @@ LONGEST_TEXT = 500
 
 
 class Reception:
-    """Counts what a node receives.
-
-    Attributes:
-        rejected: How many messages were rejected, by topic and reason.
-        last_rejected: What was wrong with the last one of them, or ''.
-    """
+    """Counts what a node receives."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         """Nothing has come yet; `warn` is told of the first rejection for each reason."""
         self._warn = warn
-        self.last_rejected = ''
-        self.rejected: Counter[str] = Counter()
+        self.last_rejected = ''  # what was wrong with the last one of them
+        self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         self._received: Counter[str] = Counter()
 
     def of(
-        self, topic: str, callback: Callable[[Any], None], publishers: Callable[[], int]
+        self, topic: str, callback: Callable[[Any], object], publishers: Callable[[], int]
     ) -> Callable[[Any, dict[str, Any]], None]:
         """Return what to subscribe with: calls `callback` unless the message comes twice or late.
 
-        Args:
-            topic: To count under.
-            callback: Raises a `MusculoskeletalError` to reject the message.
-            publishers: Counts who publishes there: a message does not say who sent it, and two
-                clocks or counters cannot be compared.
+        It raises a `MusculoskeletalError` to reject the message. `publishers` counts who publishes
+        there: a message does not say who sent it, and two clocks or counters cannot be compared.
         """
         order = SourceOrder()
 

@@ -20,14 +20,14 @@ from musculoskeletal_ae.bags.metadata import Qos, offered_qos
 from musculoskeletal_ae.bags.recover import recover
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter
-from musculoskeletal_ae.nodes.tool import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
 
 # What the recorder may lose when it is killed is what is younger than this.
 FLUSH_PERIOD = 0.5  # [s]
 # A second or two of the fastest topic, while the disk is busy.
-DEPTH = 1000
-LATCHED_DEPTH = 10
+LIVE = QoSProfile(depth=1000)
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # After Ctrl-C: what has arrived and waits to be taken still belongs to the recording.
 DRAIN_TIME = 0.5  # [s]
 
@@ -45,13 +45,7 @@ class Record(Node):
         for name in topics:
             topic = TOPICS[name]
             resolved = self.resolve_topic_name(name)
-            qos = QoSProfile(
-                depth=LATCHED_DEPTH if topic.latched else DEPTH,
-                reliability=ReliabilityPolicy.RELIABLE,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL
-                if topic.latched
-                else DurabilityPolicy.VOLATILE,
-            )
+            qos = LATCHED if topic.latched else LIVE
             receive = partial(self._receive, resolved, topic)
             self.create_subscription(message_class(topic.type), name, receive, qos, raw=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -60,21 +54,19 @@ class Record(Node):
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
         if name not in self._numbers:
-            self._numbers[name] = self.writer.add_topic(
-                name, topic.type, self._offered(name, topic)
-            )
+            offered = self._offered(name, topic)
+            self._numbers[name] = self.writer.add_topic(name, topic.type, offered)
         self.writer.write(self._numbers[name], now, info['source_timestamp'], data)
         self.received += 1
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
         """Return what the publishers of a topic offer; their depth cannot be seen from here."""
-        profiles = [info.qos_profile for info in self.get_publishers_info_by_topic(name)]
         offered = [
             offered_qos(
-                profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-                reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
+                info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                reliable=info.qos_profile.reliability == ReliabilityPolicy.RELIABLE,
             )
-            for profile in profiles
+            for info in self.get_publishers_info_by_topic(name)
         ]
         return offered or [offered_qos(topic.latched)]
 
@@ -104,27 +96,19 @@ def _record(options: Namespace, arguments: list[str]) -> None:
 
 def parse(arguments: list[str]) -> Namespace:
     """Return the options of `record`."""
-    parser = Parser(
-        'record',
-        'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
-        + ROS_HELP,
+    told = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
+    parser = Parser('record', told + ROS_HELP)
+    add = parser.add_argument
+    add('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
+    add('-o', '--out', type=Path, metavar='DIR', help='the same')
+    add('--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)')
+    add('--duration', type=positive, metavar='S', help='stop after this time [s]')
+    add('--compression', choices=COMPRESSIONS, default='zstd', help='of the messages')
+    mended = (
+        'make a finished bag of one whose recorder was killed: in place, the original kept as '
+        'BAG.unfinished, or in DIR'
     )
-    parser.add_argument('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
-    parser.add_argument('-o', '--out', type=Path, metavar='DIR', help='the same')
-    parser.add_argument(
-        '--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)'
-    )
-    parser.add_argument('--duration', type=positive, metavar='S', help='stop after this time [s]')
-    parser.add_argument(
-        '--compression', choices=COMPRESSIONS, default='zstd', help='of the messages'
-    )
-    parser.add_argument(
-        '--recover',
-        type=Path,
-        metavar='BAG',
-        help='make a finished bag of one whose recorder was killed: in place, the original kept '
-        'as BAG.unfinished, or in DIR',
-    )
+    add('--recover', type=Path, metavar='BAG', help=mended)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
         parser.error('DIR is given twice')
@@ -135,9 +119,8 @@ def parse(arguments: list[str]) -> Namespace:
 
 def _topics(text: str) -> list[str]:
     listed = names(text)
-    for name in listed:
-        if name not in TOPICS:
-            raise ArgumentTypeError(f'{name!r} is none of {", ".join(TOPICS)}')
+    if unknown := [name for name in listed if name not in TOPICS]:
+        raise ArgumentTypeError(f'{unknown[0]!r} is none of {", ".join(TOPICS)}')
     return listed
 
 

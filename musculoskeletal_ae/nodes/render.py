@@ -13,7 +13,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.qos import SENSOR
-from musculoskeletal_ae.nodes.tool import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 

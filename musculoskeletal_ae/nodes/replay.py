@@ -21,8 +21,10 @@ from tqdm import tqdm
 from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.messages import serve
 from musculoskeletal_ae.nodes.qos import LATCHED
-from musculoskeletal_ae.nodes.tool import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
 # Deep enough that a reader that is late by a second still gets everything.
@@ -38,18 +40,13 @@ CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
 
 
 class RecordedClock:
-    """Publishes the recorded time on /clock at a steady rate.
-
-    Attributes:
-        publisher: Of /clock.
-        next_tick: When the steady clock [s] calls for the next message.
-    """
+    """Publishes the recorded time on /clock at a steady rate."""
 
     def __init__(self, node: Node, rate: float) -> None:
         """Advertise /clock for a replay at a rate."""
         self.publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
         self._period = max(CLOCK_PERIOD / max(rate, 1.0), SHORTEST_CLOCK_PERIOD)
-        self.next_tick = -math.inf
+        self.next_tick = -math.inf  # when the steady clock [s] calls for the next message
 
     def tick(self, recorded: int, now: float) -> None:
         """Publish the recorded time [ns] if it is time to."""
@@ -63,13 +60,7 @@ class Replay(Node):
     """Publishes recorded bytes at their time."""
 
     def __init__(self, bag: Bag, names: dict[str, str], options: Namespace) -> None:
-        """Advertise the topics.
-
-        Args:
-            bag: An opened bag.
-            names: What to publish each recorded topic on.
-            options: Of the command line.
-        """
+        """Advertise the topics: `names` says what to publish each recorded one on."""
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
@@ -100,8 +91,8 @@ class Replay(Node):
         while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)
-        for name, serve in (('pause', self._pause), ('resume', self._resume), ('step', self._step)):
-            self.create_service(Trigger, f'replay/{name}', serve)
+        for work in (self.pause, self.resume, self.step):
+            serve(self, Trigger, f'replay/{work.__name__}', work)
 
     def play(self, progress: tqdm) -> None:
         """Publish everything once, from start to stop."""
@@ -148,25 +139,26 @@ class Replay(Node):
         if self._recorded_clock:
             self._recorded_clock.tick(self._timeline.recorded(now), now)
 
-    def _pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def pause(self, _: Trigger.Request) -> str:
+        """Stop where it is."""
         self._timeline.pause(time.monotonic())
-        return self._answer(response, 'paused')
+        return f'paused at {self._position()}'
 
-    def _resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def resume(self, _: Trigger.Request) -> str:
+        """Go on."""
         self._timeline.resume(time.monotonic())
-        return self._answer(response, 'playing')
+        return f'playing at {self._position()}'
 
-    def _step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def step(self, _: Trigger.Request) -> str:
+        """Publish the messages of the next recorded time."""
         if not self._timeline.paused:
-            response.success, response.message = False, 'not paused: call replay/pause first'
-            return response
+            raise MusculoskeletalError('not paused: call replay/pause first')
         self._timeline.jump(self._next_time, time.monotonic())
-        return self._answer(response, 'stepped')
+        return f'stepped at {self._position()}'
 
-    def _answer(self, response: Trigger.Response, what: str) -> Trigger.Response:
+    def _position(self) -> str:
         at = (self._timeline.recorded(time.monotonic()) - self._bag.start) / 1e9
-        response.success, response.message = True, f'{what} at {max(at, 0.0):.6f} s'
-        return response
+        return f'{max(at, 0.0):.6f} s'
 
 
 def _replay(options: Namespace, arguments: list[str]) -> int:
@@ -200,35 +192,22 @@ def parse(arguments: list[str]) -> Namespace:
     add('bag', type=Path, metavar='BAG', help='a bag directory or an mcap file')
     add('--check', action='store_true', help='play nothing; say what is in it (exit status 1: bad)')
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
-    add(
-        '--topics',
-        type=names,
-        default=[DEFAULT],
-        metavar='LIST',
-        help=f'{DEFAULT}: what hardware, vision, user and controller sent; {ALL}: also what nodes '
-        'compute; or names separated by commas',
+    topics = (
+        f'{DEFAULT}: what hardware, vision, user and controller sent; {ALL}: also what nodes '
+        'compute; or names separated by commas'
     )
+    add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     add('--keep-names', action='store_true', help='keep the recorded namespace')
     add('--from-namespace', metavar='NS', help='which arm, of a bag that has several')
     add('--rate', type=positive, default=1.0, help='multiple of the recorded speed; needs --clock')
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again at the end')
-    add(
-        '--start',
-        type=not_negative,
-        default=0.0,
-        metavar='S',
-        help='start this far into the bag [s]',
-    )
+    start = 'start this far into the bag [s]'
+    add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
     add('--paused', action='store_true', help='wait for replay/resume or replay/step')
-    add(
-        '--wait',
-        type=not_negative,
-        default=2.0,
-        metavar='S',
-        help='longest wait for subscribers [s]',
-    )
+    wait = 'longest wait for subscribers [s]'
+    add('--wait', type=not_negative, default=2.0, metavar='S', help=wait)
     options = parser.parse_args(arguments)
     if options.rate != 1 and not options.clock:
         parser.error(

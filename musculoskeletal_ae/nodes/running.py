@@ -1,24 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start and end of every node's process."""
+"""Start and end of every process: nodes, and the tools `record`, `replay` and `render`."""
 
 from __future__ import annotations
 
 import ast
+import signal
 import sys
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn
+from typing import Any
 
 import rclpy
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    InvalidTopicNameException,
+)
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.parameters import help_text
+from musculoskeletal_ae.options import exit_status
+
+ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
 
 # What rclpy raises for a value of the wrong type or beyond its range, given at the start.
 PARAMETER_ERRORS = (
@@ -34,26 +46,15 @@ def reason(error: Exception) -> str:
     return ' '.join(str(error).split(', at /')[0].split())
 
 
-def _refuse(error: object) -> NoReturn:
-    print(f'error: {error}', file=sys.stderr)
-    sys.exit(1)
-
-
-def help_of(node: str) -> str:
-    """Return what `--help` of a node says, without importing the node, which takes a second."""
-    spec = find_spec(f'musculoskeletal_ae.nodes.{node}')
-    assert spec is not None and spec.origin is not None
-    told = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding='utf-8')))
-    return f'{told}\n\n{help_text(node)}'
-
-
 def run(name: str) -> None:
     """Run one node on a single-threaded executor until it is asked to stop.
 
     What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
     """
     if {'--help', '-h'} & set(sys.argv[1:]):
-        print(help_of(name))
+        # Not by importing the node, which takes a second.
+        source = Path(__file__).with_name(f'{name}.py').read_text(encoding='utf-8')
+        print(ast.get_docstring(ast.parse(source)), help_text(name), sep='\n\n')
         return
     node: Node | None = None
     try:
@@ -66,12 +67,12 @@ def run(name: str) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except MusculoskeletalError as error:
-        _refuse(error)
+        sys.exit(f'error: {error}')
     except PARAMETER_ERRORS as error:
-        _refuse(reason(error))
+        sys.exit(f'error: {reason(error)}')
     except rclpy_implementation.RCLError as error:
         if node is None:
-            _refuse(reason(error))
+            sys.exit(f'error: {reason(error)}')
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
             raise
@@ -88,3 +89,56 @@ estimator = partial(run, 'estimator')
 hardware_emulator = partial(run, 'hardware_emulator')
 learner = partial(run, 'learner')
 sim = partial(run, 'sim')
+
+
+# -- tools ----------------------------------------------------------------------------------------
+
+
+def message_class(type_name: str) -> Any:
+    """Return the ROS class of a message type of ROS 2 Jazzy."""
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError) as error:
+        raise MusculoskeletalError(
+            f'message type {type_name} is not installed; install the ROS package {package}'
+        ) from error
+
+
+def start_ros(arguments: list[str]) -> None:
+    """Start ROS with the arguments of the process; signals stay with Python.
+
+    ROS's own handlers take publishers and queues away before the tool has ended its work.
+    """
+    with _clear_ros_arguments(arguments):
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+
+
+def run_tool(
+    name: str,
+    parse: Callable[[list[str]], Namespace],
+    work: Callable[[Namespace, list[str]], int],
+    argv: list[str] | None,
+) -> int:
+    """Parse options, work with them and with all arguments, and return the exit status.
+
+    `argv` are the arguments, those for ROS included; None for those of the process.
+    """
+    arguments = [name, *(sys.argv[1:] if argv is None else argv)]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with _clear_ros_arguments(arguments):
+        options = parse(remove_ros_args(arguments)[1:])
+    try:
+        refused = (InvalidTopicNameException, *PARAMETER_ERRORS)
+        return exit_status(lambda: work(options, arguments), *refused)
+    finally:
+        rclpy.try_shutdown()
+
+
+@contextmanager
+def _clear_ros_arguments(arguments: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
+        sys.exit(2)

@@ -20,18 +20,21 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
-from std_msgs.msg import UInt8MultiArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -40,13 +43,7 @@ LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': Dia
 
 
 class Shell(Node):
-    """A node that knows its robot, counts what it rejects and reports once a second.
-
-    Attributes:
-        robot: The robot of the `robot` parameter.
-        rate: Rate of the muscle modules [Hz].
-        rejected: How many messages were rejected, by topic and reason.
-    """
+    """A node that knows its robot, counts what it rejects and reports once a second."""
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
@@ -57,11 +54,11 @@ class Shell(Node):
             default = parameter.default
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
-            self.parameter(key)
+            self.parameter(key)  # refuses what is not legal
         self.robot = Robot.load(self.parameter('robot'))
-        self.rate: float = self.parameter('rate')
+        self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
-        self.rejected = self._reception.rejected
+        self.rejected = self._reception.rejected  # messages, by topic and reason
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
@@ -123,11 +120,9 @@ class Shell(Node):
     def follow_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Take checkpoints from the parameter and the topic; the last that passes the gate wins.
+        """Use checkpoints from the parameter and the topic; the last that passes the gate wins.
 
-        Args:
-            use: Takes a checked network.
-            unfit: Is told why one that came by topic cannot be used; the one in use stays.
+        `unfit` is told why one that came by topic cannot be used; the one in use stays.
         """
         gate = self.gate = Gate(self.robot)
 
@@ -165,7 +160,7 @@ class Shell(Node):
     # -- messages -------------------------------------------------------------------------------
 
     def listen(
-        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
         """Subscribe; a message that breaks a rule, or comes twice or late, is counted and dropped.
 
@@ -176,21 +171,37 @@ class Shell(Node):
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
         self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
 
+    def follow_muscles(
+        self,
+        topic: str,
+        follow: Callable[[Array], object],
+        rows: int = 1,
+        qos: QoSProfile = RELIABLE,
+    ) -> None:
+        """Give `follow` what comes on a topic with a value for each muscle, (M,) or (rows, M)."""
+        muscles = self.robot.muscle_count
+        self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
+
+    def follow_muscle_states(self, follow: Callable[[Array], object]) -> None:
+        """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M)."""
+        self.follow_muscles('muscle_states', follow, len(QUANTITIES), SENSOR)
+
+    def follow_posture(self, topic: str, follow: Callable[[Array], object]) -> None:
+        """Give `follow` the θ [rad] (D,) that comes on a topic of joint states."""
+        joints = self.robot.joints
+        self.listen(JointState, topic, lambda m: follow(read_posture(m, joints)), SENSOR)
+
     # -- diagnostics ----------------------------------------------------------------------------
 
     def _report(self) -> None:
         report = self.report()
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
-        values = {
-            **report.values,
-            **{
-                f'{topic} rate': f'{count / elapsed:.1f} Hz'
-                for topic, count in self._reception.take_received().items()
-            },
-            'rejected': str(sum(self.rejected.values())),
-            **{f'rejected {reason}': str(count) for reason, count in self.rejected.items()},
-        }
+        received = self._reception.take_received()
+        values = dict(report.values)
+        values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
+        values['rejected'] = str(sum(self.rejected.values()))
+        values |= {f'rejected {reason}': str(n) for reason, n in self.rejected.items()}
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         status = DiagnosticStatus(

@@ -10,25 +10,24 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray
+from std_msgs.msg import Bool
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.arm import Arm
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_joints, read_wrench
+from musculoskeletal_ae.validity import read_joints
 
 TEMPERATURE = 25.0  # [°C]
-# After a pause (a debugger, a jump of /clock) the arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
 
 
 class Sim(Arm):
@@ -38,17 +37,17 @@ class Sim(Arm):
         """Declare topics; options are those of Node."""
         super().__init__('sim', **options)
         as_robot = self.parameter('as_robot')
-        self.advertise('' if as_robot else 'sim/', joints=True, description=as_robot)
+        self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
-        self.listen(Float64MultiArray, 'muscle_length_command', self._follow, RELIABLE)
+        self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
+        self.follow_wrench(partial(setattr, self, 'wrench'))
         if not as_robot:
-            self.listen(Float64MultiArray, 'muscle_states', self._note, SENSOR)
+            self.follow_muscle_states(self._note)
         self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
-        self.listen(WrenchStamped, 'sim/external_wrench', self._push, RELIABLE)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -61,15 +60,9 @@ class Sim(Arm):
         else:
             self.arm.use(mae)
 
-    def _follow(self, message: Float64MultiArray) -> None:
-        self.command = read_array(message, 1, self.robot.muscle_count)
-
-    def _note(self, message: Float64MultiArray) -> None:
-        length, tension, _ = read_array(message, len(QUANTITIES), self.robot.muscle_count)
+    def _note(self, states: Array) -> None:
+        length, tension, _ = states
         self.gate.message(tension, length, time.monotonic())
-
-    def _push(self, message: WrenchStamped) -> None:
-        self.wrench = read_wrench(message, self.robot.root_link)
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

@@ -36,21 +36,13 @@ POSTURES_PER_COEFFICIENT = 10  # of the cubic that gives slopes
 
 
 class ArmState(NamedTuple):
-    """N arms between two steps.
+    """N arms between two steps."""
 
-    Attributes:
-        theta: θ_sim [rad], shape (N, D).
-        tension: T_sim [N], shape (N, M).
-        length: l_sim [m], shape (N, M).
-        followed: The command as far as the modules have followed it [m], shape (N, M).
-        holding: Torque by which a stop, or whoever holds a joint, keeps it [N·m], shape (N, D).
-    """
-
-    theta: Array
-    tension: Array
-    length: Array
-    followed: Array
-    holding: Array
+    theta: Array  # θ_sim [rad], (N, D)
+    tension: Array  # T_sim [N], (N, M)
+    length: Array  # l_sim [m], (N, M)
+    followed: Array  # the command as far as the modules have followed it [m], (N, M)
+    holding: Array  # torque of a stop, or of whoever holds a joint, on it [N·m], (N, D)
 
 
 class QuasiStatics:
@@ -70,14 +62,10 @@ class QuasiStatics:
         wrench: Array | None = None,
         fixed: Array | None = None,
     ) -> ArmState:
-        """Return the arms h later.
+        """Return the arms h [s] later, under l_target [m] (N, M), PAID_OUT for none.
 
-        Args:
-            state: N arms.
-            command: l_target [m], shape (N, M); PAID_OUT for none.
-            h: Time step [s].
-            wrench: On the end effector, axes of the root link [N, N·m], shape (N, 6).
-            fixed: Angles joints are forced to [rad], shape (N, D); nan for a free joint.
+        A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
+        forced to the angles `fixed` (N, D) [rad], nan for a free joint.
         """
         robot, theta, tension = self._robot, state.theta, state.tension
         stiffness, limits = robot.stiffness, robot.tension
@@ -105,16 +93,11 @@ class QuasiStatics:
         stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
         after = desired + stiffness * soft * stretch
         after = np.minimum(np.maximum(after, limits.bias), limits.max)
+        length = length + stretch - compliance * (after - tension)
         held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
         if fixed is not None:
             held |= np.isfinite(fixed)
-        return ArmState(
-            arrived,
-            after,
-            length + stretch - compliance * (after - tension),
-            followed,
-            np.where(held, -push, 0.0),
-        )
+        return ArmState(arrived, after, length, followed, np.where(held, -push, 0.0))
 
     def _turn(
         self, theta: Array, push: Array, matrix: Array, most: float, fixed: Array | None
@@ -138,14 +121,10 @@ class QuasiStatics:
 
 
 def follow(command: Array, followed: Array, length: Array, span: float, most: float) -> Array:
-    """Return the command as far as modules of limited speed have wound.
+    """Return the command as far as modules have wound that wind at most `most` [m] in a step.
 
-    Args:
-        command: l_target [m], shape (N, M).
-        followed: How far they had wound a step before [m], shape (N, M).
-        length: l [m], shape (N, M).
-        span: How far below l a command still adds tension [m].
-        most: What a module winds in a step [m].
+    Command, how far they had `followed` it a step before, and length are (N, M) [m]; a command
+    adds tension as far as `span` [m] below the length.
     """
     reached = followed + np.minimum(np.maximum(command - followed, -most), most)
     # What lies beyond changes no tension; following it would take as long to come back from.
@@ -186,12 +165,7 @@ class Slopes:
         self._second = np.ascontiguousarray(second.reshape(muscles * len(linear), -1))
 
     def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D).
-
-        Args:
-            theta: θ [rad], shape (N, D).
-            tension: T [N], shape (N, M).
-        """
+        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
         count, joints = theta.shape
         linear = np.ones((count, 1 + joints))
         linear[:, 1:] = theta

@@ -52,12 +52,10 @@ class Load:
         self._strict: Array = self._upper * ~np.eye(len(before), dtype=bool)
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
-        """Return load [N·m] (N, D) and ∂load/∂θ [N·m/rad] (N, D, D).
+        """Return load [N·m] (N, D) and ∂load/∂θ [N·m/rad] (N, D, D) at θ [rad] (N, D).
 
-        Args:
-            theta: θ [rad], shape (N, D).
-            wrench: Force [N] and torque [N·m] on the end effector's origin, axes of the root
-                link, shape (N, 6). The torque's share in the gradient is left out.
+        The wrench (N, 6) [N, N·m] acts on the end effector's origin, in axes of the root link; its
+        torque's share in the gradient is left out.
         """
         poses = self._kinematics.transforms(theta)
         placed = (poses @ self._columns)[..., :3, :]  # (N, joints of the tree, 3, 3)
@@ -72,7 +70,9 @@ class Load:
         turning = spread.reshape(*axis.shape[:2], 9) @ CROSS_AND_DOT  # (N, D, 4)
         pull, bend = turning[..., :3], (spread @ axis[..., None])[..., 0] - turning[..., 3:] * axis
         if self._slides.any():
-            force = self._force(wrench, len(theta))
+            force = np.broadcast_to(self._carried_mass * self._gravity, axis.shape)
+            if wrench is not None:
+                force = force + self._carries_effector[:, None] * wrench[:, None, :3]
             pull = np.where(self._slides[:, None], force, pull)
             bend = np.where(self._slides[:, None], np.cross(axis, force), bend)
         if wrench is not None:
@@ -81,9 +81,3 @@ class Load:
         torque = (axis * pull).sum(axis=-1)
         slope = axis @ bend.swapaxes(1, 2)
         return -torque, -(slope * self._upper + (slope * self._strict).swapaxes(1, 2))
-
-    def _force(self, wrench: Array | None, count: int) -> Array:
-        force = np.broadcast_to(self._carried_mass * self._gravity, (count, len(self._tree), 3))
-        if wrench is not None:
-            force = force + self._carries_effector[:, None] * wrench[:, None, :3]
-        return force

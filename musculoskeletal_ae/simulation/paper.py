@@ -52,22 +52,15 @@ class PaperDescent:
         # A bound that no command in its senses meets: no muscle is wound in by its whole length.
         whole = self._robot.routes.length_at_zero
         length = np.clip(length, -whole, whole)
-        rows = [
-            self._descend(
-                state.theta[i],
-                state.tension[i],
-                length[i],
-                load[i],
-                None if fixed is None or np.isnan(fixed[i]).all() else fixed[i],
-            )
-            for i in range(len(length))
-        ]
-        theta, tension, reached = (np.stack(part) for part in zip(*rows, strict=True))
+        forced = np.full_like(state.theta, np.nan) if fixed is None else fixed
+        arms = zip(state.theta, state.tension, length, load, forced, strict=True)
+        theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
         return ArmState(theta, tension, reached, command, np.zeros_like(theta))
 
     def _descend(
-        self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array | None
+        self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array
     ) -> tuple[Array, Array, Array]:
+        """Return θ, T and l of one arm."""
         robot, mae = self._robot, self._mae
         joints, muscles = robot.joint_count, robot.muscle_count
         row = np.eye(joints + 2 * muscles)
@@ -76,12 +69,12 @@ class PaperDescent:
             Term(TENSION_WEIGHT, pull, np.zeros(muscles)),
             Term(LENGTH_WEIGHT, wind, LENGTH_SCALE * length),
         ]
-        if fixed is None:
+        given = np.flatnonzero(np.isfinite(fixed))
+        if not len(given):
             jacobian = mae.muscle_jacobian_difference(theta, tension)
             terms.append(Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque))
             z = mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length)
         else:
-            given = np.flatnonzero(np.isfinite(fixed))
             terms.append(Term(POSTURE_WEIGHT, row[given], fixed[given]))
             z = mae.encode(Mask.THETA_LENGTH, theta=theta, length=length)
         state = mae.decode(descend(mae, z, terms, SEARCH))

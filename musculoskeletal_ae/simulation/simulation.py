@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import TypeVar
+from itertools import compress
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -36,42 +36,28 @@ SETTLED = 1e-6  # [rad] moved in a step
 # Below these a stop or a module at its end does not count as a limit reached.
 STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
 
-Piece = TypeVar('Piece')
-Result = TypeVar('Result')
-
 
 class Simulation:
-    """N simulated arms of one robot.
+    """N simulated arms of one robot."""
 
-    Attributes:
-        mae: The learned body.
-        state: The arms now; assign it to go back to a state kept before.
-        command: l_target [m], shape (N, M).
-        wrench: On the end effectors, axes of the root link [N, N·m], shape (N, 6).
-        fixed: Angles joints are forced to [rad], shape (N, D); nan for a free joint.
-    """
+    mae: Mae  # the learned body
+    state: ArmState  # the arms now; assign it to go back to a state kept before
+    command: Array  # l_target [m], (N, M)
+    wrench: Array  # on the end effectors, axes of the root link [N, N·m], (N, 6)
+    fixed: Array  # angles joints are forced to [rad], (N, D); nan for a free joint
 
     def __init__(self, robot: Robot, mae: Mae, preset: str = 'default', arms: int = 1) -> None:
-        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
-
-        Args:
-            robot: For masses, limits, K_stiff and T_bias.
-            mae: The learned body.
-            preset: 'default' or 'paper'.
-            arms: N.
-        """
-        self.robot, self.preset = robot, preset
-        self.command: Array = np.full((arms, robot.muscle_count), PAID_OUT)
-        self.wrench: Array = np.zeros((arms, 6))
-        self.fixed: Array = np.full((arms, robot.joint_count), np.nan)
+        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command."""
+        self.robot = robot
+        self._kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
+        self.wrench = np.zeros((arms, 6))
+        self.fixed = np.full((arms, robot.joint_count), np.nan)
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
         """Take a new network; the arms move on to its equilibrium from where they are."""
-        self.mae = mae
-        kind = QuasiStatics if preset_named(self.preset).equilibrium else PaperDescent
-        self._body: PaperDescent | QuasiStatics = kind(self.robot, mae)
+        self.mae, self._body = mae, self._kind(self.robot, mae)
 
     def start_from(self, theta: Array) -> None:
         """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten."""
@@ -108,48 +94,39 @@ class Simulation:
         stopped = np.isnan(forced) & (np.abs(state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
         full = state.tension[arm] > robot.tension.max - TENSION_MARGIN
-        return [
-            *(robot.joints[i] for i in np.flatnonzero(stopped)),
-            *(robot.muscles[i] for i in np.flatnonzero(full)),
-        ]
+        return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
 
-    def report(self, arm: int = 0) -> Report:
-        """Say what acts on one arm, and whether it is at a limit."""
+    def report(self) -> Report:
+        """Say what acts on the first arm, and whether it is at a limit."""
         values = {'checkpoint version': str(self.mae.version)}
-        forced = [self.robot.joints[i] for i in np.flatnonzero(np.isfinite(self.fixed[arm]))]
-        if forced:
-            values['forced joints'] = ', '.join(forced)
-        if self.wrench[arm].any():
-            values['external wrench'] = f'{np.round(self.wrench[arm], 3).tolist()} N, N·m'
-        limits = self.limits(arm)
-        if limits:
+        if forced := ', '.join(compress(self.robot.joints, np.isfinite(self.fixed[0]))):
+            values['forced joints'] = forced
+        if self.wrench[0].any():
+            values['external wrench'] = f'{np.round(self.wrench[0], 3).tolist()} N, N·m'
+        if limits := self.limits():
             return Report('warn', f'at the limit: {", ".join(limits)}', values)
-        commanded = np.isfinite(self.command[arm]).all()
+        commanded = np.isfinite(self.command[0]).all()
         return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
     def _advance(self, h: float) -> None:
-        count = len(self.command)
         wrench = self.wrench if self.wrench.any() else None
         fixed = self.fixed if np.isfinite(self.fixed).any() else None
+
+        def advance(rows: slice) -> ArmState:
+            state = ArmState(*(part[rows] for part in self.state))
+            pushed, forced = (None if part is None else part[rows] for part in (wrench, fixed))
+            return self._body.step(state, self.command[rows], h, pushed, forced)
+
+        count = len(self.command)
         if count <= CHUNK:
-            self.state = self._body.step(self.state, self.command, h, wrench, fixed)
-            return
-
-        def advance(start: int) -> ArmState:
-            rows = slice(start, start + CHUNK)
-            return self._body.step(
-                ArmState(*(part[rows] for part in self.state)),
-                self.command[rows],
-                h,
-                None if wrench is None else wrench[rows],
-                None if fixed is None else fixed[rows],
-            )
-
-        parts = on_all_cores(advance, range(0, count, CHUNK))
-        self.state = ArmState(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+            self.state = advance(slice(count))
+        else:
+            pieces = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
+            arms = on_all_cores(advance, pieces)
+            self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
 
 
-def on_all_cores(function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:
     """Return function(piece) of each piece, in order; the function may not wait for others.
 
     numpy lets go of Python's lock while it computes, so threads suffice. BLAS would also like to

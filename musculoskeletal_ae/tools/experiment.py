@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from musculoskeletal_ae.experiments import results
 from musculoskeletal_ae.experiments.report import write_report
-from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run, total_weight
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Study
-from musculoskeletal_ae.experiments.table import update_readme
 from musculoskeletal_ae.options import Parser, exit_status, whole
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -58,21 +57,20 @@ def main(argv: list[str] | None = None) -> int:
 def _measure(args: argparse.Namespace) -> None:
     start = time.perf_counter()
     names = tuple(EXPERIMENTS) if args.name == 'all' else (args.name,)
-    Robot.load(args.robot)
+    robot = Robot.load(args.robot)
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
-        study = Study(args.robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder))
-        total = round(total_weight(study, names), 1)
-        with tqdm(total=total, disable=None, bar_format=BAR) as bar:
+        study = Study(robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder))
+        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
 
-            def report(done: float, running: str) -> None:
-                bar.n = round(min(done, total), 1)
+            def report(share: float, running: str) -> None:
+                bar.n = share
                 bar.set_description_str(running)
 
             measured = run(study, names, args.jobs, report)
         files = [*results.write(study, measured, args.out), write_report(args.out)]
     if args.readme:
-        files += update_readme(args.readme, args.out)
+        files += results.update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
 
 

@@ -87,9 +87,9 @@ def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack,
     messages = round(DEAD_TIME / DT) + 1
     assert not any(verdict.cause for verdict in verdicts(slack, messages))  # no command: no demand
     if by_length:
-        detector.commanded_length(slack.length - 0.003)
+        detector.commanded(length=slack.length - 0.003)
     else:
-        detector.commanded_tension(np.full(6, 60.0))
+        detector.commanded(tension=np.full(6, 60.0))
     judged = verdicts(slack, messages)
     assert not judged[0].cause
     assert 'no tension' in judged[-1].cause and judged[-1].suspect == 2
@@ -97,5 +97,5 @@ def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack,
 
 def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):
     detector, verdicts = judge(mae)
-    detector.commanded_tension(np.full(6, 0.5 * robot.tension.bias))
+    detector.commanded(tension=np.full(6, 0.5 * robot.tension.bias))
     assert not any(verdict.cause for verdict in verdicts(slack, 100))

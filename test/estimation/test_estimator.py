@@ -96,21 +96,21 @@ def test_a_jump_of_the_clock_forgets_counts_but_not_the_latch(stepped, wound):
 
 def test_an_old_command_accuses_nobody(robot, mae, slack):
     stepped = Stepped(robot, mae)
-    stepped.core.commanded_length(slack.length - 0.003, stepped.now)
+    stepped.core.commanded(stepped.now, length=slack.length - 0.003)
     stepped.now += COMMAND_AGE
     assert not any(estimate.detected for estimate in stepped.step(slack, 100))
-    stepped.core.commanded_tension(np.full(6, 60.0), stepped.now)
+    stepped.core.commanded(stepped.now, tension=np.full(6, 60.0))
     assert not stepped.step(slack, round(DEAD_TIME / DT) - 1)[-1].detected
-    stepped.core.commanded_tension(np.full(6, 60.0), stepped.now)
+    stepped.core.commanded(stepped.now, tension=np.full(6, 60.0))
     assert any(estimate.detected for estimate in stepped.step(slack, 2))
 
 
 def test_a_pause_of_the_messages_is_no_time_without_tension(robot, mae, slack):
     stepped = Stepped(robot, mae)
     for _ in range(round(DEAD_TIME / LONGEST_PERIOD)):
-        stepped.core.commanded_length(slack.length - 0.003, stepped.now + 10.0)
+        stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
         assert not stepped.step(slack, dt=10.0)[0].detected
-    stepped.core.commanded_length(slack.length - 0.003, stepped.now + 10.0)
+    stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
     assert any(estimate.detected for estimate in stepped.step(slack, 2, dt=10.0))
 
 

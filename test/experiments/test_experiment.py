@@ -112,8 +112,11 @@ def test_the_report_has_the_papers_numbers_and_the_command_to_repeat_it(quick):
 @pytest.mark.parametrize('name', EXPERIMENTS)
 def test_the_report_explains_every_experiment(quick, name):
     page = (quick / 'report.html').read_text(encoding='utf-8')
-    assert f'<h2 id="{name}">{EXPERIMENTS[name].title}</h2>' in page
-    assert EXPERIMENTS[name].here.split('. ')[0].splitlines()[0].split(' `')[0] in page
+    title, *parts = EXPERIMENTS[name].text.split('\n\n')
+    assert f'<h2 id="{name}">{title.rstrip(".")}</h2>' in page
+    for part, heading in zip(parts, ('Paper', 'Here'), strict=True):
+        words = part.removeprefix(f'{heading}. ').partition('\n')[0].partition(' `')[0]
+        assert f'<b>{heading}.</b> {words}' in page
 
 
 def test_the_report_says_by_how_much_an_aim_is_missed(quick, tmp_path):

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import (
-    STRIDE,
     learned,
     nominal,
     oracle,
@@ -61,10 +61,10 @@ def test_without_friction_the_oracle_is_left_with_the_sensors(robot):
     """A recording whose lengths carry 3 mm of hysteresis besides."""
     rng = np.random.default_rng(2)
     individual = Individual(robot, 0)
-    theta = robot.random_postures(COUNT * STRIDE, rng)
+    theta = robot.random_postures(10 * COUNT, rng)
     tension = rng.uniform(30.0, 130.0, (len(theta), robot.muscle_count))
     hysteresis = 3e-3 * rng.choice([-1.0, 1.0], tension.shape)
     length = individual.muscle_lengths(theta, tension) + hysteresis
     recording = Recording(theta, theta, length, tension, length)
-    errors = oracle_errors(robot, 0, recording)
+    errors = oracle_errors(EmulatedArm(robot, 0), 0, recording)
     assert errors['sensor_rad'] < 0.5 * errors['oracle_rad']

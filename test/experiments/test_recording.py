@@ -9,11 +9,11 @@ import pytest
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
-    frictionless,
     record,
     rows_between,
     times,
 )
+from musculoskeletal_ae.experiments.study import Study
 
 
 @pytest.fixture(scope='module')
@@ -58,8 +58,9 @@ def test_a_script_changes_the_arm_from_its_moment_on(arm26, mae, plain):
     np.testing.assert_array_equal(loaded.command, plain.command)
 
 
-def test_without_friction_it_is_the_same_body_otherwise(arm26):
-    smooth, rubbing = frictionless(arm26, 3).individual, EmulatedArm(arm26, 3).individual
+def test_without_friction_it_is_the_same_body_otherwise(arm26, tmp_path):
+    study = Study(arm26, 'default', (3,), 1.0, True, tmp_path)
+    smooth, rubbing = study.arm(3, friction=False).individual, study.arm(3).individual
     assert not smooth.cable_friction.any() and not smooth.joint_friction.any()
     assert rubbing.cable_friction.all() and rubbing.joint_friction.all()
     theta = arm26.random_postures(3, np.random.default_rng(0))

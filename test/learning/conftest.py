@@ -8,8 +8,7 @@ import copy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import Prior
+from musculoskeletal_ae.learning.body import CorrectedBody, Prior
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.training import Job

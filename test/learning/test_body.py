@@ -6,9 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.body_fit import fit_body
-from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 
 
 def rms(body, theta, tension, length):
@@ -64,7 +62,7 @@ def test_bad_samples_do_not_poison_the_fit(arm26, stage):
 
 def test_samples_that_say_nothing_change_nothing(arm26, stage):
     observations = stage.store(1).observations()
-    nothing = Observations(*observations.__dict__.values())
+    nothing = observations[:]
     nothing.known[:] = False
     body = CorrectedBody(arm26)
     fit_body(body, nothing)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,10 +40,8 @@ class Prepared(Training):
             return None
         self._job = None
         statistics = AnomalyStatistics(np.zeros(12), np.eye(12), self.calibrated, 100)
-        from dataclasses import replace
-
         mae = replace(self._mae, anomaly=statistics)
-        return Update(mae, 0.0, 0.0, np.empty(0), self.changed)
+        return Update(mae, 0.0, changed=self.changed)
 
     def close(self):
         self._job = None
@@ -50,6 +50,11 @@ class Prepared(Training):
 @pytest.fixture
 def learner(arm26, initial):
     return Learner(arm26, initial, training=Prepared)
+
+
+def accept(learner, stage, count):
+    for _ in range(count):
+        learner.accept(stage.sample())
 
 
 class Arm:
@@ -119,8 +124,7 @@ def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm2
 
 
 def test_a_sample_that_comes_during_an_update_is_learned_in_the_next(learner, stage):
-    for _ in range(2):
-        learner.accept(stage.sample())
+    accept(learner, stage, 2)
     learner.training.released = False
     learner.poll(0.0)
     learner.accept(stage.sample())
@@ -157,8 +161,7 @@ def test_a_clock_that_goes_back_stops_neither_updates_nor_checkpoints(learner, s
 
 
 def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
-    for _ in range(2):
-        learner.accept(stage.sample())
+    accept(learner, stage, 2)
     learner.anomaly(True)
     arm = Arm(learner, stage)
     arm.rest(10.0)
@@ -171,8 +174,7 @@ def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
 
 
 def test_a_disabled_learner_learns_nothing(learner, stage):
-    for _ in range(2):
-        learner.accept(stage.sample())
+    accept(learner, stage, 2)
     learner.enable(False)
     arm = Arm(learner, stage)
     arm.rest(10.0)
@@ -188,8 +190,7 @@ def calibrated(learner):
 
 
 def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learner, stage):
-    for _ in range(3):
-        learner.accept(stage.sample())
+    accept(learner, stage, 3)
     learner.training.calibrated, learner.training.released = True, False
     learner.poll(0.0)
     learner.relearn([2])
@@ -203,8 +204,7 @@ def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learn
 
 
 def test_a_changed_muscle_is_relearned_from_the_samples_that_told_of_it(learner, stage):
-    for _ in range(6):
-        learner.accept(stage.sample())
+    accept(learner, stage, 6)
     learner.training.calibrated, learner.training.changed = True, ((1, 4),)
     learner.poll(0.0)
     assert [bool(known[1]) for known in learner.samples.known] == [False] * 2 + [True] * 4
@@ -226,8 +226,7 @@ def test_rests_count_as_often_as_they_differ_since_the_arm_was_changed(learner, 
 
 
 def test_a_replaced_network_starts_anew_and_counts_on(learner, initial, stage):
-    for _ in range(3):
-        learner.accept(stage.sample())
+    accept(learner, stage, 3)
     version = learner.mae.version
     learner.replace(initial)
     assert len(learner.samples) == 0

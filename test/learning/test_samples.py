@@ -15,9 +15,9 @@ from musculoskeletal_ae.learning.rest import (
     FrictionDirection,
     RestCollector,
     RestDetector,
-    RestSettings,
 )
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT
 
 DT = 0.01
 
@@ -37,19 +37,19 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
-    found = run(RestDetector(RestSettings()), 3.5, lambda _: 0.3, lambda _: 0.01)
+    found = run(RestDetector(DEFAULT), 3.5, lambda _: 0.3, lambda _: 0.01)
     assert len(found) == 3
     np.testing.assert_allclose(found[0].theta, 0.3)
     np.testing.assert_allclose(found[0].length, 0.01)
 
 
 def test_a_moving_joint_or_wire_is_no_rest():
-    assert run(RestDetector(RestSettings()), 3.0, theta=lambda t: 0.05 * t) == []
-    assert run(RestDetector(RestSettings()), 3.0, length=lambda t: 0.01 * t) == []
+    assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.05 * t) == []
+    assert run(RestDetector(DEFAULT), 3.0, length=lambda t: 0.01 * t) == []
 
 
 def test_rest_that_ends_early_still_counts():
-    found = run(RestDetector(RestSettings()), 2.0, theta=lambda t: max(0.0, t - 0.6))
+    found = run(RestDetector(DEFAULT), 2.0, theta=lambda t: max(0.0, t - 0.6))
     assert len(found) == 1
     np.testing.assert_allclose(found[0].theta, 0.0, atol=0.01)
 
@@ -57,7 +57,7 @@ def test_rest_that_ends_early_still_counts():
 def test_sparse_noisy_angles_of_a_camera_are_averaged():
     rng = np.random.default_rng(0)
     found = run(
-        RestDetector(RestSettings()),
+        RestDetector(DEFAULT),
         10.0,
         theta=lambda _: 0.5 + 0.02 * rng.standard_normal(),
         measured=lambda n: n % 3 == 0,
@@ -68,7 +68,7 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
 
 
 def test_no_rest_without_joint_angles():
-    assert run(RestDetector(RestSettings()), 3.0, measured=lambda _: False) == []
+    assert run(RestDetector(DEFAULT), 3.0, measured=lambda _: False) == []
 
 
 def test_friction_acts_against_the_last_sliding_and_ignores_noise():
@@ -122,7 +122,13 @@ def healthy():
 
 @pytest.fixture
 def collector(arm26, healthy):
-    return RestCollector(arm26, RestSettings(), healthy)
+    return RestCollector(arm26, DEFAULT, healthy)
+
+
+def middle(robot):
+    """Return θ, T, l in the middle of the joint limits."""
+    theta, tension = 0.5 * (robot.lower + robot.upper), np.full(6, 60.0)
+    return theta, tension, robot.muscle_lengths(theta, tension)
 
 
 def rests_at(collector, arm26, theta, seconds, tension=60.0):
@@ -135,14 +141,14 @@ def rests_at(collector, arm26, theta, seconds, tension=60.0):
 
 
 def test_a_rest_counts_after_the_margin(collector, arm26):
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    theta, _, _ = middle(arm26)
     assert rests_at(collector, arm26, theta, MARGIN) == []
     (rest, *_) = rests_at(collector, arm26, theta, 1.5)
     np.testing.assert_allclose(rest.theta, theta)
 
 
 def test_what_comes_shortly_before_an_anomaly_is_not_learned(collector, arm26, healthy):
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    theta, _, _ = middle(arm26)
     rests_at(collector, arm26, theta, 2.0)
     collector.set_anomaly(True)
     assert rests_at(collector, arm26, theta, 10.0) == []
@@ -166,21 +172,18 @@ def test_what_no_arm_can_measure_is_refused_with_a_reason(collector, arm26):
 def test_a_clock_that_stands_still_does_not_fill_the_memory(arm26, monkeypatch, collector):
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST_WAITING', 20)
     monkeypatch.setattr('musculoskeletal_ae.learning.rest.MOST', 50)
-    collector = RestCollector(arm26, RestSettings(), Reservoir(6))
-    theta = 0.5 * (arm26.lower + arm26.upper)
+    collector = RestCollector(arm26, DEFAULT, Reservoir(6))
+    theta, pull, length = middle(arm26)
     rests_at(collector, arm26, theta, 0.5)
-    pull = np.full(6, 60.0)
     for _ in range(200):
-        collector.step(pull, arm26.muscle_lengths(theta, pull), 0.0, theta)
+        collector.step(pull, length, 0.0, theta)
     assert len(collector._waiting) <= 20
     assert len(collector._detector._window) <= 50
     assert len(collector._detector._rest) <= 50
 
 
 def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26, healthy):
-    theta = 0.5 * (arm26.lower + arm26.upper)
-    pull = np.full(6, 60.0)
-    length = arm26.muscle_lengths(theta, pull)
+    theta, pull, length = middle(arm26)
     rests = []
     for n in range(800):
         glitch = n in (300, 500)
@@ -192,12 +195,10 @@ def test_a_glitch_is_no_part_of_what_is_healthy(collector, arm26, healthy):
 
 
 def test_a_wire_may_have_slid_either_way_in_a_hole_of_the_stream(collector, arm26):
-    theta = 0.5 * (arm26.lower + arm26.upper)
-    pull = np.full(6, 60.0)
-    length = arm26.muscle_lengths(theta, pull)
+    theta, pull, length = middle(arm26)
     for n in range(50):  # wound in, so that friction has a direction
         collector.step(pull, length + 0.01 - 0.0002 * n, DT, theta)
-    (rest, *_) = [*rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)]
+    rest, *_ = rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)
     assert (rest.direction > 0.5).all()
     collector.step(pull, length, HOLE + 1.0, theta)
     *_, rest = rests_at(collector, arm26, theta, 2.0 + MARGIN)

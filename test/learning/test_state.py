@@ -25,7 +25,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 
 from .conftest import Stage
-from .test_learner import Prepared
+from .test_learner import Prepared, accept
 
 
 @pytest.fixture(autouse=True)
@@ -268,11 +268,6 @@ def begun(arm26, initial, tmp_path):
     yield begin
     for learner in learners:
         learner.close()
-
-
-def accept(learner, stage, count):
-    for _ in range(count):
-        learner.accept(stage.sample())
 
 
 def test_samples_that_came_while_the_disk_was_full_are_written_when_it_is_not(begun, stage):

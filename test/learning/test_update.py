@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.paper import PaperUpdater
-from musculoskeletal_ae.learning.training import Training, make_updater
-from musculoskeletal_ae.learning.update import BodyUpdater, learned_steps
+from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.update import BodyUpdater, PaperUpdater, learned_steps
 from musculoskeletal_ae.presets import PAPER
 
 from .conftest import Stage, drawn_body, job
@@ -80,9 +79,7 @@ def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26,
     assert (update.mae.encoder[0][0] != initial.encoder[0][0]).any()
 
 
-def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26, initial):
-    with pytest.raises(MusculoskeletalError, match='default, paper'):
-        make_updater(arm26, initial, 'best')
+def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
     with pytest.raises(MusculoskeletalError, match='default, paper'):
         Training(arm26, 'best')
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from sensor_msgs.msg import JointState
@@ -46,15 +46,8 @@ def healthy(arm26):
     return array_message(np.stack(rows), 'quantity', 'muscle')
 
 
-def diagnosis(graph):
-    """Return the newest status of this graph's estimator."""
-    name = f'{graph.namespace}/estimator: state'
-    statuses = [s for m in graph.received['/diagnostics'] for s in m.status if s.name == name]
-    return statuses[-1] if statuses else DiagnosticStatus()
-
-
 def values(graph):
-    return {v.key: v.value for v in diagnosis(graph).values}
+    return graph.report('estimator').values
 
 
 def answer(graph, message):
@@ -159,8 +152,8 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
         return detected and detected[-1].data
 
     estimator.wait(seen, 'the detection')
-    estimator.wait(lambda: 'anomaly detected: ' in diagnosis(estimator).message, 'the diagnosis')
-    assert diagnosis(estimator).level == DiagnosticStatus.ERROR
+    estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the diagnosis')
+    assert 'anomaly detected: ' in estimator.report('estimator').message
     for _ in range(8):
         answer(estimator, healthy)
     assert detected[-1].data

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from graph import DEADLINE
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -236,9 +236,7 @@ def start(graph, **parameters):
 
 
 def values(graph):
-    name = f'{graph.namespace}/learner: state'
-    found = [s for m in graph.received['/diagnostics'] for s in m.status if s.name == name]
-    return {v.key: v.value for v in (found or [DiagnosticStatus()])[-1].values}
+    return graph.report('learner').values
 
 
 def samples(graph):
@@ -297,12 +295,7 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
 
     def refused():
         publisher.publish(wrong)
-        return any(
-            v.key == 'rejected marker_pose: wrong frame'
-            for m in graph.received['/diagnostics']
-            for s in m.status
-            for v in s.values
-        )
+        return 'rejected marker_pose: wrong frame' in graph.report('estimator').values
 
     graph.wait(refused, 'the refusal of another frame')
 

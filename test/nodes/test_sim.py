@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
@@ -50,12 +50,6 @@ def posture(graph, topic='sim/joint_states'):
     return np.array(graph.next(topic).position)
 
 
-def state(graph):
-    name = f'{graph.namespace}/sim: state'
-    found = [s for m in graph.received['/diagnostics'] for s in m.status if s.name == name]
-    return found[-1] if found else DiagnosticStatus()
-
-
 def wait_for_posture(graph, theta, what):
     graph.wait(lambda: np.abs(posture(graph) - theta).max() < 0.01, what)
 
@@ -92,7 +86,7 @@ def test_it_follows_the_command_of_the_hardware(arm, arm26, mae, core):
         array_message(command, 'muscle')
     )
     wait_for_posture(arm, core.settle().theta[0], 'the posture of the core')
-    arm.wait(lambda: state(arm).message == 'following commands', 'the report')
+    arm.wait(lambda: arm.report('sim').message == 'following commands', 'the report')
 
 
 def test_a_push_acts_until_it_is_zero(arm, arm26, core):
@@ -108,7 +102,7 @@ def test_a_push_acts_until_it_is_zero(arm, arm26, core):
     message.header.frame_id = 'camera'
     message.wrench.force.x = 0.0
     push.publish(message)
-    arm.wait(lambda: 'wrong frame' in str(state(arm).values), 'the rejection')
+    arm.wait(lambda: 'wrong frame' in str(arm.report('sim').values), 'the rejection')
     message.header.frame_id = arm26.root_link
     push.publish(message)
     wait_for_posture(arm, rest, 'the release')
@@ -120,10 +114,10 @@ def test_joints_are_forced_and_released(arm, core):
     force.publish(JointState(name=['elbow'], position=[-0.8]))
     core.fixed[0] = [np.nan, -0.8]
     wait_for_posture(arm, core.settle().theta[0], 'the forced posture')
-    arm.wait(lambda: 'forced joints' in str(state(arm).values), 'the report')
+    arm.wait(lambda: 'forced joints' in str(arm.report('sim').values), 'the report')
     for names, reason in ((['knee'], 'unknown joint'), (['elbow'] * 2, 'duplicate joint')):
         force.publish(JointState(name=names, position=[0.0] * len(names)))
-        arm.wait(lambda reason=reason: reason in str(state(arm).values), reason)
+        arm.wait(lambda reason=reason: reason in str(arm.report('sim').values), reason)
     assert abs(posture(arm)[1] + 0.8) < 0.01
     force.publish(JointState())
     wait_for_posture(arm, rest, 'the release')
@@ -138,7 +132,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
     np.testing.assert_allclose(posture(arm), before, atol=1e-3)
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
-    arm.wait(lambda: 'at the limit: ' in state(arm).message, 'the report')
+    arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
     _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
     assert tension.max() <= arm26.tension.max
     theta = posture(arm)
@@ -149,14 +143,15 @@ def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, 
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.host(Sim, robot='arm26')
-    graph.wait(lambda: 'waiting for a checkpoint' in state(graph).message, 'the report')
+    graph.wait(lambda: 'waiting for a checkpoint' in graph.report('sim').message, 'the report')
     assert not graph.received['sim/joint_states']
     sender = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     sender.publish(bytes_message(b'not a network'))
-    graph.wait(lambda: 'rejected mae_checkpoint' in str(state(graph).values), 'the refusal')
+    graph.wait(lambda: 'rejected mae_checkpoint' in str(graph.report('sim').values), 'the refusal')
     for version in (41, 42):
         sender.publish(bytes_message(checkpoint.to_bytes(replace(mae, version=version))))
-        graph.wait(lambda v=version: f"value='{v}'" in str(state(graph).values), f'{version}')
+        said = f"'checkpoint version': '{version}'"
+        graph.wait(lambda said=said: said in str(graph.report('sim').values), said)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
     assert graph.set_parameter('sim', 'checkpoint', trained_file)[0]
