@@ -33,7 +33,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 JITTER = 0.03  # [s] by which a loaded machine publishes a command later than it was made
 RELIEF = 0.3  # [s] for which a tension that is being relieved was measured before
-SILENT = 5.0  # [s] that a node under attack may keep /diagnostics waiting
+SILENT = 10.0  # [s] that a node under attack may keep /diagnostics waiting
 GROWTH = 1.2  # of a node's memory, over what it was after five minutes
 YOUNG = 300.0  # [s]
 MOST_MEMORY = 500.0  # [MB] of any node at any time
@@ -135,6 +135,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
         f'{1e3 * max(step.largest_in for step in steps):.2f} mm in, '
         f'{1e3 * max(step.largest_out for step in steps):.2f} mm out'
     )
+    print(f'longest silence of a node: {max(attack.silences.values(), default=0.0):.1f} s')
     silent = [f'{name}: {s:.1f} s' for name, s in attack.silences.items() if s > SILENT]
     fat = []
     for name, process in attack.processes.items():
