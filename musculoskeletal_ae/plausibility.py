@@ -23,9 +23,9 @@ TOO_TENSE, TOO_SLACK = 1.1, -0.1  # of tension.max
 TEMPERATURES = -40.0, 200.0  # [°C]
 POSTURES = 500  # that tell how long the muscles get
 LENGTH_MARGIN = 0.1  # [m], for wires that wrap, wind slack, or were tied elsewhere
-#: a length changes by no more than SLIP + SPEED·dt from message to message [m], [m/s]; a new level
-#: that lasts is taken after SETTLED [s]
-SLIP, SPEED, SETTLED = 0.02, 1.0, 1.0
+#: a length changes by no more than SLIP + SPEED·dt from message to message [m], [m/s], dt at most
+#: HOLE [s]; a new level that lasts is taken after SETTLED [s]
+SLIP, SPEED, HOLE, SETTLED = 0.02, 1.0, 0.05, 1.0
 MOMENT = 0.1  # [s] that a doubt may last
 
 TENSION = 'tension beyond the maximum'
@@ -122,7 +122,7 @@ class Plausibility:
         return None
 
     def _step(self, length: Array, now: float) -> MessageError | None:
-        allowed = SLIP + SPEED * max(now - self._came_at, 0.0)
+        allowed = SLIP + SPEED * min(max(now - self._came_at, 0.0), HOLE)
         before, came = self._before, self._came
         self._came, self._came_at = length, now
         if before is None or (step := np.abs(length - before)).max() <= allowed:

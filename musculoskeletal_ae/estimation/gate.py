@@ -40,20 +40,20 @@ NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already
 
 #: largest share left unexplained of the fixed postures
 LIMITS = {
-    'θ by ①': 0.35,
-    'T by ①': 1.6,
-    'l by ①': 1.3,
-    'θ by ②': 1.0,
-    'T by ②': 1.6,
-    'l by ②': 1.1,
-    'θ by ③': 0.35,
-    'T by ③': 6.0,
-    'l by ③': 0.35,
-    'G by ①': 1.3,
+    'θ by ①': 0.5,
+    'T by ①': 1.25,
+    'l by ①': 2.1,
+    'θ by ②': 2.0,
+    'T by ②': 1.25,
+    'l by ②': 1.3,
+    'θ by ③': 0.8,
+    'T by ③': 13.0,
+    'l by ③': 0.7,
+    'G by ①': 1.4,
 }
 WORSE = 2.0
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
-LEAST_CUT = 0.3  # d of messages with a muscle cut over the threshold, the clearest muscle
+LEAST_CUT = 0.15  # d of messages with a muscle cut over the threshold, the clearest muscle
 
 
 class Gate:
