@@ -111,7 +111,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
     """Attack the running system."""
     from bench.attack_graph import LENGTH, Attack
 
-    messages = size.messages // size.episodes
+    messages = -(-size.messages // size.episodes)
     with Attack(folder, initial, seed) as attack:
         attack.spin(2.0)
         for episode in range(size.episodes):
