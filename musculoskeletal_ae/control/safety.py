@@ -6,9 +6,10 @@ so the tension limit of a muscle is a length limit,
 
     l_target ≥ l + l_comp(T_limit),   l_comp(T) = −(T − T_bias)/K_stiff,
 
-which may pay a muscle out faster than the rate limit, never wind it in. Readings are medians of the
-last three messages, so that a glitch of a sensor moves nothing. The limit of a muscle whose module
-runs hot falls smoothly from tension.max to T_bias, and no faster than the rate limit pays out.
+which may pay a muscle out faster than the rate limit, if its tension is measured above
+tension.limit, and never winds it in. Readings are medians of the last three messages, so that a
+glitch of a sensor moves nothing. The limit of a muscle whose module runs hot falls smoothly from
+tension.max to T_bias, and no faster than the rate limit pays out.
 
 A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
 limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate. A stop
@@ -132,8 +133,11 @@ class SafetyFilter:
         value = before.value + np.clip(value - before.value, -change, change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
-        length = np.minimum(muscles.length, self._longest)
-        return Command(kind, np.maximum(value, length + msc_compensation(robot, limit)))
+        least = np.minimum(muscles.length, self._longest) + msc_compensation(robot, limit)
+        # Only a muscle that does pull too hard is let go faster: lengths alone may lie.
+        tense = muscles.tension > robot.tension.limit
+        least = np.where(tense, least, np.minimum(least, before.value + change))
+        return Command(kind, np.maximum(value, least))
 
     def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
         self._held += dt

@@ -47,23 +47,36 @@ def vectors(low, high):
     st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
     st.floats(0.001, 1.0),
 )
-def test_lengths_wind_in_at_the_rate_limit_at_most_and_never_ask_for_more_than_the_limit(
-    commands, rate
-):
+def test_lengths_move_at_the_rate_limit_at_most_but_where_a_muscle_pulls_too_hard(commands, rate):
     guard, before = SafetyFilter(ROBOT, Settings(rate_limit=rate)), None
     for desired, length, limit in commands:
+        pull = np.full(COUNT, BIAS)
+        if before is not None:  # muscle stiffness control obeys the last command
+            pull += np.maximum(0.0, ROBOT.stiffness * (length - before))
         # What two readings of three say is believed.
         for _ in range(2):
-            now = Muscles(length.copy(), np.full(COUNT, BIAS), COLD)
+            now = Muscles(length.copy(), pull, COLD)
             sent = step(guard, Command(LENGTH, desired), now, limit).value
             if before is None:
                 before = unchanging(ROBOT, LENGTH, now).value
             assert (sent - before >= -rate * DT - 1e-12).all()
             last, before = before, sent
         demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
-        assert (demanded <= limit + 1e-6).all()
+        tense = pull > ROBOT.tension.limit
+        assert (demanded <= limit + 1e-6)[tense].all()
         # Paying out faster is what the tension limit may do, and nothing else.
-        assert ((sent - last)[demanded < limit - 1e-6] <= rate * DT + 1e-12).all()
+        slow = ~tense | (demanded < limit - 1e-6)
+        assert ((sent - last)[slow] <= rate * DT + 1e-12).all()
+
+
+def test_lengths_that_lie_pay_out_at_the_rate_limit_while_no_tension_agrees():
+    guard = SafetyFilter(ROBOT, Settings())
+    held = unchanging(ROBOT, LENGTH, muscles())
+    before = [step(guard, held).value for _ in range(3)][-1]
+    for _ in range(5):
+        sent = step(guard, held, muscles(0.06)).value
+        assert (sent - before <= Settings().rate_limit * DT + 1e-12).all()
+        before = sent
 
 
 @pytest.mark.parametrize('glitch', [2.0, 1e308, -1e308])

@@ -78,7 +78,7 @@ def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_j
         arm.goes_to([0.3, -0.8], within=0.2)
         pulls.append(np.linalg.norm(posture.solution.tension))
     assert pulls[1] > pulls[0] + 20.0  # the stiffer, the tenser
-    assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e4, 0.0])[0]
+    assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e3, 0.0])[0]
     arm.says('clamped')
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0])[0]
 
