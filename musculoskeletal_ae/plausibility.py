@@ -21,6 +21,8 @@ OUTSIDE = 0.1  # of a joint's range: a sensor beyond it errs
 ESTIMATE_OUTSIDE = 0.5  # the same of an estimate
 TOO_TENSE, TOO_SLACK = 1.1, -0.1  # of tension.max
 TEMPERATURES = -40.0, 200.0  # [°C]
+SLACK = 0.2  # of T_bias: a wire that pulls less is slack, or cut,
+WOUND = 1.0  # [m] and may be wound in further than any joint allows
 POSTURES = 500  # that tell how long the muscles get
 LENGTH_MARGIN = 0.1  # [m], for wires that wrap, wind slack, or were tied elsewhere
 #: a length changes by no more than SLIP + SPEED·dt from message to message [m], [m/s], dt at most
@@ -42,6 +44,13 @@ def longest_lengths(robot: Robot) -> Array:
     )
     longest: Array = length.max(axis=(0, 1)) + LENGTH_MARGIN
     return longest
+
+
+def outside_limits(robot: Robot, theta: Array) -> Array:
+    """Return how far each joint is beyond its limits, as a share of its range, (D,)."""
+    low, high = robot.lower, robot.upper
+    share: Array = np.maximum(theta - high, low - theta) / (high - low)
+    return share
 
 
 class Doubt:
@@ -78,7 +87,8 @@ class Plausibility:
         Raises:
             MessageError: If no muscle of this arm can say that.
         """
-        error = self.levels(tension, length, temperature) or self._step(length, now)
+        wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
+        error = self.levels(tension, length, temperature, wound) or self._step(length, now)
         self.muscles.note(error, now)
         if error:
             raise error
@@ -97,21 +107,28 @@ class Plausibility:
     def outside(self, theta: Array, share: float = OUTSIDE) -> MessageError | None:
         """Return what is wrong with a joint further beyond its limits than a share of its range."""
         low, high = self._robot.lower, self._robot.upper
-        beyond = np.maximum(theta - high, low - theta) - share * (high - low)
-        if not beyond.max() > 0.0:
+        beyond = outside_limits(self._robot, theta)
+        if not beyond.max() > share:
             return None
         j = int(beyond.argmax())
         told = f'{self._robot.joints[j]} {theta[j]:.3g} rad, limits {low[j]:.2f} to {high[j]:.2f}'
         return MessageError('θ far outside the joint limits', told)
 
     def levels(
-        self, tension: Array, length: Array, temperature: Array | None = None
+        self,
+        tension: Array,
+        length: Array,
+        temperature: Array | None = None,
+        wound: Array | float = 0.0,
     ) -> MessageError | None:
-        """Return what is wrong with a value that no sensor of this arm measures, or None."""
+        """Return what is wrong with a value that no sensor of this arm measures, or None.
+
+        wound: By how much a wire may be wound in beyond what the joints allow [m].
+        """
         most, muscles = self._robot.tension.max, self._robot.muscles
         for reason, unit, value, (low, high) in (
             (TENSION, 'N', tension, (TOO_SLACK * most, TOO_TENSE * most)),
-            (LENGTH, 'm', length, (-self._longest, self._longest)),
+            (LENGTH, 'm', length, (-self._longest - wound, self._longest)),
             (TEMPERATURE, '°C', temperature, TEMPERATURES),
         ):
             if value is not None and (beyond := (value < low) | (value > high)).any():

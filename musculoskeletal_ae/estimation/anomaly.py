@@ -23,6 +23,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, outside_limits
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Name of the distance threshold among the thresholds of the checkpoint.
@@ -92,7 +93,7 @@ class AnomalyDetector:
             share = centred / self._spread
         muscles = len(tension)
         score = share[:muscles] ** 2 + share[muscles:] ** 2
-        dead = self._dead(tension, length, dt)
+        dead = self._dead(state.theta, tension, length, dt)
         if dead is not None:
             return Verdict(size, distance, dead, 'no tension where the command demands it')
         # A muscle without tension is the one, whatever the others' residuals make of it.
@@ -112,11 +113,15 @@ class AnomalyDetector:
             return ''
         return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running'
 
-    def _dead(self, tension: Array, length: Array, dt: float) -> int | None:
+    def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
         bias, demand = self._robot.tension.bias, self._tension_command
         if self._length_command is not None:
             pulled = self._robot.stiffness * (length - self._length_command)
             demand = bias + np.maximum(0.0, pulled)
+        # Nobody commands an arm whose estimate makes no sense: then T_bias is what modules hold.
+        lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
+        if demand is None and lost and (tension >= DEAD_SHARE * bias).any():
+            demand = np.full(len(tension), bias)
         if demand is None:
             self._torn[:] = 0.0
             return None

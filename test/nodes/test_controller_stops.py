@@ -53,7 +53,9 @@ def test_the_seconds_before_a_stop_are_kept_as_a_bag(moving, tmp_path, monkeypat
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
     arm = moving()
     assert arm.graph.call(Trigger, 'controller/stop').success
-    files = arm.graph.wait(lambda: list(tmp_path.glob(f'stop_*/{FILE}')), 'the recording')
+    files = arm.graph.wait(
+        lambda: [f for f in tmp_path.glob(f'stop_*/{FILE}') if f.stat().st_size], 'the recording'
+    )
     assert files[0].read_text() == 'controller/stop was called\n'
     bag = Bag.open(files[0].parent)
     sent = [m for m in bag.messages() if m.topic.endswith('/muscle_length_command')]

@@ -18,6 +18,8 @@ from musculoskeletal_ae.control.controller import LONGEST_STEP
 from musculoskeletal_ae.estimation import gate
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import array_message, bytes_message, joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED
@@ -139,3 +141,16 @@ def test_under_use_sim_time_the_ramp_follows_the_clock(graph, arm26, trained_fil
     assert done_at - begun >= 0.9 * ramp.duration
     assert len(sent) > 0
     assert (node.core.pace.value < 1.0) is (pace < 1.0)
+
+
+# The estimate of the first is so far off that the controller does not even start.
+@pytest.mark.parametrize('muscle', ['deltoid_anterior', 'brachialis'])
+def test_a_muscle_cut_before_anybody_looked_is_found(graph, trained_file, muscle):
+    graph.host(HardwareEmulator, robot='arm26', seed=0, ruptured_muscles=[muscle])
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.next('muscle_states', 300)
+    detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
+    estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
+    graph.host(Controller, robot='arm26', checkpoint=trained_file, explore=True, max_age=1.0)
+    graph.wait(lambda: detected and detected[-1].data, 'the detection', 40.0)
+    assert estimator.core.cause.startswith(muscle)

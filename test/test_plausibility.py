@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What messages of an arm can say: a cut wire that winds in is no lie."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.plausibility import SLACK, WOUND, Plausibility, longest_lengths
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+WARM = np.full(ROBOT.muscle_count, 30.0)
+
+
+def test_a_cut_wire_may_be_wound_in_further_than_any_joint_allows_but_not_without_end():
+    plausibility, tension = Plausibility(ROBOT), np.full(ROBOT.muscle_count, ROBOT.tension.bias)
+    tension[0] = 0.0
+    end = -longest_lengths(ROBOT)[0]
+    for n, length in enumerate(np.arange(0.0, end - WOUND, -0.01)):
+        row = np.zeros(ROBOT.muscle_count)
+        row[0] = length
+        plausibility.check_muscles(tension, row, WARM, 0.01 * n)
+    row[0] = end - WOUND - 0.01
+    with pytest.raises(MessageError, match='length beyond what the joints allow'):
+        plausibility.check_muscles(tension, row, WARM, 0.01 * n + 0.01)
+
+
+def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
+    tension = np.full(ROBOT.muscle_count, 2.0 * SLACK * ROBOT.tension.bias)
+    row = np.zeros(ROBOT.muscle_count)
+    row[0] = 1.01 * -longest_lengths(ROBOT)[0]
+    with pytest.raises(MessageError, match='length beyond what the joints allow'):
+        Plausibility(ROBOT).check_muscles(tension, row, WARM, 0.0)
