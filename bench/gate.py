@@ -37,7 +37,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, exit_status
-from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLIP, TOO_TENSE
+from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLIP, TOO_TENSE, outside_limits
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -149,12 +149,11 @@ def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, flo
     for over in stream.tension > robot.tension.limit:
         above = (above + SAMPLE_TIME) * over
         longest = max(longest, above.max())
-    beyond = np.maximum(theta - robot.upper, robot.lower - theta) / (robot.upper - robot.lower)
     values = (
         np.abs(np.diff(stream.length, axis=0)).max(),
         stream.tension.max() / robot.tension.max,
         longest,
-        max(0.0, beyond.max()),
+        max(0.0, outside_limits(robot, theta).max()),
     )
     return dict(zip(MESSAGES, map(float, values), strict=True))
 

@@ -21,8 +21,8 @@ OUTSIDE = 0.1  # of a joint's range: a sensor beyond it errs
 ESTIMATE_OUTSIDE = 0.5  # the same of an estimate
 TOO_TENSE, TOO_SLACK = 1.1, -0.1  # of tension.max
 TEMPERATURES = -40.0, 200.0  # [°C]
-SLACK = 0.2  # of T_bias: a wire that pulls less is slack, or cut,
-WOUND = 1.0  # [m] and may be wound in further than any joint allows
+SLACK = 0.2  # of T_bias, or of a demanded tension: a wire that pulls less is slack, or cut
+WOUND = 1.0  # [m] that such a wire may be wound in further than any joint allows
 POSTURES = 500  # that tell how long the muscles get
 LENGTH_MARGIN = 0.1  # [m], for wires that wrap, wind slack, or were tied elsewhere
 #: a length changes by no more than SLIP + SPEED·dt from message to message [m], [m/s], dt at most

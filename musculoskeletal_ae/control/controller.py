@@ -84,7 +84,10 @@ class Controller:
         self.pace = Pace()
         self.intruder = ''  # who else sends muscle_states
         self._overheated = False
-        #: since when each muscle pulls above tension.limit, and more than halfway to tension.max
+        limits = robot.tension
+        #: tensions [N] that are too high for long, and for more than a moment
+        self._overloads = np.array([limits.limit, 0.5 * (limits.limit + limits.max)])
+        #: since when each muscle pulls above each of them
         self._tense_since: Array = np.full((2, robot.muscle_count), math.inf)
         self._anomaly = False
         # Whether the next command starts a method anew, from how the muscles pull then.
@@ -123,8 +126,7 @@ class Controller:
         self._muscles_at = awake = now - self._asleep
         self._temperatures.append(temperature)
         self._warm = np.median(np.array(self._temperatures), axis=0)
-        pull, limits = self.safety.muscles(muscles).tension, self._robot.tension
-        over = pull > np.array([[limits.limit], [0.5 * (limits.limit + limits.max)]])
+        over = self.safety.muscles(muscles).tension > self._overloads[:, None]
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
     def estimated(self, theta: Array, now: float) -> None:
@@ -211,10 +213,8 @@ class Controller:
         return ''
 
     def _overload(self, now: float) -> str:
-        limits, longest = self._robot.tension, (self.settings.overload_time, OVERLOAD_MOMENT)
-        for since, allowed, most in zip(
-            self._tense_since, longest, (limits.limit, 0.5 * (limits.limit + limits.max))
-        ):
+        longest = self.settings.overload_time, OVERLOAD_MOMENT
+        for since, allowed, most in zip(self._tense_since, longest, self._overloads):
             if now - self._asleep - since.min() > allowed:
                 name = self._robot.muscles[int(since.argmin())]
                 return f'{name}: tension above {most:g} N for {allowed:g} s'

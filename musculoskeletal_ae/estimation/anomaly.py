@@ -23,14 +23,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, outside_limits
+from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLACK, outside_limits
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Name of the distance threshold among the thresholds of the checkpoint.
 DISTANCE = 'distance'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
-DEAD_SHARE = 0.2  # of the demanded tension; less counts as no tension at all
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
 
 
@@ -97,7 +96,7 @@ class AnomalyDetector:
         if dead is not None:
             return Verdict(size, distance, dead, 'no tension where the command demands it')
         # A muscle without tension is the one, whatever the others' residuals make of it.
-        slack = tension < DEAD_SHARE * self._robot.tension.bias
+        slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
         return Verdict(size, distance, suspect, self._beyond_threshold(size, distance))
 
@@ -118,14 +117,14 @@ class AnomalyDetector:
         if self._length_command is not None:
             pulled = self._robot.stiffness * (length - self._length_command)
             demand = bias + np.maximum(0.0, pulled)
-        # Nobody commands an arm whose estimate makes no sense: then T_bias is what modules hold.
-        lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
-        if demand is None and lost and (tension >= DEAD_SHARE * bias).any():
-            demand = np.full(len(tension), bias)
         if demand is None:
-            self._torn[:] = 0.0
-            return None
-        torn = (tension < DEAD_SHARE * demand) & (demand >= bias)
+            # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
+            lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
+            if not lost or (tension < SLACK * bias).all():
+                self._torn[:] = 0.0
+                return None
+            demand = np.full(len(tension), bias)
+        torn = (tension < SLACK * demand) & (demand >= bias)
         self._torn = np.where(torn, self._torn + dt, 0.0)
         worst = int(np.argmax(self._torn))
         return worst if self._torn[worst] >= DEAD_TIME else None

@@ -240,10 +240,10 @@ class Learner:
             StateError: If the backup cannot be made; nothing is changed then.
             GateError: If the network does not explain the arm; nothing is changed then.
         """
-        if self._state is not None and (self.samples or self.checkpoint):
-            self._state.back_up(self.samples, self.checkpoint)
         if mae is not None:
             self._gate.check(mae)
+        if self._state is not None and (self.samples or self.checkpoint):
+            self._state.back_up(self.samples, self.checkpoint)
         successor = None if mae is None else self._numbered(mae)
         self.training.close()
         self.samples.clear()

@@ -229,17 +229,17 @@ class Shell(Node):
         If several nodes publish them, `warn` is told who, '' once it is one; without it their
         messages are rejected.
         """
-        intruders = ['']
+        intruders = ''
 
         def look_around() -> None:
-            if (who := self._several_publishers('muscle_states')) != intruders[0]:
-                intruders[0] = who
-                if warn:
-                    warn(who)
+            nonlocal intruders
+            intruders = self._several_publishers('muscle_states')
+            if warn:
+                warn(intruders)
 
         def from_one(states: Array) -> None:
-            if intruders[0] and not warn:
-                raise MessageError('several publishers', intruders[0])
+            if intruders and not warn:
+                raise MessageError('several publishers', intruders)
             follow(states)
 
         self.create_timer(LOOK_AROUND, look_around, clock=STEADY)

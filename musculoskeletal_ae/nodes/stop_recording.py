@@ -52,11 +52,11 @@ class StopRecording:
 
     def heard(self, topic: str, message: Any) -> None:
         """Remember a message of one of `bags.topics.TOPICS`."""
-        now = time.time_ns()
+        heard = Heard(time.time_ns(), topic, message)
         if TOPICS[topic].latched:
-            self._latched[topic] = Heard(now, topic, message)
-        self._recent.append(Heard(now, topic, message))
-        oldest = now - int(SECONDS * 1e9)
+            self._latched[topic] = heard
+        self._recent.append(heard)
+        oldest = heard.time - int(SECONDS * 1e9)
         while self._recent[0].time < oldest:
             self._recent.popleft()
 
