@@ -218,7 +218,7 @@ train_once() {
     {
       (cd "$robot_directory" && find . -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum)
       cd "$repository/musculoskeletal_ae" &&
-        find robot mae presets.py tools/train.py -name '*.py' -print0 | LC_ALL=C sort -z |
+        find robot mae presets.py tools/initial_training.py -name '*.py' -print0 | LC_ALL=C sort -z |
         xargs -0 sha256sum
     } | sha256sum | cut -c 1-16
   )

@@ -9,7 +9,6 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from rclpy.utilities import remove_ros_args
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.parameters import help_text
 from musculoskeletal_ae.options import exit_status
+from musculoskeletal_ae.start import load
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
 
@@ -58,7 +58,11 @@ def run(name: str) -> None:
         return
     node: Node | None = None
     try:
-        module = import_module(f'musculoskeletal_ae.nodes.{name}')
+        if extra := remove_ros_args(sys.argv)[1:]:
+            told = f'parameters are given as  {name} --ros-args -p NAME:=VALUE'
+            print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
+            sys.exit(2)
+        module = load(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
         executor = SingleThreadedExecutor()
@@ -80,15 +84,6 @@ def run(name: str) -> None:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-
-
-# The entry points of setup.py.
-bringup_status = partial(run, 'bringup_status')
-controller = partial(run, 'controller')
-estimator = partial(run, 'estimator')
-hardware_emulator = partial(run, 'hardware_emulator')
-learner = partial(run, 'learner')
-sim = partial(run, 'sim')
 
 
 # -- tools ----------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.parameters import Parameter
@@ -54,6 +55,7 @@ class Shell(Node):
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
+        self._take_old_names()
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
@@ -102,9 +104,23 @@ class Shell(Node):
         except (MusculoskeletalError, OSError) as error:
             raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
+    def _take_old_names(self) -> None:
+        """Read parameters by the names that they had a version ago, and say so."""
+        given: dict[str, RosParameter] = getattr(self, '_parameter_overrides', {})
+        for old, new in RENAMED.items():
+            if new not in self._table:
+                continue
+            if old in given and new not in given:
+                self.get_logger().warning(f'parameter {old} is called {new} now')
+                self.set_parameters([RosParameter(new, value=given[old].value)])
+            told = _descriptor(replace(self._table[new], meaning=f'old name of {new}'))
+            self.declare_parameter(old, self.get_parameter(new).value, told)
+
     def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         taken: list[str] = []
-        for name, value in ((p.name, p.value) for p in parameters if p.name in self._setters):
+        for name, value in ((RENAMED.get(p.name, p.name), p.value) for p in parameters):
+            if name not in self._setters:
+                continue
             try:
                 self._checked(name, value, self._setters[name])
             except MusculoskeletalError as error:

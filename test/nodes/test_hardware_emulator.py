@@ -114,7 +114,7 @@ def test_payload_offset_and_wrench_act(arm, arm26):
 
 
 def test_a_marker_pose_is_published_on_request(arm, arm26):
-    assert arm.set_parameter('hardware_emulator', 'marker_rate', 30.0)[0]
+    assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 30.0)[0]
     pose = arm.next('marker_pose', 3)
     assert pose.header.frame_id == arm26.root_link
     theta = np.array(arm.received['joint_states'][-1].position)
