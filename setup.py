@@ -45,8 +45,6 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     entry_points={
-        'console_scripts': [
-            f'{name} = {NAME}.start:main' for name in NODES + ROS_TOOLS + TOOLS
-        ],
+        'console_scripts': [f'{name} = {NAME}.start:main' for name in NODES + ROS_TOOLS + TOOLS],
     },
 )

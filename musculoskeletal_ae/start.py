@@ -27,12 +27,10 @@ def main() -> int | None:
     name = Path(sys.argv[0]).stem
     try:
         if name in load('musculoskeletal_ae.nodes.parameters').PARAMETERS:
-            status: int | None = load('musculoskeletal_ae.nodes.running').run(name)
-            return status
+            return load('musculoskeletal_ae.nodes.running').run(name)
         is_tool = Path(__file__).with_name('tools').joinpath(f'{name}.py').exists()
         folder = 'tools' if is_tool else 'nodes'
-        status = load(f'musculoskeletal_ae.{folder}.{name}').main()
-        return status
+        return load(f'musculoskeletal_ae.{folder}.{name}').main()
     except KeyboardInterrupt:
         return INTERRUPTED
     finally:  # of what Python does at its end nothing is worth a second Ctrl-C

@@ -66,7 +66,8 @@ class Shell(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
-        self._fault = ''
+        self._fault = self._waiting = ''
+        self.needed: list[str] = []  # topics without which the node has nothing to do
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -179,6 +180,7 @@ class Shell(Node):
         def from_file(path: str) -> None:
             if path:
                 take(checkpoint.load(path, self.robot))
+                self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
         def from_topic(message: UInt8MultiArray) -> None:
             try:
@@ -187,6 +189,7 @@ class Shell(Node):
                 unfit(str(error))
                 raise
 
+        self.needed.append('mae_checkpoint')
         self.follow_parameter('checkpoint', from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 
@@ -226,6 +229,18 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
+    def _tell_waiting(self, missing: list[str]) -> None:
+        """Say, whenever it changes, which topics have brought nothing yet, and why."""
+        told = [
+            f'{self.resolve_topic_name(topic)}, which nobody publishes'
+            if self.count_publishers(topic) == 0
+            else f'{self.resolve_topic_name(topic)} that can be used'
+            for topic in missing
+        ]
+        before, self._waiting = self._waiting, '; '.join(told)
+        if self._waiting != before:
+            self.get_logger().info(f'waiting for {self._waiting}' if told else 'all is there')
+
     def _report(self) -> None:
         try:
             report = self.report()
@@ -237,6 +252,7 @@ class Shell(Node):
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
         received = self._reception.take_received()
+        self._tell_waiting([topic for topic in self.needed if topic not in received])
         values = dict(report.values)
         values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
         values['rejected'] = str(sum(self.rejected.values()))
