@@ -277,7 +277,8 @@ fi
 [ -n "$checkpoint" ] || train_once
 if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
-  "${with_us[@]}" "$python" "$executables/check_driver" --robot "$robot" --wait --seconds 3 \
+  rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
+  "${with_us[@]}" "$python" "$executables/check_driver" --robot "$robot" --rate "$rate" --wait --seconds 3 \
     "${remap[@]}" </dev/null &
   pid_of[check_driver]=$!
   status=0

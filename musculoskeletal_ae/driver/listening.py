@@ -116,10 +116,10 @@ class Listening:
         elif gaps.max(initial=0.0) > LONGEST_GAP:
             how = 'read and publish in a loop of its own; nothing in it may wait'
             verdict.failed('rate', (), f'{seen}, but nothing for {gaps.max():.2f} s', how)
-        states = np.array(self._states)
-        # The rate of which messages come is not the rate at which modules are read.
-        same = states[1:, :2] == states[:-1, :2]  # a temperature may stand
-        if len(same) > 10:
+        if len(self._states) > 10:
+            # The rate at which messages come is not the rate at which modules are read.
+            states = np.array(self._states)[:, :2]  # a temperature may stand
+            same = states[1:] == states[:-1]
             repeated = same.all(axis=(1, 2)).mean()
             stuck: Bools = same.all(axis=(0, 1))
             if repeated > MOST_REPEATED:
@@ -154,7 +154,11 @@ class Listening:
                 verdict.notes.append('no temperatures (NaN): nothing protects the motors from heat')
             return True
         rows = list(QUANTITIES)
-        by_muscle = states.T.reshape(3, -1)  # as if muscle by muscle, read as row by row
+        kelvin = self._plausible(states - [[0.0], [0.0], [273.15]])
+        if kelvin.all():
+            verdict.failed('unit', (), 'temperatures look like K', 'publish °C')
+            return False
+        by_muscle = states.reshape(-1, 3).T  # as if muscle by muscle, read as row by row
         if self._plausible(by_muscle).all():
             told = 'the values of each muscle stand together'
             verdict.failed('order', (), told, f'publish 3 rows: {", ".join(rows)}')
@@ -174,7 +178,7 @@ class Listening:
         for row, value, (low, high), unit, change in (
             (0, length, (self._low, self._high), 'm', 'is it m, and zero at θ = 0?'),
             (1, tension, (0.0, self._robot.tension.max), 'N', 'is it N, and does pull count as +?'),
-            (2, temperature, TEMPERATURES, '°C', 'is it °C (not K)? NaN where there is none'),
+            (2, temperature, TEMPERATURES, '°C', 'is it °C? NaN where there is none'),
         ):
             for m in np.flatnonzero(~plausible[row]).tolist():
                 least, most = (np.broadcast_to(end, value.shape)[m] for end in (low, high))

@@ -27,7 +27,7 @@ SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s]
 SPEED = 0.01  # [m/s] at which a target goes on inwards while the arm gives way
 RELEASE_SPEED = 0.03  # [m/s] at which it goes back
 FURTHEST = 0.025  # [m] that a muscle is wound in
-SLACK = 0.004  # [m] that l_target then lies beyond l
+SLACK = 0.01  # [m] that l_target then lies beyond l
 RUN_AWAY_TENSION, RUN_AWAY = 60.0, 0.05  # [N] above what is asked for, [m]: it is let go
 MOMENT = 0.1  # [s] for which a falling arm may pull harder
 LATEST = 0.1  # [s] from a command to the first change
@@ -122,7 +122,7 @@ class Winding:
             yield
             states = self._recent[-1][1]
             asked = np.minimum(self._demand(states[0]), self._robot.tension.limit)
-            for m in self._muscles:
+            for m in range(self._robot.muscle_count):
                 if not states[1, m] > asked[m] + RUN_AWAY_TENSION:
                     self._tame_at[m] = self._now
                 elif self._now - self._tame_at[m] > MOMENT:

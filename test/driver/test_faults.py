@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driver.scripted import Driver
 
+from driver.scripted import Driver
 from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -76,11 +76,11 @@ def test_a_sound_driver_is_found_sound(seed):
         (scaled(1000, 1, 1), True, 'unit', 'lengths look like mm'),
         (scaled(1, 1000, 1), False, 'unit', 'does pull count as +'),
         (scaled(1, -1, 1), False, 'unit', 'does pull count as +'),
-        (lambda rows: rows + [[0], [0], [273.15]], False, 'unit', 'not K'),
+        (lambda rows: rows + [[0], [0], [273.15]], False, 'unit', 'look like K'),
         (flipped, True, 'sign', 'must fall when the motor winds in'),
         (lambda rows: flipped(rows, [BICEPS]), True, 'sign', 'biceps_long'),
         (exchanged, True, 'order', 'behaves like deltoid_posterior'),
-        (shifted, False, 'zero', '+8'),
+        (shifted, False, 'zero', 'subtract this'),
         (shifted, True, 'zero', 'biceps_long'),
         (with_nan, False, 'rate', 'not finite'),
         (lambda rows: rows[:2], False, 'order', '3×M values'),
@@ -157,7 +157,7 @@ WOUND = {
     'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
     'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
-    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'let go'),
+    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'read as m'),
     'dead motor': ({'take': only_first}, 'law', 'does not respond'),
     'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
     'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'is T in N'),
