@@ -52,7 +52,7 @@ def test_there_are_executables():
 @pytest.mark.parametrize('name', EXECUTABLES)
 def test_help_loads_nothing_that_takes_long(name):
     # All of them together take 0.1 to 0.4 s of CPU.
-    heavy = "{'numba', 'pinocchio', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
+    heavy = "{'numba', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
     done = python(
         f'import atexit\natexit.register(lambda: print("heavy", *{heavy}))\n'
         f'sys.argv = [{name!r}, "--help"]\nsys.exit(start.main())'
@@ -77,7 +77,9 @@ def test_ctrl_c_shows_no_traceback(name, after, tmp_path):
     assert done.returncode in (0, 1, 130), told
 
 
-@pytest.mark.parametrize('arguments', [['-p', 'robot:=arm26'], ['--fast'], ['arm26']])
+@pytest.mark.parametrize(
+    'arguments', [['-p', 'robot:=arm26'], ['--fast'], ['arm26'], ['robot:=arm26']]
+)
 def test_an_option_that_no_node_has_is_an_error(arguments):
     done = subprocess.run(
         [*executable('estimator'), *arguments], capture_output=True, text=True, timeout=60

@@ -63,7 +63,9 @@ def run(name: str) -> None:
         faulthandler.enable()
     node: Node | None = None
     try:
-        if extra := remove_ros_args(sys.argv)[1:]:
+        given = sys.argv[1:]
+        mine = given[: given.index('--ros-args')] if '--ros-args' in given else given
+        if extra := mine or remove_ros_args(sys.argv)[1:]:
             told = f'parameters are given as  {name} --ros-args -p NAME:=VALUE'
             print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
             sys.exit(2)
