@@ -33,9 +33,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 JITTER = 0.03  # [s] by which a loaded machine publishes a command later than it was made
 RELIEF = 0.3  # [s] for which a tension that is being relieved was measured before
-SILENT = 5.0  # [s] that a node under attack may keep /diagnostics waiting
-GROWTH = 1.2  # of a node's memory, over what it was after a minute
-YOUNG = 60.0  # [s]
+SILENT = 10.0  # [s] that a node under attack may keep /diagnostics waiting
+GROWTH = 1.2  # of a node's memory, over what it was after five minutes
+YOUNG = 300.0  # [s]
+MOST_MEMORY = 500.0  # [MB] of any node at any time
 
 
 class Size(NamedTuple):
@@ -110,7 +111,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
     """Attack the running system."""
     from bench.attack_graph import LENGTH, Attack
 
-    messages = size.messages // size.episodes
+    messages = -(-size.messages // size.episodes)
     with Attack(folder, initial, seed) as attack:
         attack.spin(2.0)
         for episode in range(size.episodes):
@@ -134,14 +135,15 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
         f'{1e3 * max(step.largest_in for step in steps):.2f} mm in, '
         f'{1e3 * max(step.largest_out for step in steps):.2f} mm out'
     )
+    print(f'longest silence of a node: {max(attack.silences.values(), default=0.0):.1f} s')
     silent = [f'{name}: {s:.1f} s' for name, s in attack.silences.items() if s > SILENT]
     fat = []
     for name, process in attack.processes.items():
-        old = [memory for age, memory in process.memory if age > YOUNG]
-        if old:
-            print(f'{name}: {old[0]:.0f} MB after a minute, at most {max(old):.0f} MB')
-            if max(old) > GROWTH * old[0]:
-                fat.append(f'{name} from {old[0]:.0f} to {max(old):.0f} MB')
+        most = max((memory for _, memory in process.memory), default=0.0)
+        old = [memory for age, memory in process.memory if age > YOUNG] or [most]
+        print(f'{name}: at most {most:.0f} MB, {old[0]:.0f} MB at five minutes or never so old')
+        if most > MOST_MEMORY or max(old) > GROWTH * old[0]:
+            fat.append(f'{name} from {old[0]:.0f} to {most:.0f} MB')
     sent = tried['messages'] + tried['requests']
     commands = sum(step.count for step in steps)
     return [

@@ -8,10 +8,12 @@ muscle_length_command, or muscle_tension_command with method `tension`.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -24,9 +26,12 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import array_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_joints
+
+LOOK_AROUND = 0.1  # [s] between looks at who publishes
 
 
 class Controller(Shell):
@@ -36,6 +41,8 @@ class Controller(Shell):
         """Declare topics and services; options are those of Node."""
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
+        self.recording = StopRecording(self.resolve_topic_name)
+        self.latched = False  # the stop, as of the last step
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name))
         self.logged: list[str] = []
@@ -50,20 +57,43 @@ class Controller(Shell):
         self.follow_muscle_states(self._muscles)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
-        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
+        self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
+
+    def listen(
+        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
+    ) -> None:
+        """Subscribe as every shell does, and remember what came for the next stop's recording."""
+
+        def remembered(message: Any) -> None:
+            self.recording.heard(topic, message)
+            callback(message)
+
+        super().listen(kind, topic, remembered, qos)
+
+    def destroy_node(self) -> None:
+        """Let a recording be finished."""
+        self.recording.close()
+        super().destroy_node()
 
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, states: Array) -> None:
-        self.core.muscles(Muscles(*states), time.monotonic())
+        muscles, now = Muscles(*states), time.monotonic()
+        self.core.muscles(muscles, now)
+        self.gate.message(muscles.tension, muscles.length, now)
+
+    def _anomaly(self, message: Bool) -> None:
+        self.core.anomaly(message.data)
+        self.take_anomaly(message.data)
 
     def _estimated(self, theta: Array) -> None:
         self.core.estimated(theta, time.monotonic())
@@ -94,18 +124,40 @@ class Controller(Shell):
             raise MusculoskeletalError(f'refused: {reason}')
         return 'going on to the last target, if any; controller/explore explores again'
 
+    def _look_around(self) -> None:
+        """Let nobody else say how the muscles are."""
+        topic, names = self.resolve_topic_name('muscle_states'), list[str]()
+        if self.count_publishers(topic) > 1:
+            for publisher in self.get_publishers_info_by_topic(topic):
+                names.append(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
+        # One name twice: a node that was killed stays known for a while beside its successor.
+        several = sorted(set(names)) if len(set(names)) > 1 else []
+        self.core.intruder = f'muscle_states come from {" and ".join(several)}' if several else ''
+
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:
-        command = self.core.step(time.monotonic())
+        command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
-            self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
+            message = array_message(command.value, 'muscle')
+            self.publishers_of[command.kind].publish(message)
+            self.recording.heard(f'muscle_{command.kind}_command', message)
+        safety, before = self.core.safety, self.latched
+        self.latched = bool(safety.cause) and not safety.passing
+        if self.latched and not before:
+            self.recording.save(safety.cause, self.parameter('stop_recordings'))
+
+    def clock_jumped_back(self) -> None:
+        """Count time from here; latches stay."""
+        self.core.clock_jumped_back()
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
         report = self.core.report(time.monotonic())
+        if kept := self.recording.problem or self.recording.saved:
+            report.values['last stop'] = str(kept)
         stopped = [report.message] if self.core.safety.cause else []
         stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
         for line in stopped + stiffness:

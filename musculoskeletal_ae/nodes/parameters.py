@@ -38,6 +38,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'checkpoint': CHECKPOINT,
         'seed': SEED,
         'explore': Parameter(False, 'explore from the start'),
+        'stop_recordings': Parameter(
+            10, 'last seconds before a stop that are kept as bags', '', (0, 1000), settable=True
+        ),
         **parameters_of(ControlSettings),
     },
     'estimator': {
