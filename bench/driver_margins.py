@@ -12,6 +12,7 @@ does, which must find no fault.
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def margins(robot: Robot) -> tuple[float, float, float, float]:
         body, rng = Individual(robot, seed), np.random.default_rng(seed)
         for _ in range(WAYS):
             via = robot.random_postures(POSTURES, rng)
-            theta = np.concatenate([a + (b - a) * share for a, b in zip(via, via[1:])])
+            theta = np.concatenate([a + (b - a) * share for a, b in pairwise(via)])
             length = body.muscle_lengths(theta, tension)
             model = robot.muscle_lengths(theta, tension)
             offsets.append(float(np.abs(np.median(length - model, axis=0)).max()))
@@ -56,15 +57,14 @@ def main(argv: list[str] | None = None) -> int:
         robot = Robot.load(name)
         offset, least, greatest, doubtful = margins(robot)
         print(
-            f'{name}: offset of l {1e3 * offset:.0f} mm (allowed {1e3 * ZERO_TOLERANCE:.0f}), slope '
-            f'{least:.2f} to {greatest:.2f}, off by {1e3 * doubtful:.1f} mm where another fits'
+            f'{name}: offset of l {1e3 * offset:.0f} mm (allowed {1e3 * ZERO_TOLERANCE:.0f}), '
+            f'slope {least:.2f} to {greatest:.2f}, {1e3 * doubtful:.1f} mm off where another fits'
         )
         for seed in SEEDS:
             driver = Driver(robot, seed)
             for verdict in (driver.listen(), driver.listen(8.0, moved=True), driver.wind()):
                 wrong += len(verdict.faults)
-                print(
-                    *(f'  individual {seed}: {fault}' for fault in verdict.faults), sep='\n', end=''
-                )
+                for fault in verdict.faults:
+                    print(f'  individual {seed}: {fault}')
     print(f'{wrong} faults found in {2 * len(SEEDS)} sound arms')
     return 1 if wrong else 0

@@ -30,11 +30,12 @@ def test_three_lines_of_python_without_ros_do_what_the_readme_says(trained_file,
     robot = Robot.load('arm26')
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, 80.0)
+    length = robot.muscle_lengths(theta, tension)
     program = f"""
 import sys
 sys.modules['rclpy'] = None
 import numpy as np
-tension, length = np.array({tension.tolist()}), np.array({robot.muscle_lengths(theta, tension).tolist()})
+tension, length = np.array({tension.tolist()}), np.array({length.tolist()})
 {lines}
 print(*theta)
 """

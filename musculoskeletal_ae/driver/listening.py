@@ -154,7 +154,7 @@ class Listening:
                 verdict.notes.append('no temperatures (NaN): nothing protects the motors from heat')
             return True
         rows = list(QUANTITIES)
-        kelvin = self._plausible(states - [[0.0], [0.0], [273.15]])
+        kelvin = self._plausible(states - np.array([[0.0], [0.0], [273.15]]))
         if kelvin.all():
             verdict.failed('unit', (), 'temperatures look like K', 'publish °C')
             return False
@@ -172,7 +172,10 @@ class Listening:
                 return False
         length, tension, temperature = states
         for factor, unit in UNITS.items():
-            if not plausible[0].all() and self._plausible(states / [[factor], [1], [1]])[0].all():
+            if (
+                not plausible[0].all()
+                and self._plausible(states / np.array([[factor], [1.0], [1.0]]))[0].all()
+            ):
                 verdict.failed('unit', (), f'lengths look like {unit}', 'publish m')
                 plausible[0] = True
         for row, value, (low, high), unit, change in (

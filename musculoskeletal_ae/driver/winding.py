@@ -139,8 +139,9 @@ class Winding:
         return demand
 
     def _mean(self) -> _Reading:
-        states = np.mean([states for _, states in self._recent], axis=0)
-        return _Reading(*states, np.minimum(self._demand(states[0]), self._robot.tension.max))
+        length, tension, third = np.mean([states for _, states in self._recent], axis=0)
+        demand = np.minimum(self._demand(length), self._robot.tension.max)
+        return _Reading(length, tension, third, demand)
 
     def _try(self, m: int) -> Generator[None, None, None]:
         robot, verdict = self._robot, self.verdict

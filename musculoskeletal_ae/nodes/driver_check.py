@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -43,7 +44,7 @@ class CheckDriver:
         self.robot, self.options = robot, options
         self.muscle_message: Callable[[Float64MultiArray], object] = lambda _: None
         self.joint_message: Callable[[JointState], object] = lambda _: None
-        subscribe = self.node.create_subscription
+        subscribe: Any = self.node.create_subscription
         subscribe(Float64MultiArray, STATES, lambda m: self.muscle_message(m), SENSOR)
         subscribe(JointState, JOINTS, lambda m: self.joint_message(m), SENSOR)
         self._spin_until(lambda: False, DISCOVERY)
@@ -130,7 +131,7 @@ def check(options: Namespace, arguments: list[str]) -> int:
             f'--posture: {robot.joint_count} values, one a joint, are wanted'
         )
     start_ros(arguments)
-    driver, told = CheckDriver(robot, options), set[tuple[object, ...]]()
+    driver, told = CheckDriver(robot, options), set[tuple[str, tuple[int, ...]]]()
     while True:
         verdict = driver.listen()
         faults = {fault[:2] for fault in verdict.faults}
