@@ -43,8 +43,16 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
         ('drop 0.5', [], 'fault: rate of all muscles'),
         ('freeze biceps_long', [], 'the same reading in every message'),
         ('bias biceps_long 0.1', [], 'fault: zero of biceps_long'),
-        ('delay 0.2', ['--move', '--muscles', 'biceps_long'], 'fault: latency of biceps_long'),
-        ('stuck_motor biceps_long', ['--move', '--muscles', 'biceps_long'], 'does not respond'),
+        (
+            'delay 0.2',
+            ['--wait', '--move', '--muscles', 'biceps_long'],
+            'fault: latency of biceps_long',
+        ),
+        (
+            'stuck_motor biceps_long',
+            ['--wait', '--move', '--muscles', 'biceps_long'],
+            'does not respond',
+        ),
     ],
 )
 def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
