@@ -7,8 +7,11 @@ import signal
 import subprocess
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE, executable
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
+
+from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 
 
 def check(graph, *options):
@@ -110,3 +113,21 @@ def test_nodes_say_what_they_wait_for(graph):
     assert len(waiting) == 1
     assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting[0]
     assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting[0]
+
+
+def test_the_status_line_names_every_step_to_go_on(graph):
+    status = graph.host(BringupStatus, robot='arm26')
+
+    def controller_says(message):
+        name = f'{graph.namespace}/controller: state'
+        status._diagnosed(DiagnosticArray(status=[DiagnosticStatus(name=name, message=message)]))
+        return status._trouble()
+
+    assert controller_says('exploring') == ''
+    status.detected, status.suspect = True, 'brachialis'
+    steps = 'mend it, estimator/reset, controller/reset, controller/explore'
+    told = controller_says('stopped: anomaly_detected')
+    assert told == f'  ANOMALY: brachialis, STOPPED: anomaly_detected (to go on: {steps})'
+    status.detected = False
+    assert controller_says('holding') == ''
+    assert controller_says('stopped: a cause') == '  STOPPED: a cause (to go on: controller/reset)'
