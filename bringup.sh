@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Runs the whole system on the emulated arm. This is the launch file: what is started, with which
+# Runs the whole system on the emulated arm, or on your own. This is the launch file: what is started, with which
 # parameters, stands at the end, under "The system".
 set -u
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
@@ -12,10 +12,14 @@ Usage: ./bringup.sh [options]
 
 Sets up what is missing, then runs the whole system on an emulated arm and prints one status line a
 second: estimation error, anomaly A, samples learned, number of checkpoints. Ctrl-C stops it all.
+doc/your_robot.md leads from a robot of your own to one that learns.
 
   --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
                              (default: musashi_left_arm)
   --checkpoint FILE          MAE to start from (default: train one, once, and keep it in the cache)
+  --hardware                 your own driver instead of the emulator: waits for its muscle_states,
+                             says what is wrong with them, and starts once nothing is
+  --no-controller            nothing may move the arm
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
   --explore | --no-explore   random exploration, so that learning has data (default: on)
   --no-learner               no online learning
@@ -45,6 +49,8 @@ preset=default
 seed=0
 namespace=
 learner=true
+controller=true
+hardware=false
 bag=
 recording=
 duration= # until Ctrl-C
@@ -65,14 +71,16 @@ while [ $# -gt 0 ]; do
     --explore) explore=true ;;
     --no-explore) explore=false ;;
     --no-learner) learner=false ;;
+    --hardware) hardware=true ;;
+    --no-controller) controller=false ;;
     --preset) preset=$2 && shift ;;
     --seed) seed=$2 && shift ;;
     --namespace) namespace=$2 && shift ;;
     --duration) duration=$2 && shift ;;
     -h | --help) usage && exit ;;
     *)
-      refuse "unknown option '$1'; legal are --robot, --checkpoint, --bag, --explore,\
- --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --help"
+      refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
+ --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --help"
       ;;
   esac
   shift
@@ -97,6 +105,7 @@ fi
 if [ -n "$bag" ]; then
   [ -e "$bag" ] || refuse "--bag '$bag' is neither a bag directory nor an .mcap file"
   bag=$(cd "$(dirname "$bag")" && pwd -P)/$(basename "$bag")
+  [ $hardware = false ] || refuse '--bag and --hardware exclude each other: which of them is it?'
 fi
 if [ -n "$recording" ]; then
   [ ! -e "$recording" ] || refuse "--record '$recording' is there already; name a new directory"
@@ -122,8 +131,18 @@ namespace=${namespace#/}
 . "$repository/.ci/environment.sh"
 environment_setup
 
-# Emulated arms are nobody else's business on the network, unless the user says so.
-export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+# Emulated arms are nobody else's business on the network, unless the user says so. A driver may well
+# run on another machine.
+[ $hardware = true ] ||
+  export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+
+# One arm to a namespace. The lock is held until the last of what is started here has ended.
+in_use=/tmp/musculoskeletal_ae-${ROS_DOMAIN_ID:-0}-${namespace//\//.}.lock
+[ -e "$in_use" ] || (umask 022 && : >>"$in_use") || exit 1
+exec {arm_lock}<"$in_use"
+flock -n "$arm_lock" ||
+  refuse "namespace '/$namespace' is in use by another bringup.sh (ROS_DOMAIN_ID ${ROS_DOMAIN_ID:-0}):\
+ stop that one, or give this one a --namespace of its own"
 
 logs=$(mktemp -d "$repository/log/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
 export ROS_LOG_DIR=$logs
@@ -211,9 +230,9 @@ train_once() {
   mkdir -p "$cache" 2>/dev/null && [ -w "$cache" ] || cache=$repository/.cache
   hash=$(
     {
-      (cd "$robot_directory" && find . -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum)
+      (cd "$robot_directory" && sha256sum robot.urdf muscles.yaml) # what a network is made from
       cd "$repository/musculoskeletal_ae" &&
-        find robot mae presets.py tools/train.py -name '*.py' -print0 | LC_ALL=C sort -z |
+        find robot mae presets.py tools/initial_training.py -name '*.py' -print0 | LC_ALL=C sort -z |
         xargs -0 sha256sum
     } | sha256sum | cut -c 1-16
   )
@@ -251,24 +270,38 @@ remap=()
 # A recording brings its own time and its own commands: no emulator and no controller.
 if [ -n "$bag" ]; then
   common+=(-p use_sim_time:=true)
-else
+elif [ $hardware = false ]; then
   start hardware_emulator hardware_emulator "${common[@]}"
 fi
 
 [ -n "$checkpoint" ] || train_once
+if [ $hardware = true ]; then
+  # Nothing that could move the arm is there before its driver says what it must.
+  rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
+  "${with_us[@]}" "$python" "$executables/check_driver" --robot "$robot" --rate "$rate" --wait --seconds 3 \
+    "${remap[@]}" </dev/null &
+  pid_of[check_driver]=$!
+  status=0
+  watch_until_ended check_driver || status=$?
+  [ $status -eq 0 ] || finish 1
+fi
 common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
 start estimator estimator "${common[@]}"
 start sim sim "${common[@]}"
-# What is learned here stays with the logs: the next run may be another arm.
-[ $learner = false ] ||
-  start learner learner "${common[@]}" -p "state_directory:=$(quoted "$logs/learner")"
+# What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware is
+# the same arm tomorrow, and the learner goes on from where it was.
+kept=(-p "state_directory:=$(quoted "$logs/learner")")
+[ $hardware = false ] || kept=()
+[ $learner = false ] || start learner learner "${common[@]}" "${kept[@]}"
 [ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"
 if [ -n "$bag" ]; then
   start replay replay "$bag" --clock "${remap[@]}"
-else
+elif [ $controller = true ]; then
+  common+=(-p "explore:=$explore")
   # A pause of a busy desktop is no fault of an emulated arm.
-  start controller controller "${common[@]}" -p "explore:=$explore" -p max_age:=1.0
+  [ $hardware = true ] || common+=(-p max_age:=1.0)
+  start controller controller "${common[@]}"
 fi
 
 # The status line. It counts --duration from when estimates arrive, however late that is on a slow

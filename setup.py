@@ -10,7 +10,7 @@ from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
-ROS_TOOLS = ['record', 'render', 'replay']
+ROS_TOOLS = ['check_driver', 'record', 'render', 'replay']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 
@@ -45,10 +45,6 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     entry_points={
-        'console_scripts': [
-            *(f'{name} = {NAME}.nodes.running:{name}' for name in NODES),
-            *(f'{name} = {NAME}.nodes.{name}:main' for name in ROS_TOOLS),
-            *(f'{name} = {NAME}.tools.{name}:main' for name in TOOLS),
-        ],
+        'console_scripts': [f'{name} = {NAME}.start:main' for name in NODES + ROS_TOOLS + TOOLS],
     },
 )

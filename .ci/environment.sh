@@ -315,9 +315,15 @@ environment_setup() { # [test]
     export MPLCONFIGDIR=$repository/.cache/matplotlib
     export ROS_LOG_DIR=${ROS_LOG_DIR:-$repository/log/ros}
   fi
-  mkdir -p "$repository/log" "$repository/build" "$repository/.cache" ||
-    fail "Cannot write to $repository."
   setup_log=$repository/log/setup.log
+  local place
+  mkdir -p "$repository/log" "$repository/build" "$repository/.cache" 2>/dev/null
+  for place in "$repository"/{log,build,.cache,.venv,install,log/setup.log,.cache/setup.lock}; do
+    if [ -e "$place" ] && [ ! -w "$place" ] || [ ! -d "$repository/log" ]; then
+      fail "$place cannot be written: $repository belongs to $(stat -c %U "$repository"), and you are\
+ $(id -un). Clone it into a folder of your own, or let its owner run this."
+    fi
+  done
 
   find_ros_and_python
 

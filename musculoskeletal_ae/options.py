@@ -89,6 +89,17 @@ def seeds(text: str) -> tuple[int, ...]:
     return values
 
 
+def numbers(text: str) -> list[float]:
+    """Return the finite numbers of a list separated by commas."""
+    try:
+        values = [float(part) for part in text.split(',')]
+    except ValueError:
+        values = [math.nan]
+    if not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f'{text!r}: expected numbers, as in 0,-0.5,1')
+    return values
+
+
 def names(text: str) -> list[str]:
     """Return the different names in a list separated by commas."""
     listed = [name.strip() for name in text.split(',') if name.strip()]

@@ -53,7 +53,10 @@ class SourceOrder:
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:
-    """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,)."""
+    """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
+
+    Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
+    """
     if len(message.data) > MOST_ENTRIES:
         raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
     if len(message.data) == 0:
@@ -77,8 +80,11 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.asarray(message.data, dtype=float)
-    if not np.isfinite(values).all():
-        raise MessageError('not finite', f'value {np.flatnonzero(~np.isfinite(values))[0]}')
+    finite = np.isfinite(values)
+    if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
+        finite[2 * columns :] |= np.isnan(values[2 * columns :])
+    if not finite.all():
+        raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')
     return values.reshape(rows, columns) if rows > 1 else values
 
 

@@ -55,7 +55,8 @@ def test_an_array_without_layout_is_accepted_by_its_length():
         (muscle_array([1.0]), 'wrong length'),
         (muscle_array([1.0] * 7), 'wrong length'),
         (muscle_array([0.0] * 1_000_000), 'oversized'),
-        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('nan')]), 'not finite'),
+        (muscle_array([1.0, 2.0, 3.0, float('nan'), 5.0, 6.0]), 'not finite'),
+        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('inf')]), 'not finite'),
         (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('-inf')]), 'not finite'),
         (muscle_array([0.0] * 6, [2, 3]), 'wrong layout'),
         (muscle_array([0.0] * 6, [6]), 'wrong layout'),
@@ -67,6 +68,13 @@ def test_a_wrong_array_is_rejected_by_reason(message, reason):
     with pytest.raises(MessageError) as error:
         read_array(message, 3, 2)
     assert error.value.reason == reason
+
+
+def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
+    values = [1.0, 2.0, 3.0, 4.0, float('nan'), 25.0]
+    np.testing.assert_array_equal(read_array(muscle_array(values), 3, 2).ravel(), values)
+    with pytest.raises(MessageError, match='not finite'):
+        read_array(muscle_array([float('nan'), 2.0]), 1, 2)
 
 
 def test_joints_are_matched_by_name_and_foreign_ones_ignored():

@@ -14,27 +14,15 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from importlib import import_module
 from typing import Any
 
-from musculoskeletal_ae.experiments import (
-    body_change,
-    control,
-    estimation,
-    loss_change,
-    online_learning,
-    simulation,
-)
+from musculoskeletal_ae.experiments import NAMES, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study
 from musculoskeletal_ae.presets import PRESETS
 
-#: in the order of the report; the first one makes what the others need
 EXPERIMENTS = {
-    'online_learning': online_learning.EXPERIMENT,
-    'estimation': estimation.EXPERIMENT,
-    'control': control.EXPERIMENT,
-    'simulation': simulation.EXPERIMENT,
-    'loss_change': loss_change.EXPERIMENT,
-    'body_change': body_change.EXPERIMENT,
+    name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
 }
 LEARNING = 'online_learning'
 POLL = 0.5  # [s] between two reports

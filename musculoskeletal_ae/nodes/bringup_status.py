@@ -36,7 +36,7 @@ class BringupStatus(Shell):
         self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.detected = False
+        self.detected = self.explored = False
         self.checkpoints = 0
         self.samples = self.suspect = self.stopped = ''
         self.started: float | None = None
@@ -65,6 +65,19 @@ class BringupStatus(Shell):
                 self.suspect = values.get('suspect muscle', '')
             elif status.name.startswith(f'{here}/controller:'):
                 self.stopped = status.message if status.message.startswith('stopped') else ''
+                if not self.stopped:
+                    self.explored = 'exploring' in (status.message, values.get('doing'))
+
+    def _trouble(self) -> str:
+        """Return what keeps the arm from going on, and every step that is to be taken."""
+        told, steps = [], []
+        if self.detected:
+            told.append(f'ANOMALY: {self.suspect}')
+            steps += ['mend it', 'estimator/reset']
+        if self.stopped:
+            told.append(self.stopped.replace('stopped', 'STOPPED', 1))
+            steps += ['controller/reset', *['controller/explore'] * self.explored]
+        return f'  {", ".join(told)} (to go on: {", ".join(steps)})' if told else ''
 
     def _print(self) -> None:
         now = time.monotonic()
@@ -79,10 +92,6 @@ class BringupStatus(Shell):
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
         line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
-        if self.detected:
-            line += f'  ANOMALY: {self.suspect}'
-        elif self.stopped:
-            line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset resumes)'
-        print(printable(line), flush=True)
+        print(printable(line + self._trouble()), flush=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

@@ -51,6 +51,7 @@ class Controller(Shell):
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
+        self.needed += ['muscle_states', 'estimated_joint_states']
         self.follow_muscle_states(self._muscles, partial(setattr, self.core, 'intruder'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)

@@ -43,6 +43,7 @@ class Estimator(Shell):
         self.detected = self.create_publisher(Bool, 'anomaly_detected', LATCHED)
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
+        self.needed.append('muscle_states')
         self.follow_checkpoints(self.core.use)
         self.follow_muscle_states(self._estimate)
         for kind in ('length', 'tension'):

@@ -31,14 +31,14 @@ class HardwareEmulator(Arm):
         self.arm = EmulatedArm(self.robot, self.parameter('seed'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
-        self.marker_rate = self.pose_due = self.remainder = 0.0
+        self.marker_pose_rate = self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
         self.follow_parameter('command_timeout', partial(setattr, self.arm, 'command_timeout'))
         self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)
         self.follow_parameter('faults', self.arm.faults.set)
-        self.follow_parameter('marker_rate', partial(setattr, self, 'marker_rate'))
+        self.follow_parameter('marker_pose_rate', partial(setattr, self, 'marker_pose_rate'))
         self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
         self.follow_muscles('muscle_length_command', self.arm.command_length)
@@ -65,8 +65,8 @@ class HardwareEmulator(Arm):
         self.reading = self.arm.sense()
         for reading in self.arm.faults.delivered(self.reading, now):
             self.publish_state(*reading)
-        if self.marker_rate > 0.0 and now >= self.pose_due:
-            self.pose_due = max(self.pose_due + 1.0 / self.marker_rate, now)
+        if self.marker_pose_rate > 0.0 and now >= self.pose_due:
+            self.pose_due = max(self.pose_due + 1.0 / self.marker_pose_rate, now)
             self._publish_pose()
 
     def _publish_pose(self) -> None:

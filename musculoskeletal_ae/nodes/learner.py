@@ -52,7 +52,8 @@ class Learner(Shell):
         self.follow_parameter('checkpoint', self._take_checkpoint)
         self.follow_parameter('relearn_muscles', self._relearn)
         self.running = True
-        self.follow_posture(JOINT_TOPICS[value('joint_source')], self._joints)
+        self.needed = [JOINT_TOPICS[value('joint_source')], 'muscle_states']
+        self.follow_posture(self.needed[0], self._joints)
         self.follow_muscle_states(self._muscles)
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         serve(self, SetBool, 'learner/enable', self._enable)

@@ -72,7 +72,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             settable=True,
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
-        'marker_rate': Parameter(
+        'marker_pose_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
         'command_timeout': Parameter(
@@ -118,6 +118,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
     },
 }
+
+#: old names of parameters, read for one version: by 0.3 they are gone
+RENAMED = {'marker_rate': 'marker_pose_rate'}
 
 HELP_TAIL = """\
 Give them as  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be

@@ -10,7 +10,6 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.parameters import help_text
 from musculoskeletal_ae.nodes.shield import ShieldedExecutor
 from musculoskeletal_ae.options import exit_status
+from musculoskeletal_ae.start import load
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
 
@@ -63,7 +63,13 @@ def run(name: str) -> None:
         faulthandler.enable()
     node: Node | None = None
     try:
-        module = import_module(f'musculoskeletal_ae.nodes.{name}')
+        given = sys.argv[1:]
+        mine = given[: given.index('--ros-args')] if '--ros-args' in given else given
+        if extra := mine or remove_ros_args(sys.argv)[1:]:
+            told = f'parameters are given as  {name} --ros-args -p NAME:=VALUE'
+            print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
+            sys.exit(2)
+        module = load(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
         executor = ShieldedExecutor()
@@ -85,15 +91,6 @@ def run(name: str) -> None:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-
-
-# The entry points of setup.py.
-bringup_status = partial(run, 'bringup_status')
-controller = partial(run, 'controller')
-estimator = partial(run, 'estimator')
-hardware_emulator = partial(run, 'hardware_emulator')
-learner = partial(run, 'learner')
-sim = partial(run, 'sim')
 
 
 # -- tools ----------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.shield import refuse
@@ -64,6 +65,7 @@ class Shell(Node):
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
+        self._take_old_names()
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
@@ -72,7 +74,8 @@ class Shell(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
-        self._fault = ''
+        self._fault = self._waiting = ''
+        self.needed: list[str] = []  # topics without which the node has nothing to do
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -140,9 +143,23 @@ class Shell(Node):
         except (MusculoskeletalError, OSError) as error:
             raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
+    def _take_old_names(self) -> None:
+        """Read parameters by the names that they had a version ago, and say so."""
+        given: dict[str, RosParameter] = getattr(self, '_parameter_overrides', {})
+        for old, new in RENAMED.items():
+            if new not in self._table:
+                continue
+            if old in given and new not in given:
+                self.get_logger().warning(f'parameter {old} is called {new} now')
+                self.set_parameters([RosParameter(new, value=given[old].value)])
+            told = _descriptor(replace(self._table[new], meaning=f'old name of {new}'))
+            self.declare_parameter(old, self.get_parameter(new).value, told)
+
     def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         taken: list[str] = []
-        for name, value in ((p.name, p.value) for p in parameters if p.name in self._setters):
+        for name, value in ((RENAMED.get(p.name, p.name), p.value) for p in parameters):
+            if name not in self._setters:
+                continue
             try:
                 self._checked(name, value, self._setters[name])
             except MusculoskeletalError as error:
@@ -174,6 +191,7 @@ class Shell(Node):
         def from_file(path: str) -> None:
             if path:
                 take(checkpoint.load(path, self.robot))
+                self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
         def from_topic(message: UInt8MultiArray) -> None:
             try:
@@ -191,6 +209,7 @@ class Shell(Node):
                 use(before)
 
         self.take_anomaly = anomaly
+        self.needed.append('mae_checkpoint')
         self.follow_parameter('checkpoint', from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 
@@ -261,6 +280,18 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
+    def _tell_waiting(self, missing: list[str]) -> None:
+        """Say, whenever it changes, which topics have brought nothing yet, and why."""
+        told = [
+            f'{self.resolve_topic_name(topic)}, which nobody publishes'
+            if self.count_publishers(topic) == 0
+            else f'{self.resolve_topic_name(topic)} that can be used'
+            for topic in missing
+        ]
+        before, self._waiting = self._waiting, '; '.join(told)
+        if self._waiting != before:
+            self.get_logger().info(f'waiting for {self._waiting}' if told else 'all is there')
+
     def _report(self) -> None:
         try:
             report = self.report()
@@ -272,6 +303,7 @@ class Shell(Node):
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
         received = self._reception.take_received()
+        self._tell_waiting([topic for topic in self.needed if topic not in received])
         values = dict(report.values)
         values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
         values['rejected'] = str(sum(self.rejected.values()))

@@ -42,6 +42,7 @@ class Sim(Arm):
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
+        self.needed.append('muscle_length_command')
         self.follow_checkpoints(self._use_checkpoint)
         self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
         self.follow_wrench(partial(setattr, self, 'wrench'))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 
 from musculoskeletal_ae.options import Parser, exit_status, whole
+from musculoskeletal_ae.start import load
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -22,13 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
     args = parser.parse_args(argv)
 
-    def check() -> int:
-        # Imported here because it takes longer than the help of the command.
-        from musculoskeletal_ae.tools import robot_report
-
-        return robot_report.check(args)
-
-    return exit_status(check)
+    return exit_status(lambda: load('musculoskeletal_ae.tools.robot_report').check(args))
 
 
 if __name__ == '__main__':

@@ -3,27 +3,18 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
-import tempfile
-import time
 from pathlib import Path
 
-from tqdm import tqdm
-
-from musculoskeletal_ae.experiments import results
-from musculoskeletal_ae.experiments.report import write_report
-from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
-from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.experiments import NAMES
 from musculoskeletal_ae.options import Parser, exit_status, whole
-from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.start import load
 
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
 MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
-BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -34,7 +25,7 @@ def main(argv: list[str] | None = None) -> int:
         "and writes DIR/NAME/result.json, plots, and DIR/report.html with the paper's numbers "
         'beside ours. Exit status 1: the robot or a file is not usable, 2: bad options.',
     )
-    names = (*EXPERIMENTS, 'all')
+    names = (*NAMES, 'all')
     parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))
     parser.add_robot()
     parser.add_preset('networks to measure; preset paper is always shown beside them')
@@ -51,27 +42,7 @@ def main(argv: list[str] | None = None) -> int:
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
     # Ended by whoever started it, it clears up as on Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_status(lambda: _measure(args))
-
-
-def _measure(args: argparse.Namespace) -> None:
-    start = time.perf_counter()
-    names = tuple(EXPERIMENTS) if args.name == 'all' else (args.name,)
-    robot = Robot.load(args.robot)
-    args.out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
-        study = Study(robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder))
-        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
-
-            def report(share: float, running: str) -> None:
-                bar.n = share
-                bar.set_description_str(running)
-
-            measured = run(study, names, args.jobs, report)
-        files = [*results.write(study, measured, args.out), write_report(args.out)]
-    if args.readme:
-        files += results.update_readme(args.readme, args.out)
-    print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
+    return exit_status(lambda: load('musculoskeletal_ae.tools.measuring').measure(args))
 
 
 if __name__ == '__main__':

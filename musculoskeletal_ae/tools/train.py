@@ -4,37 +4,10 @@
 from __future__ import annotations
 
 import sys
-import time
-from argparse import Namespace
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.training import (
-    OUTPUTS,
-    PairError,
-    Trained,
-    initial_mae,
-    pair_errors,
-    random_states,
-)
-from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.options import Parser, exit_status, save_plot
-from musculoskeletal_ae.presets import PRESETS
-from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
-
-UNSEEN = 5000  # states
-ENTERED = {
-    Mask.THETA_TENSION: '① (θ, T)',
-    Mask.TENSION_LENGTH: '② (T, l)',
-    Mask.THETA_LENGTH: '③ (θ, l)',
-}
-SYMBOLS = {'theta': 'θ', 'tension': 'T', 'length': 'l'}
+from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.start import load
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -62,120 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint):
         parser.error('--hold-out and --checkpoint go with --from-bag')
-    return exit_status(lambda: _train(args))
-
-
-def _train(args: Namespace) -> None:
-    for file in filter(None, (args.out, args.plot)):
-        if not file.parent.is_dir() or file.is_dir():
-            raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
-    robot = Robot.load(args.robot)
-    steps = PRESETS[args.preset].training.steps // (10 if args.quick else 1)
-    if args.from_bag:
-        checkpoint.save(_learned(robot, args, steps).mae, args.out)
-        print(f'checkpoint: {args.out}')
-        return
-    start = time.perf_counter()
-    with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
-
-        def progress(step: int, loss: float) -> None:
-            bar.update()
-            if step % 100 == 0:
-                bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
-
-        trained = initial_mae(robot, args.preset, args.seed, progress, steps)
-    print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
-    # Not the stream of the training, so none of these states has been seen.
-    rng = np.random.default_rng([args.seed, 2])
-    limit, most = robot.tension.limit, robot.tension.max
-    planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, limit))
-    print(table(planned, f'{UNSEEN} unseen states, T in [0, {limit:g}] N'))
-    if most > limit:
-        overload = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, most, limit))
-        print(table(overload, f'the same, T in [{limit:g}, {most:g}] N (overload)'))
-    print(joint_table(robot, planned))
-    checkpoint.save(trained.mae, args.out)
-    print(f'checkpoint: {args.out}')
-    save_plot(args.plot, lambda file: plot(robot, trained, planned, file))
-
-
-def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
-    # Read before the network is trained, which takes longer than finding a bag unusable.
-    recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
-    if args.checkpoint:
-        mae = checkpoint.load(args.checkpoint, robot)
-    else:
-        print(f'training the network of {robot.description.directory.name} to start from')
-        mae = initial_mae(robot, args.preset, args.seed, steps=steps).mae
-    learner = Learner(robot, mae, args.preset, args.seed)
-    train_from_bags(learner, recordings, args.hold_out)
-    return learner
-
-
-def table(errors: list[PairError], title: str) -> str:
-    """Return the nine errors: mean norm of the error vector and mean |error| of an element."""
-    heads = [f'{SYMBOLS[output]} [{unit}] norm (each)' for output, unit, _ in OUTPUTS]
-    lines = ['', title, f'{"entered by":<12}' + ''.join(head.rjust(26) for head in heads)]
-    for mask, name in ENTERED.items():
-        cells = [f'{e.norm:.4f} ({e.elements.mean():.4f})' for e in errors if e.mask is mask]
-        lines.append(f'{name:<12}' + ''.join(cell.rjust(26) for cell in cells))
-    return '\n'.join(lines)
-
-
-def joint_table(robot: Robot, errors: list[PairError]) -> str:
-    """Return the mean absolute error of every joint estimated from (T, l)."""
-    estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
-    width = max(len(name) for name in robot.joints) + 2
-    rows = zip(robot.joints, estimates['theta'])
-    lines = [f'{name:<{width}}{error:.4f} rad' for name, error in rows]
-    return '\n'.join(['', '② → θ, mean |error| of each joint', *lines, ''])
-
-
-def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) -> None:
-    """Draw the loss, the nine errors and every joint's and muscle's error."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
-    figure = Figure(figsize=(13.0, 8.5), layout='constrained')
-    figure.suptitle(trained.mae.training)
-    curve, text, joints, tensions, lengths = figure.subplot_mosaic(
-        [['loss', 'loss', 'loss', 'table', 'table', 'table'],
-         ['theta', 'theta', 'tension', 'tension', 'length', 'length']]
-    ).values()  # fmt: skip
-    losses = np.array(trained.losses)
-    curve.semilogy(np.arange(1, len(losses) + 1), losses, lw=0.4, color='C7', label='mini-batch')
-    window = max(1, len(losses) // 50)
-    smooth = np.convolve(losses, np.full(window, 1.0 / window), mode='valid')
-    curve.semilogy(np.arange(window, len(losses) + 1), smooth, label=f'mean of {window}')
-    curve.set(xlabel='mini-batch', ylabel='training loss', title='Training')
-    curve.legend()
-    curve.grid(alpha=0.3)
-    text.axis('off')
-    limit = robot.tension.limit
-    text.set_title(f'Mean norm of the error, {UNSEEN} unseen states, T in [0, {limit:g}] N')
-    cells = [[f'{e.norm:.4f} {e.unit}' for e in errors if e.mask is mask] for mask in ENTERED]
-    shown = text.table(
-        cells,
-        rowLabels=list(ENTERED.values()),
-        colLabels=[f'→ {SYMBOLS[o[0]]}' for o in OUTPUTS],
-        loc='center',
-        cellLoc='center',
-    )
-    shown.scale(0.8, 2.2)
-    for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
-        one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
-        place = np.arange(len(names))
-        for i, error in enumerate(e for e in errors if e.output == output):
-            label = f'from {ENTERED[error.mask]}'
-            axes.barh(place + 0.27 * (i - 1), error.elements, 0.27, label=label, color=f'C{i}')
-        axes.set_yticks(place, names, fontsize=8)
-        axes.invert_yaxis()
-        axes.set(xlabel=f'mean |error| [{unit}]', title=f'{SYMBOLS[output]} of each {one}')
-        axes.grid(axis='x', alpha=0.3)
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-    handles, labels = lengths.get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=3)
-    figure.savefig(file, dpi=110)
+    return exit_status(lambda: load('musculoskeletal_ae.tools.initial_training').train(args))
 
 
 if __name__ == '__main__':

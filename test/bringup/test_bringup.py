@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -125,6 +126,7 @@ def test_a_cut_muscle_is_detected_and_reset_after_mending(environment):
         graph.close()
         _, output = run.end()
     assert 'ANOMALY: brachialis' in output
+    assert '(to go on: mend it, estimator/reset' in output
 
 
 def test_a_dead_node_is_named_and_nothing_is_left(environment):
@@ -179,3 +181,71 @@ def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments
     output, _ = run.process.communicate(timeout=DEADLINE)
     assert run.process.returncode == 2
     assert expected in output
+
+
+def driver(namespace):
+    """Run the template of a driver for arm26."""
+    command = [sys.executable, str(REPOSITORY / 'examples' / 'driver.py')]
+    return Process('driver.py', [*command, '--ros-args', '-r', f'__ns:=/{namespace}'])
+
+
+def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
+    run = bringup(environment, '--robot', 'arm26', '--hardware', '--namespace', 'own')
+    lines = iter(run.process.stdout.readline, '')
+    told = []
+    for line in lines:
+        told.append(line)
+        if 'waiting for /own/muscle_states' in line:
+            break
+    assert not any('starting' in line for line in told), told
+    graph = Graph('/own')
+    graph.processes += [run, driver('own')]
+    try:
+        for line in lines:
+            told.append(line)
+            if 'starting controller' in line:
+                break
+        # A test shares the machine with others; a stop would end the exploration.
+        assert graph.set_parameter('controller', 'max_age', 2.0)[0]
+        learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        graph.wait(lambda: len(learned) > 2, 'two updates of the network', 8 * DEADLINE)
+    finally:
+        status, output = run.end(signal.SIGINT)
+        graph.close()
+    told = ''.join(told) + output
+    assert 'the driver keeps its contract' in told
+    assert status == 130 and left_behind(run) == ''
+    kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
+    assert kept.is_dir()  # for the next time
+
+
+def test_without_a_controller_nothing_moves_the_arm(environment):
+    run = bringup(environment, '--robot', 'arm26', '--no-controller', '--duration', '3')
+    output, _ = run.process.communicate(timeout=300)
+    assert run.process.returncode == 0, output
+    assert 'starting hardware_emulator' in output and 'starting controller' not in output
+
+
+def test_only_the_description_of_a_robot_says_which_network_it_needs(environment, tmp_path):
+    robot = write_robot(tmp_path / 'big')
+    with (robot / 'recording.bin').open('wb') as file:
+        file.truncate(2**42)  # to read it would take an hour
+    runs = []
+    for text in ('one', 'two'):
+        (robot / 'README.md').write_text(text)
+        run = bringup(environment, '--robot', str(robot), '--preset', 'paper', '--duration', '1')
+        runs.append(run.process.communicate(timeout=300)[0])
+    assert 'training the MAE' in runs[0] and 'from an earlier run' in runs[1], runs
+
+
+def test_a_namespace_that_is_in_use_is_refused_by_name(environment):
+    first = bringup(environment, '--robot', 'arm26', '--hardware', '--namespace', 'taken')
+    for line in iter(first.process.stdout.readline, ''):
+        if 'logs in' in line:
+            break
+    second = bringup(environment, '--robot', 'arm26', '--namespace', 'taken')
+    output, _ = second.process.communicate(timeout=300)
+    assert second.process.returncode == 2
+    assert "'/taken' is in use" in output and '--namespace' in output
+    first.end(signal.SIGINT)
+    assert left_behind(first) == ''

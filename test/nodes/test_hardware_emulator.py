@@ -114,7 +114,7 @@ def test_payload_offset_and_wrench_act(arm, arm26):
 
 
 def test_a_marker_pose_is_published_on_request(arm, arm26):
-    assert arm.set_parameter('hardware_emulator', 'marker_rate', 30.0)[0]
+    assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 30.0)[0]
     pose = arm.next('marker_pose', 3)
     assert pose.header.frame_id == arm26.root_link
     theta = np.array(arm.received['joint_states'][-1].position)
@@ -184,3 +184,12 @@ def test_without_joint_sensors_there_are_no_joint_states(graph):
 def test_every_parameter_that_is_settable_is_followed(arm):
     settable = {name for name, p in PARAMETERS['hardware_emulator'].items() if p.settable}
     assert settable == set(arm.emulator._setters)
+
+
+def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):
+    graph.listen(PoseStamped, 'marker_pose')
+    emulator = graph.host(HardwareEmulator, robot='arm26', marker_rate=30.0)
+    assert emulator.parameter('marker_pose_rate') == 30.0
+    graph.next('marker_pose', 2)
+    assert graph.set_parameter('hardware_emulator', 'marker_rate', 0.0)[0]
+    assert emulator.marker_pose_rate == 0.0

@@ -277,7 +277,7 @@ def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained_file, state):
 def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained_file):
     from geometry_msgs.msg import PoseStamped
 
-    graph.start('hardware_emulator', robot='arm26', joint_sensors=False, marker_rate=30.0)
+    graph.start('hardware_emulator', robot='arm26', joint_sensors=False, marker_pose_rate=30.0)
     graph.start('estimator', robot='arm26', checkpoint=trained_file)
     graph.start('controller', robot='arm26', checkpoint=trained_file, explore=True)
     graph.start(

@@ -39,7 +39,7 @@ def test_help_tells_every_parameter_and_loads_nothing_heavy(node):
 import sys
 sys.argv[1:] = ['--help']
 from musculoskeletal_ae.nodes import running
-running.{node}()
+running.run('{node}')
 print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
@@ -54,6 +54,8 @@ print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
         below = lines[lines.index(told[0]) + 1]
         assert parameter.meaning in below and parameter.unit in below
         assert all(word in below for word in parameter.legal)
+        if parameter.within:
+            assert parameter.legal_values in below
 
 
 @pytest.mark.parametrize('node', PARAMETERS)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A driver to start from: copy it, put your motors and sensors into `Bus`, leave the rest as it is.
+
+    python my_driver.py --ros-args -p robot:=path/to/my_arm
+
+doc/your_robot.md says what a driver must do and why; `check_driver` whether this one does.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm  # for the fake bus only
+from musculoskeletal_ae.nodes.messages import array_message, joint_message
+from musculoskeletal_ae.robot.robot import Robot
+
+RATE = 100.0  # [Hz]
+SPOOL = 0.01  # [m] radius of the spools
+SILENCE = 0.5  # [s] without a command after which muscles are let go down to T_bias …
+RELEASE = 100.0  # … at this rate [N/s]
+
+
+class Bus:
+    """Your motors and sensors; all arrays in the order of muscles.yaml. This one is a fake."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.arm, self.read_at = EmulatedArm(robot, seed=1), time.monotonic()
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return spool angles [rad], + winds in, 0 at θ = 0 without tension; T [N]; °C; θ [rad]."""
+        now = time.monotonic()
+        self.arm.step(min(round(now - self.read_at, 3), 0.1))
+        self.read_at = now
+        reading = self.arm.sense()  # °C: np.full(muscles, np.nan) where there is no sensor
+        return -reading.length / SPOOL, reading.tension, reading.temperature, reading.theta
+
+    def pull(self, tension: np.ndarray) -> None:
+        """Let every motor regulate its wire to a tension [N] (M,)."""
+        self.arm.command_tension(tension)
+
+
+class Driver(Node):
+    def __init__(self) -> None:
+        super().__init__('driver')
+        self.robot = Robot.load(self.declare_parameter('robot', 'arm26').value)
+        self.bus = Bus(self.robot)
+        self.target, self.told_at = None, -SILENCE  # l_target [m], and when it came [s]
+        self.pulled = np.full(self.robot.muscle_count, self.robot.tension.bias)
+        self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
+        self.joints = self.create_publisher(JointState, 'joint_states', 10)
+        self.create_subscription(Float64MultiArray, 'muscle_length_command', self.command, 10)
+        self.create_timer(1.0 / RATE, self.tick)
+
+    def command(self, message: Float64MultiArray) -> None:
+        target = np.array(message.data)
+        if len(target) == self.robot.muscle_count and np.isfinite(target).all():
+            self.target, self.told_at = target, time.monotonic()
+
+    def tick(self) -> None:
+        angle, tension, temperature, theta = self.bus.read()
+        length = -SPOOL * angle
+        bias, most = self.robot.tension.bias, self.robot.tension.max
+        if self.target is not None and time.monotonic() - self.told_at < SILENCE:
+            wanted = bias + np.maximum(0.0, self.robot.stiffness * (length - self.target))
+        else:
+            wanted = np.maximum(bias, self.pulled - RELEASE / RATE)
+        self.pulled = np.minimum(wanted, most)
+        self.bus.pull(self.pulled)
+        rows = np.stack([length, tension, temperature])
+        self.states.publish(array_message(rows, 'quantity', 'muscle'))
+        now = self.get_clock().now().to_msg()
+        self.joints.publish(joint_message(self.robot.joints, theta, now))
+
+
+if __name__ == '__main__':
+    rclpy.init()
+    try:
+        rclpy.spin(Driver())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass

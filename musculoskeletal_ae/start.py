@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where every executable starts: `--help` loads nothing heavy, and Ctrl-C shows no traceback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+INTERRUPTED = 130
+
+
+def load(module: str) -> ModuleType:
+    """Import what takes a while; on Ctrl-C the process ends, as an import cut short would talk."""
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
+        return import_module(module)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def main() -> int | None:
+    """Run the node or tool that this process is named after; return its exit status."""
+    name = Path(sys.argv[0]).stem
+    try:
+        if name in load('musculoskeletal_ae.nodes.parameters').PARAMETERS:
+            return load('musculoskeletal_ae.nodes.running').run(name)
+        is_tool = Path(__file__).with_name('tools').joinpath(f'{name}.py').exists()
+        folder = 'tools' if is_tool else 'nodes'
+        return load(f'musculoskeletal_ae.{folder}.{name}').main()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:  # of what Python does at its end nothing is worth a second Ctrl-C
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

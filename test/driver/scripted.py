@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A driver of the emulated arm, stepped without ROS, that errs as it is told to."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+
+from musculoskeletal_ae.driver.listening import Listening
+from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.winding import Winding
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.robot.robot import Robot
+
+PERIOD = 0.01  # [s]
+
+
+class Driver:
+    """Publishes muscle_states and follows muscle_length_command, each through what may be wrong."""
+
+    def __init__(self, robot: Robot, seed: int = 0) -> None:
+        self.robot, self.arm = robot, EmulatedArm(robot, seed)
+        # Rows (3, M) as published, targets (M,) as taken, period of messages, commands on the way.
+        self.publish: Callable = lambda rows: rows
+        self.take: Callable = lambda target, _: target
+        self.names = robot.joints
+        self.period, self.late = PERIOD, 0.0
+        self.now = 0.0
+        self._commands: deque = deque()
+        self.in_tension: Callable | None = (
+            None  # (l_target, rows) → T, instead of the arm's own law
+        )
+        self._target = None
+        self._sent = -1.0
+
+    def step(self) -> list[np.ndarray]:
+        """Let 10 ms pass; return what is published then, each (3, M)."""
+        self.now += PERIOD
+        while self._commands and self._commands[0][0] <= self.now:
+            self._target = self._commands.popleft()[1]
+        rows = np.stack(self.arm.sense()[1:])
+        if self._target is not None:
+            if self.in_tension:
+                self.arm.command_tension(self.in_tension(self._target, rows))
+            else:
+                self.arm.command_length(self._target)
+        self.arm.step(PERIOD)
+        if self.now - self._sent < self.period - 1e-9:
+            return []
+        self._sent = self.now
+        read = self.arm.faults.delivered(self.arm.sense(), self.now)
+        return [self.publish(np.stack(readings[1:])) for readings in read]
+
+    def command(self, target: np.ndarray) -> None:
+        """Take a command as it came."""
+        rows = np.stack(self.arm.sense()[1:])
+        self._commands.append((self.now + self.late, self.take(target.copy(), rows)))
+
+    def listen(self, seconds: float = 5.0, moved: bool = False, joints: bool = True) -> Verdict:
+        """Return what `Listening` says, of the resting arm or while its hand is pushed about."""
+        listening = Listening(self.robot, 1.0 / PERIOD)
+        for k in range(round(seconds / PERIOD)):
+            if moved:
+                self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))
+            for rows in self.step():
+                if joints:
+                    listening.joints(joint_state(dict(zip(self.names, self.arm.sense().theta))))
+                listening.muscles(array(rows), self.now)
+        self.arm.set_wrench(np.zeros(6))
+        return listening.verdict()
+
+    def wind(self, muscles: tuple[int, ...] = (), highest: float | None = None) -> Verdict:
+        """Return what `Winding` says."""
+        winding = Winding(self.robot, muscles, highest)
+        while not winding.done:
+            for rows in self.step():
+                if (target := winding.step(rows, self.now)) is not None:
+                    self.command(target)
+        return winding.verdict
+
+
+def array(rows: np.ndarray) -> SimpleNamespace:
+    """Return a Float64MultiArray without a layout, as its readers see it."""
+    return SimpleNamespace(data=rows.ravel(), layout=SimpleNamespace(dim=[], data_offset=0))
+
+
+def joint_state(values: dict[str, float]) -> SimpleNamespace:
+    """Return a JointState, as its readers see it."""
+    return SimpleNamespace(
+        name=list(values), position=list(values.values()), velocity=[], effort=[]
+    )

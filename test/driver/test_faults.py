@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sound driver is found sound; each thing that a driver may get wrong is found, and named."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from driver.scripted import Driver
+from musculoskeletal_ae.robot.description import TensionRange
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+LOW = replace(ROBOT.description, tension=TensionRange(30.0, 55.0, 60.0))
+M, BICEPS = ROBOT.muscle_count, 4
+BIAS, K = ROBOT.tension.bias, ROBOT.stiffness
+
+
+def rows_in(order):
+    return lambda rows: rows[order]
+
+
+def scaled(*factors):
+    return lambda rows: rows * np.array(factors)[:, None]
+
+
+def exchanged(values):
+    return values[..., [1, 0, *range(2, M)]]
+
+
+def flipped(rows, muscles=slice(None)):
+    rows = rows.copy()
+    rows[0, muscles] *= -1.0
+    return rows
+
+
+def with_nan(rows):
+    rows = rows.copy()
+    rows[1, 2] = math.nan
+    return rows
+
+
+def shifted(rows):
+    rows = rows.copy()
+    rows[0, BICEPS] += 0.08
+    return rows
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_sound_driver_is_found_sound(seed):
+    for verdict in (
+        Driver(ROBOT, seed).listen(),
+        Driver(ROBOT, seed).listen(8.0, moved=True),
+        Driver(ROBOT, seed).listen(joints=False),
+    ):
+        assert not verdict.faults, str(verdict)
+    driver = Driver(ROBOT, seed)
+    driver.listen(2.0)
+    verdict = driver.wind()
+    assert not verdict.faults, str(verdict)
+    told = str(verdict).splitlines()
+    for name, line in zip(ROBOT.muscles, told[1:]):
+        assert line.startswith(name)
+        assert line.count('ok') == 5 and 'WRONG' not in line  # all but rate, zero, clip
+
+
+@pytest.mark.parametrize(
+    ('publish', 'moved', 'check', 'told'),
+    [
+        (rows_in([1, 0, 2]), False, 'order', 'rows look like tension, length, temperature'),
+        (lambda rows: rows.T.reshape(3, M), False, 'order', 'each muscle stand together'),
+        (scaled(1000, 1, 1), False, 'unit', 'lengths look like mm'),
+        (scaled(1000, 1, 1), True, 'unit', 'lengths look like mm'),
+        (scaled(1, 1000, 1), False, 'unit', 'does pull count as +'),
+        (scaled(1, -1, 1), False, 'unit', 'does pull count as +'),
+        (lambda rows: rows + [[0], [0], [273.15]], False, 'unit', 'look like K'),
+        (flipped, True, 'sign', 'must fall when the motor winds in'),
+        (lambda rows: flipped(rows, [BICEPS]), True, 'sign', 'biceps_long'),
+        (exchanged, True, 'order', 'behaves like deltoid_posterior'),
+        (shifted, False, 'zero', 'subtract this'),
+        (shifted, True, 'zero', 'biceps_long'),
+        (with_nan, False, 'rate', 'not finite'),
+        (lambda rows: rows[:2], False, 'order', '3×M values'),
+    ],
+)
+def test_what_is_wrong_is_heard(publish, moved, check, told):
+    driver = Driver(ROBOT)
+    driver.publish = publish
+    verdict = driver.listen(8.0 if moved else 5.0, moved=moved)
+    assert verdict.wrong == {check}, str(verdict)
+    assert told in str(verdict)
+
+
+def test_a_slow_a_halting_and_a_repeating_driver_are_heard():
+    slow = Driver(ROBOT)
+    slow.period = 0.05
+    verdict = slow.listen()
+    assert verdict.wrong == {'rate'} and 'came at 20 Hz' in str(verdict)
+    repeating, rows = Driver(ROBOT), []
+    repeating.publish = lambda now: rows.append(now) or rows[len(rows) // 2]
+    assert 'repeat the one before' in str(repeating.listen())
+    frozen = Driver(ROBOT)
+    first = []
+
+    def freeze(rows):
+        first.append(rows)
+        rows = rows.copy()
+        rows[:, 3] = first[0][:, 3]
+        return rows
+
+    frozen.publish = freeze
+    verdict = frozen.listen()
+    assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
+
+
+def test_joints_of_other_names_are_heard():
+    driver = Driver(ROBOT)
+    driver.names = ('joint_1', 'joint_2')
+    verdict = driver.listen()
+    assert 'missing joint' in str(verdict) and ROBOT.joints[0] in str(verdict)
+
+
+def test_modules_without_thermometers_are_no_fault():
+    driver = Driver(ROBOT)
+    driver.publish = scaled(1, 1, math.nan)
+    verdict = driver.listen()
+    assert not verdict.faults
+    assert 'nothing protects the motors from heat' in str(verdict)
+
+
+def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max, clip=True, gain=1.0):
+    def follow(target, rows):
+        tension = bias + np.maximum(0.0, stiffness * (rows[0] - target))
+        return gain * (np.minimum(tension, most) if clip else tension)
+
+    return follow
+
+
+def spring(target, rows):  # no max(0, …): it lets go where l_target is beyond l
+    return np.maximum(0.0, BIAS + K * (rows[0] - target))
+
+
+def only_first(target, _):
+    return np.where(np.arange(M) == BICEPS, 1.0, target)
+
+
+WOUND = {
+    'exchanged commands': ({'take': lambda t, _: exchanged(t)}, 'order', 'instead'),
+    'sign of both': (
+        {'publish': flipped, 'take': lambda t, _: -t},
+        'sign',
+        'a longer l_target winds it in',
+    ),
+    'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
+    'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
+    'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
+    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'read as m'),
+    'dead motor': ({'take': only_first}, 'law', 'does not respond'),
+    'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
+    'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'is T in N'),
+    'rows 2 and 3 exchanged': ({'publish': rows_in([0, 2, 1])}, 'order', 'row 3 does'),
+}
+
+
+@pytest.mark.parametrize('name', WOUND)
+def test_what_is_wrong_shows_when_a_muscle_is_wound_in(name):
+    changes, check, told = WOUND[name]
+    driver = Driver(ROBOT)
+    driver.listen(2.0)
+    for attribute, value in changes.items():
+        setattr(driver, attribute, value)
+    verdict = driver.wind((0, BICEPS))
+    assert check in verdict.wrong, str(verdict)
+    assert told in str(verdict)
+
+
+@pytest.mark.parametrize('clip', [True, False])
+def test_the_clip_is_tried_where_it_is_low_enough(clip):
+    robot = Robot(LOW)
+    driver = Driver(robot)
+    driver.listen(2.0)
+    # The module of the emulator clips by itself.
+    driver.arm._body = driver.arm._body._replace(tension_max=500.0)
+    driver.in_tension = law(most=60.0, clip=clip)
+    verdict = driver.wind((0, BICEPS))
+    assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)
+
+
+@pytest.mark.parametrize(
+    ('fault', 'checks'),
+    [
+        ('drop 0.4', {'rate'}),
+        ('delay 0.2', {'latency'}),
+        ('duplicate 0.5', {'rate'}),
+        ('freeze biceps_long', {'rate', 'law'}),
+        ('dead_sensor biceps_long', {'rate', 'law'}),
+        ('bias biceps_long 0.1', {'zero'}),
+        ('bias tension biceps_long 40', {'law'}),
+        ('stuck_motor biceps_long', {'law'}),
+    ],
+)
+def test_faults_of_the_emulated_arm_are_found(fault, checks):
+    driver = Driver(ROBOT)
+    driver.listen(2.0)
+    driver.arm.faults.set([fault])
+    heard = driver.listen()
+    verdict = driver.wind((BICEPS,))
+    verdict.add(heard)
+    assert verdict.wrong & checks, str(verdict)

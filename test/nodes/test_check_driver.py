@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`check_driver` on the graph: it waits, judges a live driver, and moves nothing unasked."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from graph import DEADLINE, executable
+from std_msgs.msg import Float32MultiArray, Float64MultiArray
+
+from musculoskeletal_ae.nodes.bringup_status import BringupStatus
+
+
+def check(graph, *options):
+    command = [*executable('check_driver'), '--robot', 'arm26', *options]
+    command += ['--ros-args', '-r', f'__ns:={graph.namespace}']
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def ended(process, deadline=2 * DEADLINE):
+    output, _ = process.communicate(timeout=deadline)
+    return process.returncode, output
+
+
+def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
+    graph.start('hardware_emulator', robot='arm26')
+    commands = graph.listen(Float64MultiArray, 'muscle_length_command')
+    # A busy machine may keep a sound driver waiting: it is listened to until it is heard well.
+    assert ended(check(graph, '--wait', '--seconds', '2'))[0] == 0
+    assert not commands
+    one = ['--move', '--muscles', 'biceps_long']
+    status, output = ended(check(graph, '--wait', '--seconds', '2', *one))
+    faults = [line for line in output.splitlines() if line.startswith('fault: ')]
+    assert {line.split()[1] for line in faults} <= {'latency', 'rate'}, output
+    assert status == 0 or faults
+    graph.spin(0.5)
+    assert commands
+
+
+@pytest.mark.parametrize(
+    ('fault', 'options', 'told'),
+    [
+        ('drop 0.5', [], 'fault: rate of all muscles'),
+        ('freeze biceps_long', [], 'the same reading in every message'),
+        ('bias biceps_long 0.1', [], 'fault: zero of biceps_long'),
+        (
+            'delay 0.2',
+            ['--wait', '--move', '--muscles', 'biceps_long'],
+            'fault: latency of biceps_long',
+        ),
+        (
+            'stuck_motor biceps_long',
+            ['--wait', '--move', '--muscles', 'biceps_long'],
+            'does not respond',
+        ),
+    ],
+)
+def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
+    graph.start('hardware_emulator', robot='arm26', faults=[fault])
+    status, output = ended(check(graph, '--seconds', '2', *options))
+    assert status == 1, output
+    assert told in output
+    assert 'change: ' in output
+
+
+def test_it_says_what_it_waits_for_and_what_is_wrong_until_it_is_right(graph):
+    waiting = check(graph, '--wait', '--seconds', '2')
+    lines = iter(waiting.stdout.readline, '')
+    assert f'waiting for {graph.namespace}/muscle_states' in next(lines)
+    graph.start('hardware_emulator', robot='arm26', faults=['bias biceps_long 0.1'])
+    for line in lines:
+        if 'nothing may move' in line:
+            break
+        assert 'keeps its contract' not in line
+    assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]
+    status, output = ended(waiting)
+    assert status == 0
+    assert 'the driver keeps its contract' in output
+
+
+def test_a_topic_of_another_type_is_told(graph):
+    graph.node.create_publisher(Float32MultiArray, 'muscle_states', 10)
+    status, output = ended(check(graph, '--seconds', '1'))
+    assert status == 1
+    assert 'is a std_msgs/msg/Float32MultiArray' in output
+
+
+def test_it_does_not_move_what_a_controller_moves(graph):
+    graph.start('hardware_emulator', robot='arm26')
+    graph.publisher(Float64MultiArray, 'muscle_length_command')
+    status, output = ended(check(graph, '--seconds', '1', '--move'))
+    assert status == 1
+    assert 'stop the controller' in output
+
+
+def test_ctrl_c_ends_it_without_a_traceback(graph):
+    waiting = check(graph)
+    waiting.stdout.readline()
+    waiting.send_signal(signal.SIGINT)
+    status, output = ended(waiting)
+    assert status == 130 and output == ''
+
+
+def test_nodes_say_what_they_wait_for(graph):
+    estimator = graph.start('estimator', robot='arm26')
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.spin(4.0)
+    _, output = estimator.end()
+    waiting = [line for line in output.splitlines() if 'waiting for' in line]
+    assert len(waiting) == 1
+    assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting[0]
+    assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting[0]
+
+
+def test_the_status_line_names_every_step_to_go_on(graph):
+    status = graph.host(BringupStatus, robot='arm26')
+
+    def controller_says(message):
+        name = f'{graph.namespace}/controller: state'
+        status._diagnosed(DiagnosticArray(status=[DiagnosticStatus(name=name, message=message)]))
+        return status._trouble()
+
+    assert controller_says('exploring') == ''
+    status.detected, status.suspect = True, 'brachialis'
+    steps = 'mend it, estimator/reset, controller/reset, controller/explore'
+    told = controller_says('stopped: anomaly_detected')
+    assert told == f'  ANOMALY: brachialis, STOPPED: anomaly_detected (to go on: {steps})'
+    status.detected = False
+    assert controller_says('holding') == ''
+    assert controller_says('stopped: a cause') == '  STOPPED: a cause (to go on: controller/reset)'
