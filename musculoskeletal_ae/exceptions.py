@@ -22,6 +22,12 @@ class CheckpointError(MusculoskeletalError):
     reason = 'unfit checkpoint'
 
 
+class GateError(CheckpointError):
+    """A checkpoint that does not explain the arm (`estimation/gate.py`); the one in use stays."""
+
+    reason = 'does not explain the arm'
+
+
 class InfeasibleError(MusculoskeletalError):
     """No muscle tension within its limits does what was asked."""
 

@@ -3,14 +3,21 @@
 
     target ─→ posture (lengths) or torque (tensions) ─→ safety ─→ command
 
-A stop latches on missing or old sensor data, an anomaly, an unfit checkpoint, a fault of control's
-own, or on request (doc/interface.md, stop and resume). `reset` clears it once no cause is left;
-then the last target is resumed by a ramp from where the arm is. Exploration is not resumed.
+A stop latches on missing or implausible sensor data, an anomaly, an unfit checkpoint, overload,
+overheating, a fault of control's own, or on request (doc/interface.md, stop and resume). `reset`
+clears it once no cause is left; then the last target is resumed by a ramp from where the arm is.
+Exploration is not resumed. Data that is late, but back before the stop pays out, is no reason to
+latch: after RESUME of it the arm goes on by itself, exploring or not.
+
+`now` is a steady clock [s], on which ages run; `time` is that of the messages, by which commands
+change. Where the messages' clock is slow, as of a slow simulator, ages may be larger by as much, up
+to SLOWEST; a fast one makes no age shorter. The controller's own pauses make nothing old.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
@@ -24,15 +31,36 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
+OWN_PAUSE = 0.3  # [s] between two steps; what is longer counts for no age
+RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
+SLOWEST = 0.05  # of real time
+PACE_SPAN = 1.0  # [s] over which the messages' clock is compared
+OVERHEATED = 20.0  # [°C] above temperature_limit
+OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
 NOTABLE = 0.05  # [N·m] of missing torque
 
 
+class Pace:
+    """How fast the messages' clock goes beside the steady one: 1 in real time."""
+
+    def __init__(self) -> None:
+        """Take it for real time."""
+        self.value = 1.0
+
+    def step(self, passed: float, since: float) -> None:
+        """Take how far both clocks went on [s]."""
+        share = 1.0 - math.exp(-since / PACE_SPAN)
+        if since > 0.0 and 0.0 <= passed < LONGEST_STEP + 10.0 * since:  # no jump
+            self.value += share * (passed / since - self.value)
+
+
 class Controller:
-    """Steps everything between a target and a command. Times are of one steady clock [s]."""
+    """Steps everything between a target and a command."""
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
@@ -46,9 +74,18 @@ class Controller:
         self._mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = Exploration(robot, seed)
-        self._muscles: Muscles | None = None
+        self._plausibility = Plausibility(robot)
+        self._temperatures: deque[Array] = deque(maxlen=5)
+        self._warm: Array | None = None  # their median [°C], (M,)
         self._estimate: Array | None = None
         self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
+        self._time = math.nan
+        self._fresh = self._asleep = 0.0  # [s] of data since it was late; of own pauses
+        self.pace = Pace()
+        self.intruder = ''  # who else sends muscle_states
+        self._overheated = False
+        #: since when each muscle pulls above tension.limit, and more than halfway to tension.max
+        self._tense_since: Array = np.full((2, robot.muscle_count), math.inf)
         self._anomaly = False
         # Whether the next command starts a method anew, from how the muscles pull then.
         self._starts = True
@@ -76,15 +113,28 @@ class Controller:
         self.posture.use(mae)
 
     def muscles(self, muscles: Muscles, now: float) -> None:
-        """Take muscle_states."""
-        self._muscles, self._muscles_at = muscles, now
-        self.safety.muscles(muscles)
-        highest = self.settings.temperature_limit
-        self.limit = safety.thermal_limit(self._robot, muscles.temperature, highest)
+        """Take muscle_states.
+
+        Raises:
+            MessageError: If no muscles of this arm can be so.
+        """
+        length, tension, temperature = muscles
+        self._plausibility.check_muscles(tension, length, temperature, now)
+        self._muscles_at = awake = now - self._asleep
+        self._temperatures.append(temperature)
+        self._warm = np.median(np.array(self._temperatures), axis=0)
+        pull, limits = self.safety.muscles(muscles).tension, self._robot.tension
+        over = pull > np.array([[limits.limit], [0.5 * (limits.limit + limits.max)]])
+        self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
     def estimated(self, theta: Array, now: float) -> None:
-        """Take estimated_joint_states [rad], shape (D,)."""
-        self._estimate, self._estimate_at = theta, now
+        """Take estimated_joint_states [rad], shape (D,).
+
+        Raises:
+            MessageError: If no joints of this arm can be there.
+        """
+        self._plausibility.check_estimate(theta, now)
+        self._estimate, self._estimate_at = theta, now - self._asleep
 
     def anomaly(self, detected: bool) -> None:
         """Take anomaly_detected."""
@@ -126,6 +176,10 @@ class Controller:
         self.explore(False)
         self.safety.stop(cause)
 
+    def clock_jumped_back(self) -> None:
+        """Count the messages' time from here."""
+        self._time, self.pace = math.nan, Pace()
+
     def reset(self, now: float) -> str:
         """Clear a stop and go on to the last target; return why not, or ''."""
         cause = self.present_cause(now)
@@ -140,13 +194,42 @@ class Controller:
             return 'no checkpoint'
         if self._anomaly:
             return 'anomaly_detected; call estimator/reset when it is mended'
+        doubts = self._plausibility
+        for what, doubt in (('muscle_states', doubts.muscles), ('estimate', doubts.estimates)):
+            if why := doubt.lasting(now):
+                return f'{what}: {why}'
+        return self.intruder or self._late(now) or self._overload(now) or self._overheat()
+
+    def _late(self, now: float) -> str:
+        allowed = self.settings.max_age / min(max(self.pace.value, SLOWEST), 1.0)
         for what, arrival in (
             ('muscle_states', self._muscles_at),
             ('estimated_joint_states', self._estimate_at),
         ):
-            if now - arrival > self.settings.max_age:
-                return f'{what} older than {self.settings.max_age:g} s'
+            if now - self._asleep - arrival > allowed:
+                return f'{what} older than {allowed:.3g} s'
         return ''
+
+    def _overload(self, now: float) -> str:
+        limits, longest = self._robot.tension, (self.settings.overload_time, OVERLOAD_MOMENT)
+        for since, allowed, most in zip(
+            self._tense_since, longest, (limits.limit, 0.5 * (limits.limit + limits.max))
+        ):
+            if now - self._asleep - since.min() > allowed:
+                name = self._robot.muscles[int(since.argmin())]
+                return f'{name}: tension above {most:g} N for {allowed:g} s'
+        return ''
+
+    def _overheat(self) -> str:
+        if self._warm is None:
+            return ''
+        now, bias = self._warm, self._robot.tension.bias
+        highest = self.settings.temperature_limit
+        hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
+        self._overheated = bool(hot or (self.limit <= bias).all())
+        name = self._robot.muscles[int(now.argmax())]
+        told = f'overheated: {name} {now.max():.0f} °C, limit {highest:g} °C'
+        return told if self._overheated else ''
 
     def report(self, now: float) -> Report:
         """Say what control is doing and what is in its way."""
@@ -175,12 +258,16 @@ class Controller:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
             warnings.append('the target needs more torque than the muscles have')
+        if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
+            warnings.append(f'tension above {robot.tension.limit:g} N: {", ".join(tense)}')
         hot = {n: t for n, t in zip(robot.muscles, self.limit) if t < robot.tension.max}
         if hot:
             values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
             warnings.append(f'hot: {", ".join(hot)}')
         doing = 'no target' if posture.theta is None else 'holding'
         doing = 'exploring' if posture.exploring else doing
+        if self.safety.cause and self.safety.passing:
+            return Report('warn', f'holding: {self.safety.cause}', values)
         if self.safety.cause:
             return Report('error', f'stopped: {self.safety.cause}', values)
         if waiting := self.present_cause(now):
@@ -195,26 +282,58 @@ class Controller:
     def _in_tension(self) -> bool:
         return self.settings.method == 'tension' and not self.posture.exploring
 
-    def step(self, now: float) -> Command | None:
-        """Return the command of this moment, or None while nothing was ever commanded."""
-        since = now - self.stepped_at if self.stepped_at > -math.inf else 0.0
-        dt = min(max(since, 0.0), LONGEST_STEP)
-        self.stepped_at = now
-        cause = self.present_cause(now)
+    def step(self, now: float, time: float | None = None) -> Command | None:
+        """Return the command of this moment, or None while nothing was ever commanded.
+
+        `time` is the messages' [s], that of the steady clock if it is not given.
+        """
+        dt, awake = self._elapsed(now, now if time is None else time)
+        late, cause = self._late(now), self.present_cause(now)
         # Before the first command there is nothing to stop.
         if cause and self.safety.command is not None:
-            self.stop(cause)
+            if cause == late:
+                self.safety.stop(cause, passing=True)
+            else:
+                self.stop(cause)
+        self._fresh = 0.0 if cause else self._fresh + awake
+        if self.safety.passing and self._fresh > RESUME:
+            self.safety.cause, self.safety.passing, self._starts = '', False, True
+        self._limit_by_heat(dt)
         desired = None
         if not cause and not self.safety.cause:
             try:
                 desired = self._command(dt)
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
-        fresh = now - self._muscles_at <= self.settings.max_age
-        return self.safety.step(desired, self.limit, dt, fresh)
+        waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
+        fresh = not late.startswith('muscle')
+        command = self.safety.step(desired, self.limit, 0.0 if waits else dt, fresh)
+        if self.safety.cause and not self.safety.passing:
+            self.explore(False)
+        return command
+
+    def _limit_by_heat(self, dt: float) -> None:
+        """Let no limit fall faster than the rate limit pays out."""
+        if self._warm is not None:
+            limit = safety.thermal_limit(self._robot, self._warm, self.settings.temperature_limit)
+            self.limit = np.maximum(limit, self.limit - self.safety.most_change(TENSION, dt))
+
+    def _elapsed(self, now: float, time: float) -> tuple[float, float]:
+        """Return how long this step is on the messages' clock, and on the steady one [s]."""
+        since, passed = max(now - self.stepped_at, 0.0), time - self._time
+        if self.stepped_at == -math.inf or math.isnan(passed):
+            since = passed = 0.0
+        if since > OWN_PAUSE:  # the arm may be elsewhere by now
+            self._asleep += since - OWN_PAUSE
+            self._starts = True
+        self.stepped_at, self._time = now, time
+        self.pace.step(passed, min(since, OWN_PAUSE))
+        # Where the messages' clock stands still for good, a stop must still let go.
+        passed = since if self.pace.value < SLOWEST and self.safety.cause else passed
+        return min(max(passed, 0.0), LONGEST_STEP), min(since, LONGEST_STEP)
 
     def _command(self, dt: float) -> Command | None:
-        mae, muscles, estimate = self._mae, self._muscles, self._estimate
+        mae, muscles, estimate = self._mae, self.safety.now, self._estimate
         # No present cause: all are there.
         assert mae is not None and muscles is not None and estimate is not None
         posture, in_tension = self.posture, self._in_tension

@@ -6,12 +6,13 @@ so the tension limit of a muscle is a length limit,
 
     l_target ≥ l + l_comp(T_limit),   l_comp(T) = −(T − T_bias)/K_stiff,
 
-which may pay a muscle out faster than the rate limit, never wind it in. l is the median of the last
-three readings there, so that a glitch of a sensor lets no muscle go. The limit of a muscle whose
-module runs hot falls smoothly from tension.max to T_bias.
+which may pay a muscle out faster than the rate limit, never wind it in. Readings are medians of the
+last three messages, so that a glitch of a sensor moves nothing. The limit of a muscle whose module
+runs hot falls smoothly from tension.max to T_bias, and no faster than the rate limit pays out.
 
 A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
-limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate.
+limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate. A stop
+that may pass by itself (data that is late) latches when that paying out begins.
 """
 
 from __future__ import annotations
@@ -73,22 +74,27 @@ class SafetyFilter:
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self._robot, self.settings = robot, settings
         self.cause = ''  # why the arm was stopped; '' ends it
+        self.passing = False  # whether the stop may end by itself
         self.command: Command | None = None  # the last one that left
         self._held = 0.0
-        self._muscles: Muscles | None = None
-        self._lengths: deque[Array] = deque(maxlen=3)
+        self._readings: deque[Muscles] = deque(maxlen=3)
+        #: medians of the last three messages
+        self.now: Muscles | None = None
         postures = robot.random_postures(200, np.random.default_rng(0))
         self._longest = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
 
-    def muscles(self, muscles: Muscles) -> None:
-        """Take new muscle_states."""
-        self._muscles = muscles
-        self._lengths.append(muscles.length)
+    def muscles(self, muscles: Muscles) -> Muscles:
+        """Take new muscle_states; return the medians of the last three."""
+        self._readings.append(muscles)
+        self.now = Muscles(*np.median(np.array(self._readings), axis=0))
+        return self.now
 
-    def stop(self, cause: str) -> None:
-        """Latch a stop; the first cause is kept."""
+    def stop(self, cause: str, passing: bool = False) -> None:
+        """Latch a stop, or one that may pass; the first cause is kept, if it latched."""
         if not self.cause:
-            self.cause, self._held = cause, 0.0
+            self._held = 0.0
+        if not self.cause or (self.passing and not passing):
+            self.cause, self.passing = cause, passing
 
     def step(
         self, desired: Command | None, limit: Array, dt: float, fresh: bool = True
@@ -98,7 +104,7 @@ class SafetyFilter:
         It follows the desired one, or keeps the last (None), within the tension limits [N] (M,),
         dt [s] after the last one; fresh muscle_states still say where the muscles are.
         """
-        muscles, desired = self._muscles, desired or self.command
+        muscles, desired = self.now, desired or self.command
         if muscles is None or desired is None:
             return None
         if not self.cause:
@@ -111,7 +117,8 @@ class SafetyFilter:
             self.command = self._released(self.command, muscles, dt, fresh)
         return self.command
 
-    def _most_change(self, kind: str, dt: float) -> float:
+    def most_change(self, kind: str, dt: float) -> float:
+        """Return by how much a command may change in dt [s]."""
         rate = self.settings.rate_limit
         return (rate if kind == LENGTH else rate * self._robot.stiffness) * dt
 
@@ -121,19 +128,20 @@ class SafetyFilter:
             before = unchanging(robot, kind, muscles)
             if kind == LENGTH:
                 before = Command(kind, np.minimum(before.value, self._longest))
-        change = self._most_change(kind, dt)
+        change = self.most_change(kind, dt)
         value = before.value + np.clip(value - before.value, -change, change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
-        length = np.minimum(np.median(self._lengths, axis=0), self._longest)
+        length = np.minimum(muscles.length, self._longest)
         return Command(kind, np.maximum(value, length + msc_compensation(robot, limit)))
 
     def _released(self, command: Command, muscles: Muscles, dt: float, fresh: bool) -> Command:
         self._held += dt
         if self._held <= self.settings.hold_time:
             return command
+        self.passing = False
         kind, value = command
-        change = self._most_change(kind, dt)
+        change = self.most_change(kind, dt)
         if kind == TENSION:
             return Command(kind, np.maximum(self._robot.tension.bias, value - change))
         # At the measured length MSC pulls with T_bias only; where that is not known, out to the

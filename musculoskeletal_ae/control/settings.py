@@ -53,9 +53,14 @@ class Settings:
     max_age: float = _set(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
     )
-    hold_time: float = _set(0.5, 'how long a stop holds the last command', 's', 0.0, 60.0)
+    hold_time: float = _set(
+        0.5, 'how long a stop holds the last command; data back by then resumes', 's', 0.0, 60.0
+    )
     temperature_limit: float = _set(
-        85.0, 'a module this hot pulls with T_bias only', '°C', 40.0, 200.0
+        85.0, 'a module this hot pulls with T_bias only; 20 °C more stop the arm', '°C', 40.0, 200.0
+    )
+    overload_time: float = _set(
+        20.0, 'a tension above tension.limit for this long stops the arm', 's', 0.1, 3600.0
     )
 
     def desired_stiffness(self, joints: int) -> tuple[float, ...]:

@@ -19,7 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import StateError
+from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.rest import RestCollector
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
@@ -77,9 +78,13 @@ class Learner:
         # Where they do not, the network says that its detector is not calibrated.
         self._statistics_hold = True
         self._forgot = False  # a muscle, since the update began
+        self._gate = Gate(robot)
+        self._gate_time = 0.0  # [s] of the messages
+        self.refused = 0  # updates that the gate did not let through
+        self.last_refused = ''
         self._state = None if directory is None else State(directory, robot)
         saved = None if self._state is None else self._state.load(self.samples)
-        if saved is not None:
+        if saved is not None and self._passes(saved):
             self._go_on_from(saved)
         elif mae is not None:
             self.begin(mae)
@@ -103,6 +108,8 @@ class Learner:
         if paired is None or not self.enabled:
             return
         _, tension, length, dt, theta = paired
+        self._gate_time += dt
+        self._gate.message(tension, length, self._gate_time)
         for rest in self._rests.step(tension, length, dt, theta):
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
@@ -117,8 +124,14 @@ class Learner:
         self._news = True
 
     def anomaly(self, detected: bool) -> None:
-        """Stop learning when an anomaly is detected, resume when it is reset."""
+        """Stop learning when an anomaly is detected, resume when it is reset.
+
+        The last network that explained the arm is published again, if that is another one.
+        """
         self._rests.set_anomaly(detected)
+        before = self._gate.anomaly(detected, self._gate_time)
+        if before is not None:
+            self._use(self._numbered(before))
 
     def enable(self, enabled: bool) -> None:
         """Stop or resume learning; samples and network stay."""
@@ -164,7 +177,16 @@ class Learner:
         self._statistics_hold |= is_calibrated(mae)
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
-        self._use(self._numbered(mae))
+        if self._passes(mae):
+            self._use(self._numbered(mae))
+
+    def _passes(self, mae: Mae) -> bool:
+        try:
+            self._gate.check(mae)
+        except GateError as error:
+            self.refused, self.last_refused = self.refused + 1, str(error)
+            return False
+        return True
 
     def _numbered(self, mae: Mae) -> Mae:
         before = 0 if self._mae is None else self._mae.version
@@ -172,6 +194,7 @@ class Learner:
 
     def _use(self, mae: Mae) -> None:
         self._mae, self.checkpoint = mae, checkpoint.to_bytes(mae)
+        self._gate.take(mae, self._gate_time)
         # What is published is on disk before it leaves.
         self._keep()
         self._to_publish = True
@@ -197,7 +220,12 @@ class Learner:
     # -- the state ------------------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Go on from a network, where none was saved; samples stay."""
+        """Go on from a network, where none was saved; samples stay.
+
+        Raises:
+            GateError: If it does not explain the arm.
+        """
+        self._gate.check(mae)
         self._go_on_from(self._numbered(mae))
 
     def _go_on_from(self, mae: Mae) -> None:
@@ -210,9 +238,12 @@ class Learner:
 
         Raises:
             StateError: If the backup cannot be made; nothing is changed then.
+            GateError: If the network does not explain the arm; nothing is changed then.
         """
         if self._state is not None and (self.samples or self.checkpoint):
             self._state.back_up(self.samples, self.checkpoint)
+        if mae is not None:
+            self._gate.check(mae)
         successor = None if mae is None else self._numbered(mae)
         self.training.close()
         self.samples.clear()
@@ -279,6 +310,8 @@ class Learner:
             'healthy time': f'{self._healthy.time:.0f} s',
             **self.training.values(),
         }
+        if self.refused:
+            values |= {'refused networks': str(self.refused), 'last refused': self.last_refused}
         if self._state is not None:
             values['state directory'] = str(self._state.directory)
             if self._state.not_used:

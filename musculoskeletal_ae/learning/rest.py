@@ -21,6 +21,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.learning.settings import Settings
+from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
@@ -135,11 +136,6 @@ class FrictionDirection:
 # -- what may be learned --------------------------------------------------------------------------
 
 MARGIN = 2.0  # [s] before a detection and after its reset
-# Beyond these a sensor errs, not the arm.
-OUTSIDE = 0.1  # of the joint's range
-TOO_TENSE = 1.1  # of tension.max
-POSTURES = 500  # that tell how long the muscles get
-LENGTH_MARGIN = 0.1  # [m], for wires that wrap, wind slack, or were tied elsewhere
 #: [s] without messages, and longer than a rest has to be, in which a wire may have slid anywhere
 HOLE = 0.5
 #: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
@@ -167,7 +163,7 @@ class RestCollector:
         self.rejected: Counter[str] = Counter()
         self._detector = RestDetector(settings)
         self._hole = max(HOLE, settings.rest_time)
-        self._longest = _longest(robot)
+        self._plausibility = Plausibility(robot)
         self._direction = FrictionDirection()
         self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
         self._time = self._skipped = 0.0
@@ -184,8 +180,10 @@ class RestCollector:
         if dt > self._hole:
             self._direction.reset()
             dt = self._hole
-        if implausible := self._implausible(tension, length, theta):
-            self.rejected[implausible] += 1
+        judge = self._plausibility
+        error = judge.levels(tension, length) or (theta is not None and judge.outside(theta))
+        if error:
+            self.rejected[error.reason] += 1
             self._skipped = dt
             return []
         self._skipped = 0.0
@@ -207,19 +205,6 @@ class RestCollector:
                 rests.append(passed.rest)
         return rests
 
-    def _implausible(self, tension: Array, length: Array, theta: Array | None) -> str:
-        """Return why no sensor of this arm measures that, or ''."""
-        if (tension > TOO_TENSE * self._robot.tension.max).any():
-            return 'tension beyond the maximum'
-        if (np.abs(length) > self._longest).any():
-            return 'length beyond what the joints allow'
-        if theta is not None:
-            reach = self._robot.upper - self._robot.lower
-            beyond = np.maximum(theta - self._robot.upper, self._robot.lower - theta)
-            if (beyond > OUTSIDE * reach).any():
-                return 'θ far outside the joint limits'
-        return ''
-
     def set_anomaly(self, detected: bool) -> None:
         """Close the gate on an anomaly, open it some time after the reset."""
         if detected and not self.anomaly:
@@ -236,12 +221,3 @@ class RestCollector:
         self._detector.reset()
         self._direction.reset()
         self._waiting.clear()
-
-
-def _longest(robot: Robot) -> Array:
-    """Return |l| of every muscle that no posture passes [m], shape (M,)."""
-    theta = robot.random_postures(POSTURES, np.random.default_rng(0), OUTSIDE)
-    pulls = np.zeros((2, POSTURES, robot.muscle_count))
-    pulls[1] = robot.tension.max
-    length = np.abs([robot.muscle_lengths(theta, pull) for pull in pulls])
-    return np.asarray(length.max(axis=(0, 1)) + LENGTH_MARGIN)

@@ -28,6 +28,8 @@ from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_joints
 
+LOOK_AROUND = 0.1  # [s] between looks at who publishes
+
 
 class Controller(Shell):
     """Node shell of control."""
@@ -49,12 +51,13 @@ class Controller(Shell):
         self.follow_muscle_states(self._muscles)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
-        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
+        self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
 
@@ -62,7 +65,13 @@ class Controller(Shell):
         self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _muscles(self, states: Array) -> None:
-        self.core.muscles(Muscles(*states), time.monotonic())
+        muscles, now = Muscles(*states), time.monotonic()
+        self.core.muscles(muscles, now)
+        self.gate.message(muscles.tension, muscles.length, now)
+
+    def _anomaly(self, message: Bool) -> None:
+        self.core.anomaly(message.data)
+        self.take_anomaly(message.data)
 
     def _estimated(self, theta: Array) -> None:
         self.core.estimated(theta, time.monotonic())
@@ -93,14 +102,28 @@ class Controller(Shell):
             raise MusculoskeletalError(f'refused: {reason}')
         return 'going on to the last target, if any; controller/explore explores again'
 
+    def _look_around(self) -> None:
+        """Let nobody else say how the muscles are."""
+        topic, names = self.resolve_topic_name('muscle_states'), list[str]()
+        if self.count_publishers(topic) > 1:
+            for publisher in self.get_publishers_info_by_topic(topic):
+                names.append(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
+        # One name twice: a node that was killed stays known for a while beside its successor.
+        several = sorted(set(names)) if len(set(names)) > 1 else []
+        self.core.intruder = f'muscle_states come from {" and ".join(several)}' if several else ''
+
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:
-        command = self.core.step(time.monotonic())
+        command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
             self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
+
+    def clock_jumped_back(self) -> None:
+        """Count time from here; latches stay."""
+        self.core.clock_jumped_back()
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""

@@ -22,6 +22,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_pose
 
@@ -32,7 +33,7 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         """Declare topics; options are those of Node."""
         super().__init__('estimator', **options)
-        self.core = Core(self.robot)
+        self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
         self.follow_parameter(
             'anomaly_threshold', partial(setattr, self.core.detector, 'threshold')
         )
@@ -53,11 +54,13 @@ class Estimator(Shell):
         self.core.commanded(time.monotonic(), **{kind: command})
 
     def _estimate(self, states: Array) -> None:
-        length, tension, _ = states
-        clock = self.get_clock().now()
-        estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, time.monotonic())
+        length, tension, temperature = states
+        clock, now = self.get_clock().now(), time.monotonic()
+        self.plausibility.check_muscles(tension, length, temperature, now)
+        estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         if estimate is None:
             return
+        self.gate.message(tension, length, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
         restored = np.stack([state.length, state.tension])
@@ -66,6 +69,7 @@ class Estimator(Shell):
         if estimate.detected:
             self.get_logger().warning(f'anomaly detected: {self.core.cause}')
             self.detected.publish(Bool(data=True))
+            self.take_anomaly(True)
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.robot.root_link))
@@ -74,6 +78,7 @@ class Estimator(Shell):
     def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
         self.core.reset()
+        self.take_anomaly(False)
         self.detected.publish(Bool(data=False))
         return f'cleared: {cause}' if cause else 'nothing was detected'
 

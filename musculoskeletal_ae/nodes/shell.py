@@ -24,7 +24,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import CheckpointError, MusculoskeletalError
+from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
@@ -119,16 +120,19 @@ class Shell(Node):
     def follow_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Use checkpoints from the parameter and the topic; the last valid one wins.
+        """Use checkpoints from the parameter and the topic; the last that passes the gate wins.
 
         `unfit` is told why one that came by topic cannot be used; the one in use stays.
         """
+        gate = self.gate = Gate(self.robot)
 
         def take(mae: Mae) -> None:
+            gate.check(mae)
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
                 raise CheckpointError(f'cannot be computed with ({error})') from error
+            gate.take(mae, time.monotonic())
 
         def from_file(path: str) -> None:
             if path:
@@ -137,10 +141,19 @@ class Shell(Node):
         def from_topic(message: UInt8MultiArray) -> None:
             try:
                 take(checkpoint.from_bytes(bytes(message.data), self.robot))
+            except GateError:  # the one in use goes on
+                raise
             except CheckpointError as error:
                 unfit(str(error))
                 raise
 
+        def anomaly(detected: bool) -> None:
+            before = gate.anomaly(detected, time.monotonic())
+            if before is not None:
+                self.get_logger().warning(f'back to checkpoint version {before.version}')
+                use(before)
+
+        self.take_anomaly = anomaly
         self.follow_parameter('checkpoint', from_file)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 

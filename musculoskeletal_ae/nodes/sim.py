@@ -9,15 +9,18 @@ the first, muscles are at T_bias. muscle_tension_command is not followed, and mo
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
-from musculoskeletal_ae.nodes.qos import RELIABLE
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
@@ -42,6 +45,9 @@ class Sim(Arm):
         self.follow_checkpoints(self._use_checkpoint)
         self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
         self.follow_wrench(partial(setattr, self, 'wrench'))
+        if not as_robot:
+            self.follow_muscle_states(self._note)
+        self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -53,6 +59,10 @@ class Sim(Arm):
             self.arm = arm
         else:
             self.arm.use(mae)
+
+    def _note(self, states: Array) -> None:
+        length, tension, _ = states
+        self.gate.message(tension, length, time.monotonic())
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

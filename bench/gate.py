@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gate's limits: how far healthy networks are from them, and which attacks it refuses.
+
+    python -m bench gate [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 10]
+
+For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
+minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
+Printed are the largest of every measure over all of them beside its limit, what was refused (none
+may be), and how many of the initial and the last learned networks are refused under each attack.
+
+Exit status 1 if a healthy network was refused, or an attack was not.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.estimation.gate import FLOOR, LEAST_CUT, LIMITS, WORSE, Gate
+from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.robot import Robot
+
+LOAD, MINUTE = 3.6, 60.0  # [kg], [s]
+
+# -- attacks --------------------------------------------------------------------------------------
+
+Attack = Callable[[Mae], Mae]
+
+
+def _weights(times: Callable[[Array], Array]) -> Attack:
+    def attack(mae: Mae) -> Mae:
+        stacks = (
+            tuple((times(weight), times(bias)) for weight, bias in stack)
+            for stack in (mae.encoder, mae.decoder)
+        )
+        return replace(mae, **dict(zip(('encoder', 'decoder'), stacks, strict=True)))
+
+    return attack
+
+
+def _noise(share: float) -> Attack:
+    rng = np.random.default_rng(0)
+    return _weights(lambda w: w * (1.0 + share * rng.standard_normal(w.shape)))
+
+
+def _last(quantity: int, change: Callable[[Array, Array, Array], None]) -> Attack:
+    """Change weight and bias of the decoder's last layer where it says θ (0), T (1) or l (2)."""
+
+    def attack(mae: Mae) -> Mae:
+        joints, muscles = len(mae.joints), len(mae.muscles)
+        starts = np.cumsum([0, joints, muscles])
+        weight, bias = (part.copy() for part in mae.decoder[-1])
+        change(weight, bias, starts[quantity] + np.arange(2))
+        return replace(mae, decoder=(*mae.decoder[:-1], (weight, bias)))
+
+    return attack
+
+
+def _swap(weight: Array, bias: Array, rows: Array) -> None:
+    weight[rows], bias[rows] = weight[rows[::-1]], bias[rows[::-1]]
+
+
+def _flip(weight: Array, _: Array, rows: Array) -> None:
+    weight[rows[0]] *= -1.0
+
+
+def _scaled_std(times: float, part: slice) -> Attack:
+    def attack(mae: Mae) -> Mae:
+        scale = np.ones(len(mae.std))
+        scale[len(mae.joints) :][part] = times
+        return replace(mae, std=mae.std * scale, mean=mae.mean * scale)
+
+    return attack
+
+
+def _lengths(times: float) -> Attack:
+    return lambda mae: _scaled_std(times, slice(len(mae.muscles), None))(mae)
+
+
+def _shifted(quantity: int, scaled: float) -> Attack:
+    """Let the decoder say so much more [scaled units] of the first joint or muscle."""
+
+    def attack(mae: Mae) -> Mae:
+        row = (0, len(mae.joints), len(mae.joints) + len(mae.muscles))[quantity]
+
+        def change(_: Array, bias: Array, rows: Array) -> None:
+            bias[rows[0]] += scaled / mae.std[row]
+
+        return _last(quantity, change)(mae)
+
+    return attack
+
+
+ATTACKS: Mapping[str, Attack] = {
+    **{f'weights × {k:g}': _weights(lambda w, k=k: k * w) for k in (1.5, 1.7, 2.0, -1.0)},
+    'noise of 100 %': _noise(1.0),
+    'noise of 50 %': _noise(0.5),
+    'lengths × 10': _lengths(10.0),
+    'lengths × 2': _lengths(2.0),
+    'two joints swapped': _last(0, _swap),
+    'two tensions swapped': _last(1, _swap),
+    'two lengths swapped': _last(2, _swap),
+    'one joint the other way': _last(0, _flip),
+    'one length the other way': _last(2, _flip),
+    'one joint 1.5 rad off': _shifted(0, 1.5),
+    'one length 0.2 m off': _shifted(2, 2.0),
+    'standardisation × 2': _scaled_std(2.0, slice(None)),
+}
+#: what only the arm's own messages tell
+ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
+
+
+# -- healthy networks -----------------------------------------------------------------------------
+
+
+class Spread:
+    """The largest of every measure over networks, and what was refused of them."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        self.most: defaultdict[str, float] = defaultdict(float)
+        self.least_cut, self.refused, self.count = np.inf, list[str](), 0
+
+    def take(self, gate: Gate, mae: Mae, name: str) -> None:
+        """Measure a network, and try it."""
+        self.count += 1
+        values = {key: share.max() for key, share in gate.posture_errors(mae).items()}
+        left = gate.message_errors(mae)
+        values |= {f'{key} of messages': error.max() for key, error in left.items()}
+        if gate.mae is not None:
+            for key, before in (gate.message_errors(gate.mae) if left else {}).items():
+                worse = left[key][left[key] > FLOOR[key]] / before[left[key] > FLOOR[key]]
+                values[f'{key} beyond that in use'] = worse.max(initial=0.0)
+        values['d on messages'], cut = np.nan_to_num(gate.detector(mae), nan=[0.0, np.inf])
+        self.least_cut = min(self.least_cut, cut)
+        for key, value in values.items():
+            self.most[key] = max(self.most[key], float(value))
+        try:
+            gate.check(mae)
+        except GateError as error:
+            self.refused.append(f'{name}: {error}')
+
+
+def learned(robot: Robot, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
+    """Let a learner learn of one individual, each of its checkpoints through a gate; the last."""
+    arm, gate = EmulatedArm(robot, seed), Gate(robot)
+
+    def script(arm: EmulatedArm, time: float) -> None:
+        arm.set_payload(LOAD * (time // MINUTE % 2))
+
+    stream = record(arm, driver, EXPLORATION_STREAM + seed, MINUTE * minutes, script)
+    learner = Learner(robot, mae, preset=mae.preset, seed=seed)
+    gate.take(mae, 0.0)
+    for n, row in enumerate(zip(stream.theta_sensor, stream.tension, stream.length, strict=True)):
+        now = n * SAMPLE_TIME
+        gate.message(*row[1:], now)
+        if learner.step(now, *row) is not None:
+            spread.take(gate, learner.mae, f'individual {seed}, {mae.preset}, {now:.0f} s')
+            gate.take(learner.mae, now)
+    if learner.refused:
+        spread.refused.append(f'individual {seed}, by the learner: {learner.last_refused}')
+    return learner.mae
+
+
+def limit(name: str) -> float:
+    """Return a measure's limit."""
+    if name in LIMITS:
+        return LIMITS[name]
+    return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'beyond' in name else 1.0)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure, attack and print."""
+    parser = Parser(
+        'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
+    )
+    parser.add_robot()
+    parser.add_seeds((0, 1, 2, 3, 4))
+    parser.add_minutes('duration of learning', 10.0)
+    args = parser.parse_args(argv)
+    failed = False
+
+    def work() -> None:
+        nonlocal failed
+        torch.set_num_threads(1)
+        robot, spread = Robot.load(args.robot), Spread()
+        initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
+        networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
+        for _, mae in networks:
+            spread.take(Gate(robot), mae, 'initial')
+        for seed in args.seeds:
+            for preset, mae in initial.items():
+                last = learned(robot, mae, initial['default'], seed, args.minutes, spread)
+                networks.append((f'individual {seed}, {preset}', last))
+        print(f'{spread.count} healthy networks: largest of each measure, limit')
+        for name, value in spread.most.items():
+            print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
+        print(f'  {"d with a muscle cut (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
+        print('\n'.join(['refused:', *(spread.refused or ['none'])]))
+        for attack, change in ATTACKS.items():
+            passed = []
+            for name, mae in networks:
+                try:
+                    Gate(robot).check(change(mae))
+                    passed.append(name)
+                except GateError:
+                    pass
+            print(f'{attack:<30}refused {len(networks) - len(passed)} of {len(networks)}', *passed)
+            failed |= bool(passed)
+        failed |= bool(spread.refused)
+
+    return exit_status(work) or int(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A candidate network is tried beside the one in use before it takes over.
+
+    postures   what it restores of (θ, T, l) through ①, ② and ③, and G through ①, on a fixed set of
+               postures of the geometric model: the root mean square error of each joint or muscle,
+               as a share of what there is to explain, is at most LIMITS
+    messages   what it leaves of T and l through ②, and of l through ① at the θ of ②, on the last
+               seconds of the node's own healthy messages: the median of each muscle is at most
+               WORSE times that of the network in use, or FLOOR
+    detector   a calibrated one is quiet on those messages, and would not be on the same with a
+               muscle cut
+
+A share of 1 is what a network reaches that always says the same. LIMITS, WORSE, FLOOR and LEAST_CUT
+leave a margin to the largest that healthy networks showed: initial and learned ones of both presets
+on both shipped robots (`python -m bench gate` prints them, beside those of attacks).
+
+On an anomaly the newest network that has been in use for PROOF without one comes back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import residuals
+from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 64
+SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept
+LEAST = 20  # messages that say something
+PROOF = 10.0  # [s]
+NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already wrong
+
+#: largest share left unexplained of the fixed postures
+LIMITS = {
+    **{'θ by ①': 0.5, 'T by ①': 1.25, 'l by ①': 2.1},
+    **{'θ by ②': 2.0, 'T by ②': 1.25, 'l by ②': 1.3},
+    **{'θ by ③': 0.8, 'T by ③': 13.0, 'l by ③': 0.7, 'G by ①': 1.4},
+}
+WORSE = 2.0
+FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
+LEAST_CUT = 0.15  # d of messages with a muscle cut over the threshold, the clearest muscle
+
+
+class Gate:
+    """What a node's network has to pass. Times `now` are of one steady clock [s]."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        rng, tension = np.random.default_rng(0), robot.tension
+        shape = POSTURES, robot.muscle_count
+        theta, pull = robot.random_postures(POSTURES, rng), rng.uniform(size=shape)
+        pull = tension.bias + pull * (tension.limit - tension.bias)
+        self._postures = theta, pull, robot.muscle_lengths(theta, pull)
+        slope = robot.series_elastic.length_slope(pull)[..., None]
+        self._jacobian = robot.routes.muscle_jacobian(theta) * (1.0 - slope)
+        self._messages: deque[tuple[float, Array, Array]] = deque()
+        self._used: list[tuple[float, Mae]] = []  # since when which network was in use
+        self._anomaly = False
+
+    @property
+    def mae(self) -> Mae | None:
+        """The network in use."""
+        return self._used[-1][1] if self._used else None
+
+    def message(self, tension: Array, length: Array, now: float) -> None:
+        """Note one of the node's own messages, T [N] and l [m] (M,)."""
+        if self._anomaly or (self._messages and 0.0 <= now - self._messages[-1][0] < SPACING):
+            return
+        self._messages.append((now, tension, length))
+        while now - self._messages[0][0] > SPAN:
+            self._messages.popleft()
+
+    def check(self, mae: Mae) -> None:
+        """Try a network.
+
+        Raises:
+            GateError: If it does not explain the arm; the one in use stays.
+        """
+        with np.errstate(all='ignore'):
+            if faults := [*self._faults(mae)]:
+                raise GateError('; '.join(faults))
+
+    def take(self, mae: Mae, now: float) -> None:
+        """Note that a network took over."""
+        self._used.append((now, mae))
+        while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
+            del self._used[0]
+
+    def anomaly(self, detected: bool, now: float) -> Mae | None:
+        """Note whether an anomaly is detected; return the network that is to come back, if any."""
+        if detected == self._anomaly:
+            return None
+        self._anomaly = detected
+        if not detected:
+            self._messages.clear()  # a mended arm may be another one
+            return None
+        while self._messages and now - self._messages[-1][0] < NOTICED:
+            self._messages.pop()
+        in_use = self.mae
+        while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
+            del self._used[-1]
+        return self.mae if self.mae is not in_use else None
+
+    # -- what is measured -----------------------------------------------------------------------
+
+    def posture_errors(self, mae: Mae) -> dict[str, Array]:
+        """Return shares left unexplained of the fixed postures, of each joint or muscle."""
+        errors = {}
+        for mask, sign in zip(Mask, '①②③', strict=True):
+            restored = mae.decode(mae.encode(mask, *self._postures))
+            for name, value, true in zip('θTl', restored, self._postures, strict=True):
+                spread = np.maximum(true.std(axis=0), 1e-9)
+                errors[f'{name} by {sign}'] = _size(value - true) / spread
+        off = mae.muscle_jacobian(*self._postures[:2]) - self._jacobian
+        by_muscle = (
+            part.swapaxes(1, 2).reshape(-1, off.shape[1]) for part in (off, self._jacobian)
+        )
+        error, size = map(_size, by_muscle)
+        return errors | {'G by ①': error / np.maximum(size, 1e-9)}
+
+    def message_errors(self, mae: Mae) -> dict[str, Array]:
+        """Return what is left of T [N] and l [m] of the messages, of each muscle; {} if too few."""
+        if len(self._messages) < LEAST:
+            return {}
+        _, tension, length = map(np.array, zip(*self._messages))
+        restored = mae.estimate(tension, length)
+        parts = (
+            restored.tension - tension,
+            restored.length - length,
+            mae.lengths(restored.theta, tension) - length,
+        )
+        return {name: np.median(np.abs(part), axis=0) for name, part in zip(FLOOR, parts)}
+
+    def detector(self, mae: Mae) -> tuple[float, float]:
+        """Return d over its threshold: of the messages, and of the same with a muscle cut.
+
+        Medians; of the muscle whose cut shows most. NaN where there is no calibrated detector.
+        """
+        statistics = mae.anomaly
+        if statistics is None or not statistics.calibrated or len(self._messages) < LEAST:
+            return np.nan, np.nan
+        threshold = statistics.thresholds.get(DISTANCE, np.inf)
+        _, tension, length = map(np.array, zip(*self._messages))
+
+        def distance(tension: Array) -> float:
+            off = residuals(mae.estimate(tension, length), tension, length) - statistics.mean
+            square = np.einsum('ni,in->n', off, np.linalg.solve(statistics.covariance, off.T))
+            return float(np.median(np.sqrt(square))) / threshold
+
+        uncut = 1.0 - np.eye(self._robot.muscle_count)
+        return distance(tension), max(distance(tension * row) for row in uncut)
+
+    def _faults(self, mae: Mae) -> Iterator[str]:
+        joints, muscles = self._robot.joints, self._robot.muscles
+        for name, share in self.posture_errors(mae).items():
+            if not share.max() <= LIMITS[name]:
+                who = (joints if name[0] == 'θ' else muscles)[int(share.argmax())]
+                told = f'{share.max():.2g} unexplained on the geometric model'
+                yield f'{name}, {who}: {told}, limit {LIMITS[name]:g}'
+        left = self.message_errors(mae)
+        before = {} if self.mae is None or not left else self.message_errors(self.mae)
+        for name, error in left.items():
+            limit = np.full(len(error), FLOOR[name])
+            if name in before:
+                limit = np.fmax(limit, WORSE * before[name])
+            over = error / limit
+            if not over.max() <= 1.0:
+                worst = int(over.argmax())
+                told = f'{error[worst]:.3g} left of own messages, limit {limit[worst]:.3g}'
+                yield f'{name}, {muscles[worst]}: {told}'
+        healthy, cut = self.detector(mae)
+        if healthy > 1.0:
+            yield f'detector: d {healthy:.2g} of its threshold on own messages, limit 1'
+        if cut < LEAST_CUT:
+            yield f'detector: d {cut:.2g} of its threshold with a muscle cut, least {LEAST_CUT:g}'
+
+
+def _size(error: Array) -> Array:
+    size: Array = np.sqrt(np.square(error).mean(axis=0))
+    return size

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No message makes the controller do harm: glitches, lies, late data, heat, overload, clocks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.control.controller import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE, RESUME
+from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.exceptions import MessageError
+
+TICK = 0.1 * DT  # [m] that the rate limit allows
+MUSCLE = ROBOT.muscles[0]
+
+
+class Lied(Bench):
+    """A bench whose messages are distorted on their way; what is refused is counted."""
+
+    def __init__(self, **chosen):
+        super().__init__(first_duration=0.5, **chosen)
+        self.refused = []
+        take = self.core.muscles
+
+        def muscles(read, now):
+            try:
+                take(self.lie(read), now)
+            except MessageError as error:
+                self.refused.append(str(error))
+
+        self.core.muscles, self.lie = muscles, lambda read: read
+        self.target(REST)
+        self.step(100)
+
+    def pull(self, tension):
+        """Let the muscles come to tensions as fast as motors do."""
+        before = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
+        for share in np.linspace(0.0, 1.0, 20):
+            self.tension = before + share * (tension - before)
+            self.step()
+
+    def lies(self, count=1, **rows):
+        """Step with rows of the message replaced by functions of them."""
+        self.lie = lambda read: read._replace(**{k: f(getattr(read, k)) for k, f in rows.items()})
+        sent = self.step(count)
+        self.lie = lambda read: read
+        return sent
+
+
+def largest_step(before, sent):
+    return np.abs(np.diff(values([before, *sent]), axis=0)).max()
+
+
+ROWS = st.sampled_from(['length', 'tension', 'temperature'])
+LIES = st.one_of(
+    st.floats(-1e308, 1e308).map(lambda v: lambda row: np.full_like(row, v)),
+    st.sampled_from([0.1, -0.1, 50.0, 400.0]).map(lambda v: lambda row: row + v),
+    st.sampled_from([84.0, 90.0, 499.0]).map(lambda v: lambda row: np.full_like(row, v)),
+)
+
+
+@hypothesis_settings(max_examples=60)
+@given(st.lists(st.tuples(ROWS, LIES, st.integers(1, 30)), min_size=1, max_size=4))
+def test_no_bad_message_moves_a_command_by_more_than_a_tick_s_worth(lies):
+    bench = Lied()
+    for row, lie, pause in lies:
+        before = bench.core.safety.command
+        sent = bench.lies(1, **{row: lie}) + bench.step(pause)
+        assert largest_step(before, sent) <= TICK + 1e-9
+    assert bench.core.safety.cause == ''
+
+
+@pytest.mark.parametrize(
+    ('row', 'lie', 'cause'),
+    [
+        ('length', lambda v: v + 0.1, 'length jumped'),
+        ('length', lambda v: v * 0.0 + 1e308, 'length beyond what the joints allow'),
+        ('tension', lambda v: v * 0.0 + 600.0, 'tension beyond the maximum'),
+        ('tension', lambda v: v * 0.0 + 450.0, 'tension above 350 N for 1 s'),
+        ('temperature', lambda v: v * 0.0 + 1e308, 'temperature of no module'),
+        ('temperature', lambda v: v * 0.0 + 110.0, f'overheated: {MUSCLE} 110 °C, limit 85 °C'),
+    ],
+)
+def test_what_lasts_stops_the_arm_with_its_own_cause_and_never_by_a_jump(row, lie, cause):
+    bench = Lied()
+    before = bench.core.safety.command
+    sent = bench.lies(70 if 'jumped' in cause else 110, **{row: lie})
+    assert cause in bench.core.safety.cause
+    assert not bench.core.safety.passing
+    assert cause in bench.core.reset(bench.now)
+    assert largest_step(before, sent) <= TICK + 1e-9
+    bench.step(120)
+    assert bench.core.reset(bench.now) == ''
+    bench.step(200)
+    assert bench.report().message == 'holding'
+
+
+def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
+    bench = Lied()
+    before = bench.core.safety.command
+    bench.blind = {'estimate'}
+    for k in range(15):
+        with pytest.raises(MessageError, match='outside the joint limits'):
+            bench.core.estimated(REST + 22.0, bench.now)
+        sent = bench.step()
+        assert largest_step(before, sent) <= TICK + 1e-9
+        before = sent[-1]
+        assert not (bench.core.safety.cause and k < 9)
+    assert 'estimate: θ far outside' in bench.core.safety.cause
+
+
+def test_a_hot_glitch_changes_nothing_and_real_heat_pays_out_within_the_rate_limit():
+    bench = Lied()
+    bench.pull(np.full(ROBOT.muscle_count, 150.0))
+    bench.step(300)
+    limit, before = bench.core.limit.copy(), bench.core.safety.command
+    for hot in (84.0, 90.0, 200.0):
+        sent = bench.lies(2, temperature=lambda t, hot=hot: t * 0.0 + hot) + bench.step(10)
+        np.testing.assert_array_equal(bench.core.limit, limit)
+        assert largest_step(before, sent) <= TICK + 1e-9
+    bench.temperature = COLD + np.array([60.0, *[0.0] * (ROBOT.muscle_count - 1)])
+    assert largest_step(before, bench.step(200)) <= TICK + 1e-9
+    assert bench.core.limit[0] == ROBOT.tension.bias
+
+
+def test_overheating_is_reset_only_when_the_module_is_cool():
+    bench = Lied()
+    limit = bench.core.settings.temperature_limit
+    bench.temperature = COLD.copy()
+    bench.temperature[2] = limit + OVERHEATED + 1.0
+    bench.step(20)
+    assert bench.core.safety.cause.startswith(f'overheated: {ROBOT.muscles[2]} 106 °C')
+    bench.temperature[2] = limit + 1.0
+    bench.step(20)
+    assert 'overheated' in bench.core.reset(bench.now)
+    bench.temperature[2] = limit - 1.0
+    bench.step(20)
+    assert bench.core.reset(bench.now) == ''
+    bench.step(20)
+    assert bench.core.safety.cause == ''
+
+
+def test_a_tension_above_the_limit_is_said_at_once_and_stops_the_arm_after_the_stated_time():
+    bench = Lied(overload_time=3.0)
+    tension = np.full(ROBOT.muscle_count, 60.0)
+    tension[3] = 220.0
+    bench.pull(tension)
+    assert f'tension above 200 N: {ROBOT.muscles[3]}' in bench.report().message
+    bench.step(280)
+    assert bench.core.safety.cause == ''
+    bench.step(20)
+    assert bench.core.safety.cause == f'{ROBOT.muscles[3]}: tension above 200 N for 3 s'
+    bench.tension = None
+    bench.step(120)
+    assert bench.core.reset(bench.now) == ''
+    assert OVERLOAD_MOMENT < 3.0
+
+
+def test_a_second_source_of_muscle_states_stops_the_arm_by_name():
+    bench = Lied()
+    bench.core.intruder = 'muscle_states come from /a and /b'
+    bench.step(2)
+    assert bench.core.safety.cause == 'muscle_states come from /a and /b'
+    assert bench.core.reset(bench.now)
+
+
+# -- late for a moment, or gone -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('what', ['muscles', 'estimate'])
+def test_data_that_is_late_for_a_moment_is_waited_for_and_the_arm_goes_on_by_itself(what):
+    bench = Lied(max_age=0.2, hold_time=0.5)
+    bench.core.explore(True)
+    bench.step(50)
+    bench.blind = {what}
+    held = bench.step(60)  # late after 0.2 s, gone after 0.7 s
+    assert 'older' in bench.core.safety.cause
+    assert bench.report().level == 'warn'
+    assert len({tuple(command.value) for command in held[25:]}) == 1
+    bench.blind = set()
+    back = bench.step(round(RESUME / DT) + 3)
+    assert bench.core.safety.cause == ''
+    assert bench.core.posture.exploring
+    assert largest_step(held[-1], back + bench.step(100)) <= TICK + 1e-9
+
+
+def test_data_that_is_gone_latches_the_stop_and_ends_exploration():
+    bench = Lied(max_age=0.2, hold_time=0.5)
+    bench.core.explore(True)
+    bench.step(50)
+    bench.blind = {'muscles'}
+    bench.step(80)
+    bench.blind = set()
+    bench.step(200)
+    assert 'muscle_states older' in bench.core.safety.cause
+    assert not bench.core.posture.exploring
+    assert bench.core.reset(bench.now) == ''
+
+
+@pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
+def test_a_pause_of_the_controller_itself_makes_no_data_old(pause):
+    bench = Lied(max_age=0.2, hold_time=0.5)
+    before = bench.step()[-1]
+    bench.now += pause
+    sent = bench.step(100)
+    assert bench.core.safety.cause == ''
+    assert np.abs(values(sent)[0] - before.value).max() <= 10 * TICK + 1e-9  # LONGEST_STEP
+    assert pause > OWN_PAUSE
+
+
+# -- clocks ---------------------------------------------------------------------------------------
+
+
+def run(pace, gap=0.0, at=150, count=250):
+    """Return the commands of messages every 10 ms of their own clock, and the cause of a stop."""
+    bench = Bench(first_duration=1.0, max_age=0.2)
+    bench.target(OTHER)
+    now, time, sent = 100.0, 5.0, []
+    for k in range(count):
+        for _ in range(round(gap / DT) if k == at else 0):  # nothing but the watch steps
+            now, time = now + DT, time + pace * DT
+            sent.append(bench.core.step(now, time))
+        now, time = now + DT / pace, time + DT
+        tension = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
+        bench.core.muscles(Muscles(ROBOT.muscle_lengths(REST, tension), tension, COLD), now)
+        bench.core.estimated(REST, now)
+        sent.append(bench.core.step(now, time))
+    return values(sent), bench.core.safety.cause
+
+
+@pytest.mark.parametrize('pace', [0.3, 3.0])
+def test_commands_follow_the_messages_clock_however_fast_it_goes(pace):
+    expected, _ = run(1.0)
+    sent, cause = run(pace)
+    assert cause == ''
+    np.testing.assert_allclose(sent, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('pace', 'gap', 'late'),
+    [(1.0, 0.15, False), (1.0, 0.3, True), (3.0, 0.15, False), (3.0, 0.3, True)]
+    + [(0.3, 0.4, False), (0.3, 0.9, True)],
+)
+def test_an_age_limit_grows_with_a_slow_clock_and_never_shrinks(pace, gap, late):
+    _, cause = run(pace, gap, at=200, count=201)
+    assert ('older' in cause) is late

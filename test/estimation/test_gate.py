@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A network takes over only if it explains the arm; the attacks are those of `bench/gate.py`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.gate import ATTACKS, ON_MESSAGES
+from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.gate import LIMITS, NOTICED, PROOF, Gate
+from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.learning.calibration import Healthy, calibrate
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.training import Update
+from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+
+
+def body(count=60, seed=0):
+    """Return messages (T, l) of an arm whose lengths are 3 mm off."""
+    rng = np.random.default_rng(seed)
+    theta = ROBOT.random_postures(count, rng)
+    tension = rng.uniform(30.0, 150.0, (count, ROBOT.muscle_count))
+    return tension, ROBOT.muscle_lengths(theta, tension) + 0.003
+
+
+def seeing(gate, start=0.0):
+    """Let a gate see six seconds of a healthy arm; return when they end."""
+    for k, (tension, length) in enumerate(zip(*body(), strict=True)):
+        gate.message(tension, length, start + 0.1 * k)
+    return start + 6.0
+
+
+def calibrated(mae):
+    healthy = Healthy(np.hstack(body(500, 1)).astype(np.float32), 100.0, 50)
+    return replace(mae, anomaly=calibrate(mae, healthy, 50))
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_trained_networks_pass_with_and_without_messages(trained, preset):
+    gate = Gate(ROBOT)
+    gate.check(trained[preset])
+    gate.take(trained[preset], 0.0)
+    seeing(gate)
+    gate.check(trained[preset])
+    for other in trained.values():
+        gate.check(other)
+    gate.check(calibrated(trained[preset]))
+
+
+@pytest.mark.parametrize('attack', ATTACKS)
+@pytest.mark.parametrize('preset', PRESETS)
+def test_an_attack_is_refused_without_any_message_and_the_figures_are_said(trained, preset, attack):
+    with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
+        Gate(ROBOT).check(ATTACKS[attack](trained[preset]))
+    assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
+
+
+@pytest.mark.parametrize('attack', ON_MESSAGES)
+def test_what_the_geometric_model_cannot_tell_is_refused_on_own_messages(trained, attack):
+    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    gate.take(mae, 0.0)
+    bad = ON_MESSAGES[attack](mae)
+    gate.check(bad)
+    seeing(gate)
+    with pytest.raises(GateError, match=r'own messages|muscle cut'):
+        gate.check(bad)
+
+
+def test_a_detector_that_sleeps_or_would_stop_a_healthy_arm_is_refused(trained):
+    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    seeing(gate)
+    gate.check(mae)
+    for times, told in ((100.0, 'with a muscle cut'), (0.01, 'on own messages')):
+        thresholds = {DISTANCE: times * mae.anomaly.thresholds[DISTANCE]}
+        with pytest.raises(GateError, match=told):
+            gate.check(replace(mae, anomaly=replace(mae.anomaly, thresholds=thresholds)))
+
+
+def test_after_an_anomaly_the_last_network_that_had_proved_itself_comes_back(trained):
+    gate, old, new = Gate(ROBOT), trained['default'], trained['paper']
+    gate.take(old, 0.0)
+    gate.take(new, 100.0)
+    assert gate.anomaly(True, 100.0 + 0.6 * PROOF) is old
+    assert gate.mae is old
+    assert gate.anomaly(True, 108.0) is None
+    assert gate.anomaly(False, 120.0) is None
+    gate.take(new, 130.0)
+    assert gate.anomaly(True, 130.0 + 1.1 * PROOF) is None
+    assert gate.mae is new
+
+
+def test_messages_from_just_before_an_anomaly_are_not_healthy_and_those_during_it_neither(trained):
+    gate = Gate(ROBOT)
+    end = seeing(gate)
+    before = gate.message_errors(trained['default'])
+    tension, length = body()
+    for k in range(15):
+        gate.message(tension[k], length[k] + 0.2, end + 0.1 * k)
+    gate.anomaly(True, end + 0.75 * NOTICED)
+    for k in range(30):
+        gate.message(tension[k], length[k] + 0.2, end + 2.0 + 0.1 * k)
+    after = gate.message_errors(trained['default'])
+    for name in before:
+        assert after[name].max() < 2.0 * before[name].max() + 1e-3
+
+
+def test_a_learner_publishes_no_network_that_the_gate_refuses_and_goes_back_on_an_anomaly(trained):
+    learner = Learner(ROBOT, trained['default'], preset='default')
+    good = learner.poll(0.0)
+    with pytest.raises(GateError):
+        learner.replace(ATTACKS['weights × 1.5'](trained['default']))
+    update = Update(ATTACKS['weights × 1.5'](trained['default']), 0.0, 0.0, np.zeros(0))
+    learner._take(update)
+    assert learner.poll(10.0) is None
+    assert learner.refused == 1
+    assert 'limit' in learner.report().values['last refused']
+    assert learner.checkpoint == good
+    learner._take(Update(trained['paper'], 0.0, 0.0, np.zeros(0)))
+    assert learner.poll(20.0) is not None
+    learner.anomaly(True)
+    assert learner.poll(30.0) is not None
+    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Strangers on the graph: networks, second sources, values no arm has, and odd clocks."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from controlled_arm import RATE_LIMIT, ControlledArm
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
+from std_srvs.srv import Trigger
+
+from bench.gate import ATTACKS
+from musculoskeletal_ae.control.controller import LONGEST_STEP
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.messages import array_message, bytes_message, joint_message
+from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.sim import Sim
+
+HERE = np.array([-0.5, -1.2])
+REFUSED = 'mae_checkpoint: does not explain the arm'
+
+
+@pytest.fixture
+def arm(graph, arm26, trained_file):
+    arm = ControlledArm(graph, arm26, trained_file)
+    arm.target(HERE)
+    graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+    return arm
+
+
+@pytest.mark.parametrize('attack', ['weights × 1.5', 'weights × -1', 'two lengths swapped'])
+def test_a_stranger_s_network_is_refused_by_every_node_and_the_arm_goes_on(
+    arm, trained, trained_file, attack
+):
+    sim = arm.graph.host(Sim, robot='arm26', checkpoint=trained_file)
+    nodes = [arm.controller, arm.estimator, sim]
+    before = [node.gate.mae for node in nodes]
+    stranger = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    stranger.publish(bytes_message(checkpoint.to_bytes(ATTACKS[attack](trained['default']))))
+    arm.graph.wait(lambda: all(node.rejected[REFUSED] for node in nodes), 'the refusals')
+    assert [node.gate.mae for node in nodes] == before
+    for node in nodes:
+        assert 'unexplained on the geometric model, limit' in node._reception.last_rejected
+    arm.goes_to(HERE)
+    assert arm.controller.core.safety.cause == ''
+    assert np.abs(np.diff(arm.sent(), axis=0)).max() <= RATE_LIMIT * LONGEST_STEP + 1e-9
+
+
+def test_a_stranger_s_file_is_refused_with_the_figures(arm, trained, trained_file, tmp_path):
+    learner = arm.graph.host(Learner, robot='arm26', checkpoint=trained_file, state_directory='')
+    bad = tmp_path / 'bad.safetensors'
+    checkpoint.save(ATTACKS['noise of 100 %'](trained['default']), bad)
+    for node in ('estimator', 'controller', 'learner'):
+        done, reason = arm.graph.set_parameter(node, 'checkpoint', str(bad))
+        assert not done
+        assert 'limit' in reason
+    learner.core.close()
+
+
+def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, trained):
+    core = arm.controller.core
+    first = arm.controller.gate.mae
+    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    publisher.publish(bytes_message(checkpoint.to_bytes(trained['paper'])))
+    arm.graph.wait(lambda: arm.controller.gate.mae is not first, 'another network')
+    detected = arm.graph.publisher(Bool, 'anomaly_detected', LATCHED)
+    detected.publish(Bool(data=True))
+    arm.says('anomaly_detected')
+    assert arm.controller.gate.mae is first
+    assert core._mae is first
+
+
+def test_a_second_source_of_muscle_states_stops_the_arm_by_name_until_it_is_gone(arm):
+    stranger = arm.graph.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
+    space = arm.graph.namespace
+    arm.says(f'stopped: muscle_states come from {space}/hardware_emulator and {space}/test')
+    assert not arm.graph.call(Trigger, 'controller/reset').success
+    arm.graph.node.destroy_publisher(stranger)
+    arm.graph.wait(lambda: arm.graph.call(Trigger, 'controller/reset').success, 'the reset')
+    arm.goes_to(HERE)
+
+
+def test_lengths_no_muscle_can_have_stop_the_arm_by_name_and_without_a_jump(arm):
+    arm.goes_to(HERE)
+    done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.1])
+    assert done
+    arm.says('stopped: muscle_states: length jumped')
+    assert arm.estimator.rejected['muscle_states: length jumped'] > 0
+    assert np.abs(np.diff(arm.sent(), axis=0)).max() <= RATE_LIMIT * LONGEST_STEP + 1e-9
+    assert np.linalg.norm(arm.posture() - HERE) < 0.4
+
+
+@pytest.mark.parametrize('pace', [0.3, 3.0])
+def test_under_use_sim_time_the_ramp_follows_the_clock(graph, arm26, trained_file, pace):
+    sent = graph.listen(Float64MultiArray, 'muscle_length_command', 1000)
+    node = graph.host(
+        Controller,
+        robot='arm26',
+        checkpoint=trained_file,
+        first_duration=2.0,
+        feedback_gain=0.0,
+        max_age=1.0,
+        use_sim_time=True,
+    )
+    clock = graph.node.create_publisher(Clock, '/clock', 10)
+    muscles = graph.publisher(Float64MultiArray, 'muscle_states')
+    joints = graph.publisher(JointState, 'estimated_joint_states')
+    targets = graph.publisher(JointState, 'target_joint_states')
+    bias = np.full(arm26.muscle_count, arm26.tension.bias)
+    rows = np.stack([arm26.muscle_lengths(HERE, bias), bias, np.full_like(bias, 25.0)])
+    started, done_at = time.monotonic(), None
+    while done_at is None:
+        now = 100.0 + pace * (time.monotonic() - started)
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = int(now), int(now % 1.0 * 1e9)
+        clock.publish(message)
+        muscles.publish(array_message(rows, 'quantity', 'muscle'))
+        joints.publish(joint_message(arm26.joints, HERE, message.clock))
+        if node.core.posture.theta is None and now > 101.0:
+            targets.publish(JointState(name=arm26.joints, position=[-0.2, -0.8]))
+            begun = now
+        ramp = node.core.posture._ramp
+        if ramp is not None and ramp.done:
+            done_at = now
+        graph.spin(0.01)
+        assert time.monotonic() - started < 60.0
+    assert node.core.safety.cause == ''
+    # By the steady clock it would be over after 0.6 s of this one, or last for 6 s.
+    assert done_at - begun >= 0.9 * ramp.duration
+    assert len(sent) > 0
+    assert (node.core.pace.value < 1.0) is (pace < 1.0)
