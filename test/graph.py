@@ -24,7 +24,7 @@ from rclpy.qos import QoSProfile
 
 from musculoskeletal_ae.report import Report
 
-DEADLINE = 60.0  # [s] a wait may take on a loaded machine before the test fails
+DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 
