@@ -64,7 +64,9 @@ class GentleMotion:
         for goal in robot.random_postures(TRIES, self._rng, -INSIDE):
             near = theta + np.clip(goal - theta, -REACH, REACH)
             torque = robot.kinematics.holding_torque(near)
-            exertion = least_tension(mae.muscle_jacobian(near, tension), torque, robot.tension.bias, limit)
+            exertion = least_tension(
+                mae.muscle_jacobian(near, tension), torque, robot.tension.bias, limit
+            )
             missing = float(np.abs(exertion.missing_torque).max())
             if missing < least:
                 best, least, pull = near, missing, exertion.tension

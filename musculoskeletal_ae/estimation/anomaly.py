@@ -20,16 +20,15 @@ longer than it can be; meanwhile the rule waits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Name of the distance threshold among the thresholds of the checkpoint.
@@ -38,25 +37,9 @@ DISTANCE = 'distance'
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_SHARE = 0.2  # of the demanded tension; less counts as no tension at all
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-#: the threshold grows by this share for each FAR of distance beyond NEAR, up to WIDEST times it;
-#: distances are shares of the joint ranges (`python -m bench unfamiliar` prints what healthy arms need)
+#: the threshold grows by SLOPE of itself for each FAR of distance beyond NEAR, up to WIDEST times;
+#: distances are shares of the joint ranges (`python -m bench unfamiliar`: what healthy arms need)
 NEAR, FAR, SLOPE, WIDEST = 0.25, 0.1, 0.5, 3.0
-
-
-def _set(default: float, meaning: str, unit: str, *within: float) -> float:
-    parameter = Parameter(default, meaning, unit, (within[0], within[1]), settable=True)
-    field: float = parameter.field()
-    return field
-
-
-@dataclass(frozen=True)
-class Slack:
-    """What a module does that takes up slack wire, so that no tension is no cut muscle yet."""
-
-    slack_length: float = _set(0.06, 'longest slack that a module may wind in', 'm', 0.0, 1.0)
-    slack_speed: float = _set(
-        0.005, 'a slower module stands: it takes up no slack', 'm/s', 0.0001, 1.0
-    )
 
 
 class Verdict(NamedTuple):
@@ -81,7 +64,7 @@ class AnomalyDetector:
         self.slack = Slack()
         self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
-        #: [s] without tension and without winding in; l [m] when tension went, and when it wound last
+        #: [s] without tension, without winding in; l [m] when tension went, when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
         self._beyond = 0
         self.commanded()
@@ -139,9 +122,7 @@ class AnomalyDetector:
         nearest = float(np.sqrt(np.square(share).sum(axis=1).min()))
         return max(0.0, (nearest - NEAR) / FAR)
 
-    def _beyond_threshold(
-        self, anomaly: float, distance: float, theta: Array, slack: Bools
-    ) -> str:
+    def _beyond_threshold(self, anomaly: float, distance: float, theta: Array, slack: Bools) -> str:
         limit, value, what, where = self.threshold, anomaly, 'A', ''
         if limit <= 0.0:
             if self._statistics is None or not self._statistics.calibrated:

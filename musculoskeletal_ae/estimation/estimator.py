@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -57,8 +57,7 @@ class Estimator:
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
-        none = np.zeros(robot.muscle_count)
-        self.zeros = Zeros(none, none)  # of the length sensors, as all nodes are told
+        self.zeros = no_offset(robot.muscle_count)  # of the length sensors, as all nodes are told
         self._zeroing: Zeroing | None = None
         self._joints: tuple[float, Array | None] = -math.inf, None
         self._time = math.inf  # of the last message; none yet
@@ -80,6 +79,15 @@ class Estimator:
         """Take measured θ [rad] (D,): only zeroing uses it, where there is any."""
         self._joints = now, theta
 
+    def check_posture(self, posture: tuple[float, ...]) -> None:
+        """Raise a MusculoskeletalError unless an arm can stand in θ [rad] (D,); () is legal."""
+        limits = [*zip(self._robot.lower, self._robot.upper, strict=True)]
+        inside = len(posture) == len(limits)
+        inside = inside and all(low <= t <= high for t, (low, high) in zip(posture, limits))
+        if posture and not inside:
+            legal = ', '.join(f'{low:.2f} to {high:.2f}' for low, high in limits)
+            raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal} [rad]')
+
     def zero(self, posture: tuple[float, ...] = ()) -> None:
         """Begin to find the zeros of the length sensors; the arm stands in `posture` [rad] (D,).
 
@@ -90,10 +98,8 @@ class Estimator:
         """
         if self.mae is None:
             raise MusculoskeletalError('no checkpoint, and zeros are found with a network')
+        self.check_posture(posture)
         robot = self._robot
-        if posture and not _within(robot, posture):
-            legal = ', '.join(f'{low:.2f} to {high:.2f}' for low, high in zip(robot.lower, robot.upper))
-            raise MusculoskeletalError(f'zero_posture {list(posture)}; legal: none, or {legal} [rad]')
         self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
         self.zeros = Zeros(np.zeros(robot.muscle_count), np.full(robot.muscle_count, UNKNOWN))
         self.detector.judges, self._verdict = False, None
@@ -110,15 +116,13 @@ class Estimator:
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
-        offset = self.zeros.offset
+        guess: Zeros | None = self.zeros
         if self._zeroing is not None:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
-            if guess is None:
-                return None
-            offset = guess.offset
-        length = length - offset
-        state = self.mae.estimate(tension, length)
-        self._theta = state.theta
+        if guess is None:
+            return None
+        state = self.mae.estimate(tension, length - guess.offset)
+        self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
         verdict = self._verdict = self.detector.step(state, tension, length, dt)
         detected = bool(verdict.cause) and not self.cause
         if detected:
@@ -132,6 +136,8 @@ class Estimator:
         came, theta = self._joints
         zeroing.step(tension, length, dt, theta if now - came < JOINTS_AGE else None)
         guess = zeroing.zeros
+        if zeroing.stands and not zeroing.done:
+            return None  # nobody shall move
         # A guess is told anew only when it is another one: whoever follows it goes on from there.
         if guess is not None and (
             guess.known
@@ -194,8 +200,3 @@ class Estimator:
             return Report('warn', f'finding the length zeros: {self._zeroing.progress}', values)
         calibrated = '' if self.detector.calibrated else ', uncalibrated'
         return Report('ok', f'estimating{calibrated}', values)
-
-
-def _within(robot: Robot, posture: tuple[float, ...]) -> bool:
-    inside = len(posture) == robot.joint_count
-    return inside and bool(((robot.lower <= posture) & (robot.upper >= posture)).all())

@@ -40,9 +40,16 @@ NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already
 
 #: largest share left unexplained of the fixed postures
 LIMITS = {
-    **{'θ by ①': 0.5, 'T by ①': 1.25, 'l by ①': 2.1},
-    **{'θ by ②': 2.0, 'T by ②': 1.25, 'l by ②': 1.3},
-    **{'θ by ③': 0.8, 'T by ③': 13.0, 'l by ③': 0.7, 'G by ①': 1.4},
+    'θ by ①': 0.5,
+    'T by ①': 1.25,
+    'l by ①': 2.1,
+    'θ by ②': 2.0,
+    'T by ②': 1.25,
+    'l by ②': 1.3,
+    'θ by ③': 0.8,
+    'T by ③': 13.0,
+    'l by ③': 0.7,
+    'G by ①': 1.4,
 }
 WORSE = 2.0
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
@@ -77,6 +84,10 @@ class Gate:
         self._messages.append((now, tension, length))
         while now - self._messages[0][0] > SPAN:
             self._messages.popleft()
+
+    def forget(self) -> None:
+        """Forget the messages, as when lengths are measured from other zeros."""
+        self._messages.clear()
 
     def check(self, mae: Mae) -> None:
         """Try a network.

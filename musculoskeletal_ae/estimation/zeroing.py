@@ -30,6 +30,7 @@ FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small besi
 #: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
 ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 50.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
+SETTLED = 20.0  # [s] of motion after which the guess is only made better
 MOST = 240  # moments
 
 LENGTH_NOISE, TORQUE_NOISE = 0.001, 0.6  # [m], [N·m] of network and friction together
@@ -59,6 +60,11 @@ class Zeros(NamedTuple):
         return bool(self.deviation.max() < KNOWN)
 
 
+def no_offset(muscles: int) -> Zeros:
+    """Return the zeros of sensors that know them."""
+    return Zeros(np.zeros(muscles), np.zeros(muscles))
+
+
 class Fit(NamedTuple):
     """Zeros with the postures [rad] (K, D) of K moments."""
 
@@ -79,19 +85,23 @@ class Parts(NamedTuple):
 class Zeroing:
     """Collects moments and finds the zeros a little at every message. Lengths here are readings."""
 
-    def __init__(
-        self, robot: Robot, mae: Mae, posture: Array | None = None, seed: int = 0
-    ) -> None:
+    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None, seed: int = 0) -> None:
         """Find zeros with a network; `posture` [rad] (D,) if the arm stands in a known one."""
         self._robot, self._mae, self._posture = robot, mae, posture
         self._rng = np.random.default_rng([seed, 0x2E])
         self._window: list[tuple[Array, Array, Array]] = []
         self._moments: list[tuple[Array, Array, Array]] = []  # T, l_read, θ or NaN
+        self._before: Array = np.zeros(robot.muscle_count)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
         self._work: Generator[None, None, Fit] | None = None
         self._fit: Fit | None = None  # the best so far
         self.zeros: Zeros | None = None  # the guess so far, known or not; None before the first
         self.trouble = ''
+
+    @property
+    def stands(self) -> bool:
+        """Whether the arm is said to stand in a posture."""
+        return self._posture is not None
 
     @property
     def enough(self) -> float:
@@ -144,12 +154,17 @@ class Zeroing:
 
     def _take(self, tension: Array, length: Array, theta: Array) -> None:
         if self._moments:
-            gone = np.abs(length - self._moments[-1][1]).max()
-            if self._posture is None and not MOVED < gone < FASTEST * WINDOW:
-                if gone > MOVED:  # too fast to count, but the next one is compared with it
-                    self._moments[-1] = self._moments[-1][0], length, self._moments[-1][2]
+            before = self._moments[0][1] if self.stands else self._before
+            gone = np.abs(length - before).max()
+            if self.stands and gone > MOVED:  # it does not
+                self._moments, self.moving = [], 0.0
+            elif not self.stands and gone < MOVED:
+                return
+            self._before = length
+            if not self.stands and gone > FASTEST * WINDOW:
                 return
             self.moving += WINDOW
+        self._before = length
         if len(self._moments) >= MOST:
             del self._moments[1]
         self._moments.append((tension, length, theta))
@@ -174,8 +189,9 @@ class Zeroing:
 
     def _search(self, tension: Array, length: Array) -> Generator[None, None, Fit]:
         """Find zeros and postures of T [N] and readings [m] (K, M); yields between its parts."""
-        fits = [] if self._fit is None else [self._fit.offset]
-        guesses = [*fits, *(yield from self._guesses(tension, length))]
+        guesses = [] if self._fit is None else [self._fit.offset]
+        if self.moving < SETTLED:
+            guesses += [*(yield from self._guesses(tension, length))]
         rows = np.unique(np.linspace(0, len(tension) - 1, TOLD_BY).astype(int))
         best: Fit | None = None
         for offset in guesses:
@@ -184,9 +200,7 @@ class Zeroing:
             if best is None or fit.cost < best.cost:
                 best = fit
         assert best is not None
-        return (
-            yield from self._refine(self._start(best.offset, tension, length), tension, length)
-        )
+        return (yield from self._refine(self._start(best.offset, tension, length), tension, length))
 
     def _start(self, offset: Array, tension: Array, length: Array) -> Fit:
         theta = self._mae.estimate(tension, length - offset).theta
@@ -196,7 +210,9 @@ class Zeroing:
         """Return the zeros (PURSUED, M) of the likeliest random first postures."""
         robot, mae = self._robot, self._mae
         first = robot.random_postures(POSTURES, self._rng)
-        offset = length[0] - mae.lengths(first, np.broadcast_to(tension[0], (POSTURES, len(length[0]))))
+        offset = length[0] - mae.lengths(
+            first, np.broadcast_to(tension[0], (POSTURES, len(length[0])))
+        )
         offset = offset[np.argsort(np.abs(offset).max(axis=1))]
         offset = offset[: max(PURSUED, int((np.abs(offset).max(axis=1) < FARTHEST).sum()))]
         rows = np.unique(np.linspace(0, len(tension) - 1, TOLD_BY).astype(int))
@@ -240,7 +256,7 @@ class Zeroing:
         self, fit: Fit, tension: Array, length: Array, rounds: int = ROUNDS
     ) -> Generator[None, None, Fit]:
         """Return the best fit near one, after so many Gauss–Newton steps at most."""
-        joints, eye = self._robot.joint_count, np.eye(self._robot.joint_count)
+        eye = np.eye(self._robot.joint_count)
         muscles, damping = np.eye(length.shape[1]), 1e-3
         parts = self._parts(fit, tension, length)
         fit = fit._replace(cost=self._cost(parts, fit.offset))
@@ -266,9 +282,7 @@ class Zeroing:
                 damped = normal * (1.0 + damping * eye) + 1e-6 * eye
                 inverse = np.linalg.inv(damped)
                 through = cross @ inverse
-                reduced = own * (1.0 + damping * muscles) - np.einsum(
-                    'kmi,kni->mn', through, cross
-                )
+                reduced = own * (1.0 + damping * muscles) - np.einsum('kmi,kni->mn', through, cross)
                 shift = -np.linalg.solve(reduced, down - np.einsum('kmi,ki->m', through, gradient))
                 turn = gradient + np.einsum('kmi,m->ki', cross, shift)
                 turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)

@@ -48,6 +48,7 @@ class Controller(Shell):
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
+        self.follow_zeros(self.core.zeros)
         self.follow_muscle_states(self._muscles)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
@@ -67,7 +68,8 @@ class Controller(Shell):
     def _muscles(self, states: Array) -> None:
         muscles, now = Muscles(*states), time.monotonic()
         self.core.muscles(muscles, now)
-        self.gate.message(muscles.tension, muscles.length, now)
+        if self.zeros.known:
+            self.gate.message(muscles.tension, muscles.length, now)
 
     def _anomaly(self, message: Bool) -> None:
         self.core.anomaly(message.data)
@@ -119,7 +121,8 @@ class Controller(Shell):
     def _step(self) -> None:
         command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
-            self.publishers_of[command.kind].publish(array_message(command.value, 'muscle'))
+            value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
+            self.publishers_of[command.kind].publish(array_message(value, 'muscle'))
 
     def clock_jumped_back(self) -> None:
         """Count time from here; latches stay."""

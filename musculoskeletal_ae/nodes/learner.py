@@ -53,6 +53,7 @@ class Learner(Shell):
         self.follow_parameter('relearn_muscles', self._relearn)
         self.running = True
         self.follow_posture(JOINT_TOPICS[value('joint_source')], self._joints)
+        self.follow_zeros(lambda known, _: self.core.zeros(known))
         self.follow_muscle_states(self._muscles)
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         serve(self, SetBool, 'learner/enable', self._enable)

@@ -25,6 +25,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.zeroing import Zeros, no_offset
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -59,6 +60,7 @@ class Shell(Node):
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected  # messages, by topic and reason
+        self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
@@ -183,8 +185,28 @@ class Shell(Node):
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
     def follow_muscle_states(self, follow: Callable[[Array], object]) -> None:
-        """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M)."""
-        self.follow_muscles('muscle_states', follow, len(QUANTITIES), SENSOR)
+        """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
+
+        Zeros are taken off l, here and nowhere else.
+        """
+
+        def from_zero(states: Array) -> object:
+            return follow(np.stack([states[0] - self.zeros.offset, *states[1:]]))
+
+        self.follow_muscles('muscle_states', from_zero, len(QUANTITIES), SENSOR)
+
+    def follow_zeros(self, changed: Callable[[bool, Array], object] = lambda *_: None) -> None:
+        """Take zeros that the estimator found; `changed` is told whether they are known now.
+
+        And how much less l [m] (M,) is than with those before.
+        """
+
+        def take(rows: Array) -> None:
+            less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
+            self.gate.forget()
+            changed(self.zeros.known, less)
+
+        self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
     def follow_posture(self, topic: str, follow: Callable[[Array], object]) -> None:
         """Give `follow` the θ [rad] (D,) that comes on a topic of joint states."""
