@@ -9,7 +9,8 @@ in every second one, grasping 3.6 kg every other minute: false alarms are alarms
 Then muscles are cut in turn, each for a second, while the arm is in the upper 40 %: a cut counts
 if the muscle pulled 10 N more than T_bias and the posture was unfamiliar to the detector; noticed
 is an alarm that begins within half a second, named one with that suspect. Every rate is given with
-what it would be if nothing widened, and d over its threshold beside the distance.
+what it would be if nothing widened, and d over its threshold beside the distance. At last the same
+of the true body at rest anywhere, and at all joint limits at once, where motion hardly leads.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from bench.learned_arm import initial, learned_arm, postures
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import DURATIONS, Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.mechanics import SPEED_LIMIT
 from musculoskeletal_ae.estimation import anomaly
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, FAR, NEAR, AnomalyDetector
 from musculoskeletal_ae.experiments.detection import (
@@ -45,6 +48,8 @@ HEALTHY = 3600.0  # [s] over all individuals
 HEALTHY_STREAM, CUT_STREAM = 9600, 9700
 CUT, SLOT = 1.0, sum(DURATIONS)  # [s] that a muscle is cut, and until the next one is
 WITHIN = 0.5  # [s]
+REST_COUNTS = 'postures', 'alarms', 'narrow_alarms', 'noticed', 'named'
+RESTS, MOST_TENSE = 600, 150.0  # postures at rest, [N] their highest tension
 
 
 def near(robot: Robot, seed: int) -> Callable[[Array], bool]:
@@ -95,6 +100,48 @@ def both(robot: Robot, mae: Mae, recording: Any) -> dict[str, Watched]:
         seen[name] = watch(robot, mae, recording)
     anomaly.WIDEST = widest
     return seen
+
+
+def at_rest(robot: Robot, seed: int, mae: Mae, count: int) -> dict[str, Any]:
+    """Return rates in postures at rest, half of them at joint limits, of the true body.
+
+    Each healthy, and with one muscle cut, whose module winds in from where it was.
+    """
+    rng, individual = np.random.default_rng([seed, 0xC9]), Individual(robot, seed)
+    shape, detector = (count, robot.muscle_count), AnomalyDetector(robot)
+    detector.use(mae)
+    theta = robot.random_postures(count, rng)
+    corner = np.where(rng.uniform(size=theta.shape) < 0.5, robot.lower, robot.upper)
+    theta[::2] = corner[::2]
+    tension = rng.uniform(robot.tension.bias, MOST_TENSE, shape)
+    end = tension * np.exp(-individual.cable_friction * rng.choice([-1.0, 1.0], shape))
+    length = individual.muscle_lengths(theta, end) + individual.length_bias
+    counts = dict.fromkeys(REST_COUNTS, 0)
+    slowest, widest = 0.0, anomaly.WIDEST
+    for n in range(count):
+        if detector.unfamiliar(mae.estimate(tension[n], length[n]).theta) <= 0.0:
+            continue
+        counts['postures'] += 1
+        for name, anomaly.WIDEST in (('alarms', widest), ('narrow_alarms', 1.0)):
+            detector.reset()
+            state = mae.estimate(tension[n], length[n])
+            for _ in range(anomaly.IN_A_ROW):
+                verdict = detector.step(state, tension[n], length[n], SAMPLE_TIME)
+            counts[name] += bool(verdict.cause)
+        anomaly.WIDEST = widest
+        muscle = int(rng.integers(robot.muscle_count))
+        pull, wound = tension[n].copy(), length[n].copy()
+        pull[muscle] = 0.0
+        detector.reset()
+        for tick in range(round(WITHIN / SAMPLE_TIME)):
+            wound[muscle] -= SPEED_LIMIT * SAMPLE_TIME
+            verdict = detector.step(mae.estimate(pull, wound), pull, wound, SAMPLE_TIME)
+            if verdict.cause:
+                counts['noticed'] += 1
+                counts['named'] += verdict.suspect == muscle
+                slowest = max(slowest, SAMPLE_TIME * (tick + 1))
+                break
+    return {**counts, 'slowest_s': slowest}
 
 
 def measure(
@@ -150,7 +197,7 @@ def measure(
             'counted': counted, 'noticed': noticed, 'named': named,
             'slowest_s': max(delays, default=0.0),
         }  # fmt: skip
-    return result
+    return {**result, 'at rest': at_rest(robot, seed, mae, RESTS)}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -187,4 +234,12 @@ def main(argv: list[str] | None = None) -> int:
         )
         if name == 'widened':
             passed = not false and noticed >= 0.95 * counted and named >= 0.9 * counted
+    rest = {key: sum(row['at rest'][key] for row in rows.values()) for key in REST_COUNTS}
+    print(
+        f'at rest in {rest["postures"]} unfamiliar postures: {rest["alarms"]} false alarms '
+        f'(not widened: {rest["narrow_alarms"]}), {rest["noticed"]} cuts noticed within '
+        f'{WITHIN:g} s, {rest["named"]} named'
+    )
+    passed &= not rest['alarms'] and rest['noticed'] >= 0.95 * rest['postures']
+    passed &= rest['named'] >= 0.9 * rest['postures']
     return 0 if passed else 1

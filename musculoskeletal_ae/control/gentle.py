@@ -5,8 +5,9 @@
 
 uses lengths only relative to those of the moment, so that zeros cancel; θ_est may be off, and G
 with it, which muscle stiffness control takes as some more or less tension, below the limit. Goals
-lie all over the joint range, but each is approached by a short step that the arm can hold; so the
-muscles see many postures from different sides, as finding the zeros needs.
+lie all over the joint range, but each is approached by a short step and held by random tensions:
+the muscles see many postures and tensions, from different sides, as finding the zeros needs, since
+how G turns tension into torque tells the posture.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.control.posture import Ramp
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.robot.tension import TensionProgramme
 
 SPEED = 0.05  # [m/s] of a command, at most
 DURATION, REST = 1.5, 0.25  # [s] of a step and after it
-REACH = 0.5  # [rad] of a step, each joint
+REACH = 0.7  # [rad] of a step, each joint
 INSIDE = 0.1  # of the joint range that goals keep from its ends
-TRIES, MISSING = 20, 0.5  # goals tried, and torque [N·m] that one may lack
+TRIES = 20  # goals, of which the first is taken that can be held
 SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
 
 
@@ -57,19 +59,20 @@ class GentleMotion:
         return self._ramp.step(dt)
 
     def _goal(self, mae: Mae, tension: Array, length: Array, theta: Array) -> Array:
-        robot, limit = self._robot, gentle_limit(self._robot)
-        now = length - mae.lengths(theta, tension)
-        best, least = theta, np.inf
-        pull = tension
+        robot, limits = self._robot, (self._robot.tension.bias, gentle_limit(self._robot))
+        best, pull, least = theta, tension, np.inf
         for goal in robot.random_postures(TRIES, self._rng, -INSIDE):
             near = theta + np.clip(goal - theta, -REACH, REACH)
-            torque = robot.kinematics.holding_torque(near)
-            exertion = least_tension(
-                mae.muscle_jacobian(near, tension), torque, robot.tension.bias, limit
+            programme = TensionProgramme(
+                mae.muscle_jacobian(near, tension), robot.kinematics.holding_torque(near), *limits
             )
-            missing = float(np.abs(exertion.missing_torque).max())
-            if missing < least:
-                best, least, pull = near, missing, exertion.tension
-            if missing < MISSING:
+            try:
+                pull = programme.nearest(self._rng.uniform(*limits, robot.muscle_count))
+                best = near
                 break
+            except InfeasibleError:
+                exertion = programme.compromise()
+                if (missing := float(np.abs(exertion.missing_torque).max())) < least:
+                    best, pull, least = near, exertion.tension, missing
+        now = length - mae.lengths(theta, tension)
         return now + mae.lengths(best, pull) + msc_compensation(robot, pull)

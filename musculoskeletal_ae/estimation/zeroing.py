@@ -16,11 +16,12 @@ reached from different sides; only messages at which the arm has moved on count.
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.learning.rest import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -28,12 +29,16 @@ WINDOW = 0.25  # [s] that one moment averages
 MOVED = 0.002  # [m] of some muscle since the last moment that counts
 FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small beside the weight
 #: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
-ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 50.0, 1.0
+ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 46.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
 SETTLED = 20.0  # [s] of motion after which the guess is only made better
 MOST = 240  # moments
 
-LENGTH_NOISE, TORQUE_NOISE = 0.001, 0.6  # [m], [N·m] of network and friction together
+LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
+#: μ of a wire, with its mean; Coulomb torque of a joint over the largest that the weight needs
+FRICTION_MEAN, FRICTION, JOINT_FRICTION = 0.05, 0.05, 0.03
+TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
+STICKING = 0.003  # [rad] that turn a joint's friction round
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
 #: postures tried as the first one, moments that tell how good they are, those that are pursued
@@ -65,21 +70,34 @@ def no_offset(muscles: int) -> Zeros:
     return Zeros(np.zeros(muscles), np.zeros(muscles))
 
 
+class Moments(NamedTuple):
+    """Means of K short windows."""
+
+    tension: Array  # T [N], (K, M)
+    length: Array  # l as it was read [m], (K, M)
+    direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (K, M)
+    theta: Array  # θ [rad] or NaN, (K, D)
+
+    def __getitem__(self, rows: Any) -> Any:
+        return Moments(*(part[rows] for part in tuple(self)))
+
+
 class Fit(NamedTuple):
-    """Zeros with the postures [rad] (K, D) of K moments."""
+    """What explains K moments."""
 
     cost: float
-    offset: Array
-    theta: Array
+    #: o [m], μ of the wires, zeros of the tensions [N], Coulomb torques [N·m], (3M + D,)
+    constants: Array
+    theta: Array  # postures [rad], (K, D)
 
 
-class Parts(NamedTuple):
-    """Residuals of K moments, each in its noise; and G."""
+class Linear(NamedTuple):
+    """Residuals of K moments, lengths and then torques, each in its noise; and their slopes."""
 
-    length: Array  # (K, M)
-    torque: Array  # (K, D)
-    outside: Array  # (K, D)
-    jacobian: Array  # [m/rad] (K, M, D)
+    value: Array  # (K, M + D)
+    outside: Array  # beyond the joint limits, (K, D)
+    by_theta: Array  # (K, M + D, D)
+    by_constants: Array  # (K, M + D, 3M + D)
 
 
 class Zeroing:
@@ -89,8 +107,14 @@ class Zeroing:
         """Find zeros with a network; `posture` [rad] (D,) if the arm stands in a known one."""
         self._robot, self._mae, self._posture = robot, mae, posture
         self._rng = np.random.default_rng([seed, 0x2E])
-        self._window: list[tuple[Array, Array, Array]] = []
-        self._moments: list[tuple[Array, Array, Array]] = []  # T, l_read, θ or NaN
+        self._direction = FrictionDirection()
+        self._window: list[tuple[Array, ...]] = []  # rows of Moments
+        self._moments: list[tuple[Array, ...]] = []
+        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng)))
+        counts = *(3 * [robot.muscle_count]), robot.joint_count
+        self._mean = np.repeat([0.0, FRICTION_MEAN, 0.0, 0.0], counts)
+        spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight.max()
+        self._spread = np.repeat(spread, counts)
         self._before: Array = np.zeros(robot.muscle_count)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
         self._work: Generator[None, None, Fit] | None = None
@@ -108,11 +132,8 @@ class Zeroing:
         """Seconds of gentle motion that it takes, or of standing still where the arm is said to."""
         if self._posture is not None:
             return STANDING
-        return ENOUGH_SEEN if self._seen else ENOUGH
-
-    @property
-    def _seen(self) -> bool:
-        return bool(self._moments) and not np.isnan(self._moments[-1][2]).any()
+        sees = bool(self._moments) and not np.isnan(self._moments[-1][-1]).any()
+        return ENOUGH_SEEN if sees else ENOUGH
 
     @property
     def progress(self) -> str:
@@ -132,7 +153,8 @@ class Zeroing:
             return
         known = self._posture if self._posture is not None else theta
         unknown = np.full(self._robot.joint_count, np.nan)
-        self._window.append((tension, length, unknown if known is None else known))
+        direction = self._direction.step(length, dt)
+        self._window.append((tension, length, direction, unknown if known is None else known))
         self._span += dt
         self._since += dt
         if self._span >= WINDOW:
@@ -146,13 +168,20 @@ class Zeroing:
                 self._judge(ended.value)
         elif self._since >= (AGAIN if self._fit else FIRST) and self._moments:
             self._since = 0.0
-            tensions, lengths, angles = map(np.array, zip(*self._moments))
-            if np.isnan(angles).any():
-                self._work = self._search(tensions, lengths)
-            else:
-                self._judge(_seen(self._mae, tensions, lengths, angles))
+            seen = self._seen()
+            if np.isnan(seen.theta).any():
+                self._work = self._search(seen)
+            else:  # with the angles known, zeros are what is left
+                left = seen.length - self._mae.lengths(seen.theta, seen.tension)
+                offset = left.mean(axis=0)
+                constants = np.concatenate([offset, self._mean[len(offset) :]])
+                self._judge(Fit(0.0, constants, seen.theta))
 
-    def _take(self, tension: Array, length: Array, theta: Array) -> None:
+    def _seen(self, count: int | None = None) -> Moments:
+        return Moments(*map(np.array, zip(*self._moments[:count])))
+
+    def _take(self, *moment: Array) -> None:
+        length = moment[1]
         if self._moments:
             before = self._moments[0][1] if self.stands else self._before
             gone = np.abs(length - before).max()
@@ -166,13 +195,13 @@ class Zeroing:
             self.moving += WINDOW
         self._before = length
         if len(self._moments) >= MOST:
-            del self._moments[1]
-        self._moments.append((tension, length, theta))
+            del self._moments[0]
+        self._moments.append(moment)
 
     def _judge(self, fit: Fit) -> None:
         """Take a fit as the guess, or as known when it rests on enough."""
-        tension, length, _ = map(np.array, zip(*self._moments[: len(fit.theta)]))
-        left = np.abs(length - fit.offset - self._mae.lengths(fit.theta, tension))
+        seen, offset = self._seen(len(fit.theta)), fit.constants[: self._robot.muscle_count]
+        left = np.abs(seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
         bad = float(np.median(left, axis=0).max())
         self._fit = fit
         enough = self.moving >= self.enough
@@ -180,126 +209,148 @@ class Zeroing:
         if enough and bad > LARGEST_LEFT:
             name = self._robot.muscles[int(np.median(left, axis=0).argmax())]
             self.trouble = f'{1e3 * bad:.1f} mm of {name} are left unexplained'
-        deviation = np.full(len(fit.offset), UNKNOWN)
+        deviation = np.full(len(offset), UNKNOWN)
         if enough and not self.trouble:
             deviation = 1.48 * np.median(left, axis=0) / np.sqrt(max(1.0, len(left) / 10.0))
-        self.zeros = Zeros(fit.offset, deviation)
+        self.zeros = Zeros(offset, deviation)
 
     # -- without joint angles -------------------------------------------------------------------
 
-    def _search(self, tension: Array, length: Array) -> Generator[None, None, Fit]:
-        """Find zeros and postures of T [N] and readings [m] (K, M); yields between its parts."""
-        guesses = [] if self._fit is None else [self._fit.offset]
+    def _search(self, seen: Moments) -> Generator[None, None, Fit]:
+        """Find what explains the moments; yields between its parts."""
+        guesses = [] if self._fit is None else [self._fit.constants]
         if self.moving < SETTLED:
-            guesses += [*(yield from self._guesses(tension, length))]
-        rows = np.unique(np.linspace(0, len(tension) - 1, TOLD_BY).astype(int))
-        best: Fit | None = None
-        for offset in guesses:
-            fit = self._start(offset, tension[rows], length[rows])
-            fit = yield from self._refine(fit, tension[rows], length[rows], FIRST_ROUNDS)
-            if best is None or fit.cost < best.cost:
-                best = fit
-        assert best is not None
-        return (yield from self._refine(self._start(best.offset, tension, length), tension, length))
+            guesses += [*(yield from self._guesses(seen))]
+        rows = np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(int))
+        fits = []
+        for constants in guesses:
+            part = seen[rows]
+            fits.append((yield from self._refine(self._start(constants, part), part, FIRST_ROUNDS)))
+        best = min(fits, key=lambda fit: fit.cost)
+        return (yield from self._refine(self._start(best.constants, seen), seen))
 
-    def _start(self, offset: Array, tension: Array, length: Array) -> Fit:
-        theta = self._mae.estimate(tension, length - offset).theta
-        return Fit(np.inf, offset, np.clip(theta, self._robot.lower, self._robot.upper))
+    def _start(self, constants: Array, seen: Moments) -> Fit:
+        length = seen.length - constants[: seen.length.shape[1]]
+        theta = self._mae.estimate(seen.tension, length).theta
+        return Fit(np.inf, constants, np.clip(theta, self._robot.lower, self._robot.upper))
 
-    def _guesses(self, tension: Array, length: Array) -> Generator[None, None, Array]:
-        """Return the zeros (PURSUED, M) of the likeliest random first postures."""
-        robot, mae = self._robot, self._mae
+    def _guesses(self, seen: Moments) -> Generator[None, None, list[Array]]:
+        """Return constants with the zeros of the likeliest of many random first postures."""
+        robot, mae, muscles = self._robot, self._mae, self._robot.muscle_count
         first = robot.random_postures(POSTURES, self._rng)
-        offset = length[0] - mae.lengths(
-            first, np.broadcast_to(tension[0], (POSTURES, len(length[0])))
-        )
-        offset = offset[np.argsort(np.abs(offset).max(axis=1))]
-        offset = offset[: max(PURSUED, int((np.abs(offset).max(axis=1) < FARTHEST).sum()))]
-        rows = np.unique(np.linspace(0, len(tension) - 1, TOLD_BY).astype(int))
-        cost, postures = np.empty(len(offset)), np.empty((len(offset), len(rows), len(robot.lower)))
+        pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
+        offset = seen.length[0] - mae.lengths(first, pull)
+        size = np.abs(offset).max(axis=1)
+        offset = offset[np.argsort(size)[: max(PURSUED, int((size < FARTHEST).sum()))]]
+        part = seen[np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(int))]
+        cost, postures = np.empty(len(offset)), []
         for n, zero in enumerate(offset):
-            theta = postures[n] = mae.estimate(tension[rows], length[rows] - zero).theta
-            left = length[rows] - zero - mae.lengths(theta, tension[rows])
+            theta = mae.estimate(part.tension, part.length - zero).theta
+            postures.append(theta)
+            left = part.length - zero - mae.lengths(theta, part.tension)
             parts = left / COARSE[0], self._outside(theta) / COARSE[2]
-            cost[n] = sum(np.log1p(part**2).sum() for part in parts)
+            cost[n] = sum(np.log1p(each**2).sum() for each in parts)
             if n % 40 == 39:
                 yield
         order = np.argsort(cost)[:SHORTLIST]
         for n in order:
-            torque, _ = self._torque(postures[n], tension[rows])
-            cost[n] += np.log1p((torque / COARSE[1]) ** 2).sum()
+            torque = self._torque(postures[n], part.tension)[0] / COARSE[1]
+            cost[n] += np.log1p(torque**2).sum()
             yield
-        return offset[order[np.argsort(cost[order])][:PURSUED]]
+        best = order[np.argsort(cost[order])][:PURSUED]
+        return [np.concatenate([offset[n], self._mean[muscles:]]) for n in best]
 
     def _outside(self, theta: Array) -> Array:
         robot = self._robot
         return np.maximum(theta - robot.upper, 0.0) + np.minimum(theta - robot.lower, 0.0)
 
     def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return what torque is not balanced [N·m] (K, D), and G."""
+        """Return what torque is not balanced [N·m] (K, D), and G (K, M, D)."""
         jacobian = self._mae.muscle_jacobian(theta, tension)
         pull = np.einsum('kmd,km->kd', jacobian, tension)
         return self._robot.kinematics.holding_torque(theta) + pull, jacobian
 
-    def _parts(self, fit: Fit, tension: Array, length: Array) -> Parts:
-        left = length - fit.offset - self._mae.lengths(fit.theta, tension)
-        torque, jacobian = self._torque(fit.theta, tension)
+    def _residuals(self, fit: Fit, seen: Moments, turning: Array, slopes: bool = False) -> Linear:
+        """Return residuals, with slopes only if asked; `turning` is which way joints turned."""
+        muscles, joints = self._robot.muscle_count, self._robot.joint_count
+        ends = [muscles, 2 * muscles, 3 * muscles]
+        offset, friction, zero, sticking = np.split(fit.constants, ends)
+        passed = np.exp(-friction * seen.direction)  # from the motor to the elastic unit
+        end, pull = seen.tension * passed, (seen.tension - zero) * passed
+        length = self._mae.lengths(fit.theta, end)
+        torque, jacobian = self._torque(fit.theta, pull)
+        left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
+        noise = np.repeat([LENGTH_NOISE, TORQUE_NOISE], [muscles, joints])
         outside = self._outside(fit.theta) / OUTSIDE
-        return Parts(left / LENGTH_NOISE, torque / TORQUE_NOISE, outside, jacobian)
+        if not slopes:
+            return Linear(left / noise, outside, left, left)
+        turned = [self._torque(fit.theta + STEP * row, pull)[0] for row in np.eye(joints)]
+        slope = (np.stack(turned, axis=-1) - torque[..., None]) / STEP
+        by_theta = np.concatenate([-jacobian, slope], axis=1)
+        by = np.zeros((len(left), muscles + joints, len(fit.constants)))
+        m, j = np.arange(muscles), np.arange(joints)
+        by[:, m, m] = -1.0
+        rubbed = self._mae.lengths(fit.theta, end * np.exp(-STEP * seen.direction))
+        by[:, m, muscles + m] = (length - rubbed) / STEP
+        by[:, muscles:, muscles : 2 * muscles] = -np.swapaxes(
+            jacobian * (pull * seen.direction)[..., None], 1, 2
+        )
+        by[:, muscles:, 2 * muscles : 3 * muscles] = -np.swapaxes(
+            jacobian * passed[..., None], 1, 2
+        )
+        by[:, muscles + j, 3 * muscles + j] = turning
+        return Linear(left / noise, outside, by_theta / noise[:, None], by / noise[:, None])
 
-    def _cost(self, parts: Parts, offset: Array) -> float:
-        student = sum(np.log1p(part**2 / FREEDOM).sum() for part in parts[:2])
-        plain = np.square(parts.outside).sum() + np.square(offset / OFFSET).sum()
-        return float((FREEDOM + 1.0) * student + plain)
+    def _cost(self, left: Linear, constants: Array) -> float:
+        student = (FREEDOM + 1.0) * np.log1p(left.value**2 / FREEDOM).sum()
+        prior = np.square((constants - self._mean) / self._spread).sum()
+        return float(student + np.square(left.outside).sum() + prior)
 
-    def _refine(
-        self, fit: Fit, tension: Array, length: Array, rounds: int = ROUNDS
-    ) -> Generator[None, None, Fit]:
+    def _refine(self, fit: Fit, seen: Moments, rounds: int = ROUNDS) -> Generator[None, None, Fit]:
         """Return the best fit near one, after so many Gauss–Newton steps at most."""
-        eye = np.eye(self._robot.joint_count)
-        muscles, damping = np.eye(length.shape[1]), 1e-3
-        parts = self._parts(fit, tension, length)
-        fit = fit._replace(cost=self._cost(parts, fit.offset))
+        eye, own_eye = np.eye(self._robot.joint_count), np.eye(len(fit.constants))
+        damping, turning = 1e-3, _turning(fit.theta)
+        fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning), fit.constants))
         for _ in range(rounds):
             yield
-            turned = [self._torque(fit.theta + STEP * row, tension)[0] for row in eye]
-            slope = (np.stack(turned, axis=-1) / TORQUE_NOISE - parts.torque[..., None]) / STEP
-            along = -parts.jacobian / LENGTH_NOISE
-            weight, weight_torque = (
-                (FREEDOM + 1.0) / (FREEDOM + part**2) for part in (parts.length, parts.torque)
-            )
-            normal = np.einsum('kmi,km,kmj->kij', along, weight, along)
-            normal += np.einsum('kdi,kd,kdj->kij', slope, weight_torque, slope)
-            normal += (parts.outside != 0.0)[:, :, None] * eye / OUTSIDE**2
-            gradient = np.einsum('kmi,km->ki', along, weight * parts.length)
-            gradient += np.einsum('kdi,kd->ki', slope, weight_torque * parts.torque)
-            gradient += parts.outside / OUTSIDE
-            cross = -along * weight[..., None] / LENGTH_NOISE
-            own = np.diag((weight / LENGTH_NOISE**2).sum(axis=0) + OFFSET**-2)
-            down = fit.offset / OFFSET**2 - (weight * parts.length / LENGTH_NOISE).sum(axis=0)
+            left = self._residuals(fit, seen, turning, slopes=True)
+            weight = (FREEDOM + 1.0) / (FREEDOM + left.value**2)
+            weighted = weight[..., None] * left.by_theta
+            normal = np.swapaxes(left.by_theta, 1, 2) @ weighted
+            normal += (left.outside != 0.0)[:, :, None] * eye / OUTSIDE**2
+            gradient = np.einsum('krd,kr->kd', weighted, left.value) + left.outside / OUTSIDE
+            cross = np.swapaxes(left.by_constants, 1, 2) @ weighted
+            own = np.einsum('krp,kr,krq->pq', left.by_constants, weight, left.by_constants)
+            own += np.diag(self._spread**-2)
+            down = np.einsum('krp,kr->p', left.by_constants, weight * left.value)
+            down += (fit.constants - self._mean) / self._spread**2
             before = fit.cost
             while damping < 1e4:
-                damped = normal * (1.0 + damping * eye) + 1e-6 * eye
-                inverse = np.linalg.inv(damped)
+                inverse = np.linalg.inv(normal * (1.0 + damping * eye) + 1e-6 * eye)
                 through = cross @ inverse
-                reduced = own * (1.0 + damping * muscles) - np.einsum('kmi,kni->mn', through, cross)
-                shift = -np.linalg.solve(reduced, down - np.einsum('kmi,ki->m', through, gradient))
-                turn = gradient + np.einsum('kmi,m->ki', cross, shift)
+                reduced = own * (1.0 + damping * own_eye)
+                reduced = reduced - np.einsum('kpd,kqd->pq', through, cross)
+                shift = -np.linalg.solve(reduced, down - np.einsum('kpd,kd->p', through, gradient))
+                turn = gradient + np.einsum('kpd,p->kd', cross, shift)
                 turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)
-                tried = Fit(np.inf, fit.offset + shift, fit.theta + turn)
-                after = self._parts(tried, tension, length)
-                if (cost := self._cost(after, tried.offset)) < fit.cost:
+                tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
+                cost = self._cost(self._residuals(tried, seen, turning), tried.constants)
+                if cost < fit.cost:
                     break
                 damping *= 5.0
                 yield
             else:
                 break
-            fit, parts, damping = tried._replace(cost=cost), after, max(0.2 * damping, 1e-6)
-            if before - cost < 1e-3 * before and np.abs(shift).max() < 1e-4:
+            fit, damping = tried._replace(cost=cost), max(0.2 * damping, 1e-6)
+            if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
 
 
-def _seen(mae: Mae, tension: Array, length: Array, theta: Array) -> Fit:
-    """Return the zeros that joint angles say."""
-    return Fit(0.0, (length - mae.lengths(theta, tension)).mean(axis=0), theta)
+def _turning(theta: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
+    result, reference = np.zeros_like(theta), theta[0].copy()
+    for k, posture in enumerate(theta):
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
+    return result
