@@ -16,11 +16,11 @@ reached from different sides; only messages at which the arm has moved on count.
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.learning.rest import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -78,8 +78,9 @@ class Moments(NamedTuple):
     direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (K, M)
     theta: Array  # θ [rad] or NaN, (K, D)
 
-    def __getitem__(self, rows: Any) -> Any:
-        return Moments(*(part[rows] for part in tuple(self)))
+    def some(self, rows: Ints) -> Moments:
+        """Return some of them."""
+        return Moments(*(part[rows] for part in self))
 
 
 class Fit(NamedTuple):
@@ -221,10 +222,10 @@ class Zeroing:
         guesses = [] if self._fit is None else [self._fit.constants]
         if self.moving < SETTLED:
             guesses += [*(yield from self._guesses(seen))]
-        rows = np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(int))
+        rows = _spaced(seen)
         fits = []
         for constants in guesses:
-            part = seen[rows]
+            part = seen.some(rows)
             fits.append((yield from self._refine(self._start(constants, part), part, FIRST_ROUNDS)))
         best = min(fits, key=lambda fit: fit.cost)
         return (yield from self._refine(self._start(best.constants, seen), seen))
@@ -242,7 +243,7 @@ class Zeroing:
         offset = seen.length[0] - mae.lengths(first, pull)
         size = np.abs(offset).max(axis=1)
         offset = offset[np.argsort(size)[: max(PURSUED, int((size < FARTHEST).sum()))]]
-        part = seen[np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(int))]
+        part = seen.some(_spaced(seen))
         cost, postures = np.empty(len(offset)), []
         for n, zero in enumerate(offset):
             theta = mae.estimate(part.tension, part.length - zero).theta
@@ -354,3 +355,8 @@ def _turning(theta: Array) -> Array:
         reference = np.clip(reference, posture - STICKING, posture + STICKING)
         result[k] = (posture - reference) / STICKING
     return result
+
+
+def _spaced(seen: Moments) -> Ints:
+    """Return which few of the moments stand for all."""
+    return np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(np.int64))
