@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gate's limits: how far healthy networks are from them, and which attacks it refuses.
+"""Limits of trust: how far healthy networks and messages are from them; which attacks are refused.
 
     python -m bench gate [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 10]
 
 For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
 minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
-Printed are the largest of every measure over all of them beside its limit, what was refused (none
-may be), and how many of the initial and the last learned networks are refused under each attack.
+Printed are the largest of every measure over all of them beside its limit, the same of the messages
+(`plausibility.py`, `controller`'s overload_time), what was refused (none may be), and how many of
+the initial and the last learned networks are refused under each attack.
 
 Exit status 1 if a healthy network was refused, or an attack was not.
 """
@@ -22,14 +23,21 @@ import numpy as np
 import torch
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.gate import FLOOR, LEAST_CUT, LIMITS, WORSE, Gate
 from musculoskeletal_ae.exceptions import GateError
-from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    SAMPLE_TIME,
+    Recording,
+    record,
+)
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLIP, TOO_TENSE
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -126,6 +134,31 @@ ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 # -- healthy networks -----------------------------------------------------------------------------
 
 
+MESSAGES = {
+    'step of l in 10 ms [m]': SLIP,
+    'T beside tension.max': TOO_TENSE,
+    'time of a T above tension.limit [s]': Settings().overload_time,
+    'θ_est beyond its limits, of the range': ESTIMATE_OUTSIDE,
+}
+
+
+def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, float]:
+    """Return the largest of MESSAGES over a recording, θ_est by `mae`."""
+    theta = mae.estimate(stream.tension, stream.length).theta
+    above, longest = np.zeros(robot.muscle_count), 0.0
+    for over in stream.tension > robot.tension.limit:
+        above = (above + SAMPLE_TIME) * over
+        longest = max(longest, above.max())
+    beyond = np.maximum(theta - robot.upper, robot.lower - theta) / (robot.upper - robot.lower)
+    values = (
+        np.abs(np.diff(stream.length, axis=0)).max(),
+        stream.tension.max() / robot.tension.max,
+        longest,
+        max(0.0, beyond.max()),
+    )
+    return dict(zip(MESSAGES, map(float, values), strict=True))
+
+
 class Spread:
     """The largest of every measure over networks, and what was refused of them."""
 
@@ -162,6 +195,8 @@ def learned(robot: Robot, mae: Mae, driver: Mae, seed: int, minutes: float, spre
         arm.set_payload(LOAD * (time // MINUTE % 2))
 
     stream = record(arm, driver, EXPLORATION_STREAM + seed, MINUTE * minutes, script)
+    for name, value in message_measures(robot, mae, stream).items():
+        spread.most[name] = max(spread.most[name], value)
     learner = Learner(robot, mae, preset=mae.preset, seed=seed)
     gate.take(mae, 0.0)
     for n, row in enumerate(zip(stream.theta_sensor, stream.tension, stream.length, strict=True)):
@@ -177,8 +212,8 @@ def learned(robot: Robot, mae: Mae, driver: Mae, seed: int, minutes: float, spre
 
 def limit(name: str) -> float:
     """Return a measure's limit."""
-    if name in LIMITS:
-        return LIMITS[name]
+    if name in (limits := LIMITS | MESSAGES):
+        return limits[name]
     return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'beyond' in name else 1.0)
 
 

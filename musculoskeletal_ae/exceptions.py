@@ -5,11 +5,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+LONGEST_TEXT = 4000
+
+
+def printable(text: object) -> str:
+    """Return a text that can do nothing to a terminal: what is not printable is escaped."""
+    shown = str(text)[:LONGEST_TEXT]
+    return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in shown)
+
 
 class MusculoskeletalError(Exception):
     """Base of every error this package raises on purpose."""
 
     reason = 'cannot be used'  # in a few words, what a rejected message is counted under
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class RobotDescriptionError(MusculoskeletalError):

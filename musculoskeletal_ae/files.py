@@ -22,6 +22,7 @@ Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # [bytes] of a text
 LARGEST_YAML = 1 << 20  # [bytes]; it is slow to read
+LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty
 MOST_ENTRIES = 100_000  # in a YAML file, what aliases stand for included
 DEEPEST = 50  # levels of a YAML file
 LONGEST = 1000  # characters of a number in YAML: those to base 60 take the square of it
@@ -58,6 +59,18 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
     raise refuse(file, f'is larger than {largest} bytes')
 
 
+def read_start(file: Path, largest: int) -> bytes:
+    """Return the first bytes of a regular file; none where there is no such file.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    if not file.is_file():
+        return b''
+    with file.open('rb') as stream:
+        return stream.read(largest)
+
+
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file of at most `largest` bytes."""
     try:
@@ -83,7 +96,7 @@ def read_csv(
     # begins a comment line.
     """
     rows = []
-    for number, line in enumerate(read_text(file, refuse).splitlines(), 1):
+    for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):
         if line.strip() and not line.startswith('#'):
             try:
                 cells = next(csv.reader([line]))

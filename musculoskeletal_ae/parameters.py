@@ -73,8 +73,10 @@ class Parameter:
                 numbers = tuple(map(float, value))
             except (TypeError, ValueError):
                 numbers = (math.nan,)
-            if not all(map(math.isfinite, numbers)):
-                raise MusculoskeletalError(f'{value!r}; legal: a list of finite numbers')
+            low, high = self.within or (-math.inf, math.inf)
+            if not all(math.isfinite(number) and low <= number <= high for number in numbers):
+                legal = f'a list of finite numbers, {self.legal_values}'.removesuffix(', ')
+                raise MusculoskeletalError(f'{value!r}; legal: {legal}')
             return numbers
         return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
 

@@ -20,7 +20,9 @@ from musculoskeletal_ae.exceptions import MessageError
 
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000
-MOST_WRENCH = 1e4  # [N], [N·m]: no arm outlives more
+# What a hand can take [N], [N·m]: a third of what the emulated arms do, any axis and posture.
+MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
+MOST_EFFORT = 1000.0  # [N·m] asked of one joint
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
 
@@ -110,6 +112,8 @@ def read_joints(
             raise MessageError('duplicate joint', repr(name))
         # Drivers say NaN for a velocity or effort they do not measure; only a target's counts.
         effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
+        if abs(effort) > MOST_EFFORT:
+            raise MessageError('oversized', f'effort {effort:g}, at most {MOST_EFFORT:g}')
         values[name] = (message.position[i], effort)
     if foreign_allowed and len(values) < len(joints):
         missing = [name for name in joints if name not in values]
@@ -138,8 +142,8 @@ def read_wrench(message: Any, root_link: str) -> Array:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
     if not np.isfinite(wrench).all():
         raise MessageError('not finite', 'a force or torque')
-    if np.abs(wrench).max() > MOST_WRENCH:
-        raise MessageError('oversized', f'{np.abs(wrench).max():g}, at most {MOST_WRENCH:g}')
+    if (np.abs(wrench) > MOST_WRENCH).any():
+        raise MessageError('oversized', f'{wrench}, at most {MOST_WRENCH}')
     return wrench
 
 

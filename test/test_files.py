@@ -69,7 +69,7 @@ STRANGE = {
     dangling: 'No such file',
     folder: 'no regular file',
     latin: 'is not text in UTF-8 (byte 6)',
-    large: 'is larger than 5000000 bytes',
+    large: 'is larger than 1048576 bytes',
     forbidden: 'Permission denied',
 }
 

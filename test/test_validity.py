@@ -138,10 +138,18 @@ def test_velocities_are_counted_and_a_target_s_are_finite():
 
 
 def test_a_wrench_that_no_arm_outlives_is_refused():
-    message = WrenchStamped()
-    message.wrench.force.x = 1e6
-    with pytest.raises(MessageError, match='oversized'):
-        read_wrench(message, 'torso')
+    for part, value in (('force', 1e6), ('force', -2000.0), ('torque', 1000.0)):
+        message = WrenchStamped()
+        getattr(message.wrench, part).x = value
+        with pytest.raises(MessageError, match='oversized'):
+            read_wrench(message, 'torso')
+
+
+def test_an_effort_that_no_joint_has_is_refused():
+    for effort in (1e308, -2000.0):
+        message = JointState(name=['a'], position=[0.0], effort=[effort])
+        with pytest.raises(MessageError, match='oversized'):
+            read_joints(message, JOINTS, foreign_allowed=False)
 
 
 def test_messages_are_told_by_their_fields_whatever_library_made_them():

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.bags.topics import interface_topics
-from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -34,7 +34,8 @@ class BagCheck:
     faults: list[str] = field(default_factory=list)  # why it is not whole or does not fit
 
     def __str__(self) -> str:
-        return '\n'.join([*self.lines, *(f'fault: {fault}' for fault in self.faults)])
+        lines = [*self.lines, *(f'fault: {fault}' for fault in self.faults)]
+        return '\n'.join(map(printable, lines))
 
 
 def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:

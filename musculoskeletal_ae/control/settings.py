@@ -30,6 +30,8 @@ class Settings:
         (0.0,),
         'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
         'N·m/rad',
+        0.0,
+        1000.0,
     )
     first_duration: float = _set(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = _set(

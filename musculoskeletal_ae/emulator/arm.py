@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator import mechanics
+from musculoskeletal_ae.emulator.faults import Faults, Readings
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -24,22 +24,6 @@ LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
-
-
-class Readings(NamedTuple):
-    """One sample of the arm's sensors.
-
-    Attributes:
-        theta: Joint angles [rad], shape (D,).
-        length: Muscle lengths [m], shape (M,).
-        tension: Muscle tensions [N], shape (M,).
-        temperature: Housing temperatures of the modules [°C], shape (M,).
-    """
-
-    theta: Array
-    length: Array
-    tension: Array
-    temperature: Array
 
 
 def seen_by_camera(pose: pin.SE3, rng: np.random.Generator) -> pin.SE3:
@@ -56,6 +40,7 @@ class EmulatedArm:
         robot: The geometric model that the description gives.
         individual: The true body that `seed` picked.
         command_timeout: Seconds without a command until the modules go safe.
+        faults: Of wires, motors and sensors.
     """
 
     def __init__(
@@ -77,6 +62,7 @@ class EmulatedArm:
         self.individual = individual or Individual(robot, seed)
         self.command_timeout = command_timeout
         self._rng = np.random.default_rng([seed, 0x5E45])
+        self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
         self._model.armature = np.full(self._model.nv, ARMATURE)
@@ -89,7 +75,13 @@ class EmulatedArm:
         self._payload = 0.0
         self._body = self._constants()
         muscles, joints = robot.muscle_count, robot.joint_count
-        self._command = mechanics.Command(np.zeros(muscles), self.individual.length_bias.copy())
+        self._command = mechanics.Command(
+            np.zeros(muscles),
+            self.individual.length_bias.copy(),
+            self.faults.stuck,
+            self.faults.slack,
+            self.faults.hot,
+        )
         tree_joints = self.individual.tree.parent.shape[0]
         self._scratch = mechanics.Scratch(
             np.zeros((tree_joints, 3, 3)),
@@ -131,15 +123,16 @@ class EmulatedArm:
         )
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ (default: hanging, θ = 0 within the limits), heal and cool it.
+        """Put the arm at rest at θ (default: hanging, θ = 0 within the limits), free, mended, cool.
 
-        Payload, length offsets and the external wrench stay as set.
+        Payload, length offsets and `faults` stay as set.
         """
         posture = np.zeros(self.robot.joint_count) if theta is None else np.asarray(theta, float)
         posture = np.clip(posture, self.robot.lower, self.robot.upper)
         for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
             state[:] = 0.0
         self._joint.q[self._order] = posture
+        self._wrench[:] = 0.0
         bias = self.robot.tension.bias
         self._muscle.sliding[:] = 0.0
         self._muscle.ruptured[:] = 0.0
@@ -174,6 +167,11 @@ class EmulatedArm:
     def tension(self) -> Array:
         """True muscle tensions at the modules [N], shape (M,)."""
         return self._muscle.tension.copy()
+
+    @property
+    def broken(self) -> bool:
+        """Whether forces beyond all bounds left no posture that is a number, until `reset`."""
+        return not np.isfinite(self._joint.q).all()
 
     @property
     def safe(self) -> bool:
@@ -251,19 +249,20 @@ class EmulatedArm:
             )
 
     def sense(self) -> Readings:
-        """Read all sensors once, with their noise, bias and resolution."""
+        """Read all sensors once, with their noise, bias, resolution and faults."""
         muscle, true = self._muscle, self.individual
         tension = true.tension_gain * muscle.tension + true.tension_bias
         # A cut wire pulls on no sensor, and a tension unit does not read below zero.
         tension = np.where(muscle.ruptured > 0.0, 0.0, tension)
         noisy = self._noisy(tension, TENSION_NOISE, TENSION_RESOLUTION)
         length = muscle.length + self._command.length_error
-        return Readings(
+        readings = Readings(
             self._noisy(self.theta, ANGLE_NOISE, ANGLE_RESOLUTION),
             self._noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION),
             np.where(muscle.ruptured > 0.0, 0.0, np.maximum(noisy, 0.0)),
             self._noisy(muscle.housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION),
         )
+        return self.faults.sensed(readings)
 
     def _noisy(self, value: Array, noise: float, resolution: float) -> Array:
         read: Array = value + self._rng.normal(0.0, noise, value.shape)

@@ -71,15 +71,13 @@ class Body(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the modules follow and how they read their length sensors.
+    """What the modules follow and what is wrong with them, each of shape (M,)."""
 
-    Attributes:
-        value: Target lengths [m] or tensions [N], shape (M,).
-        length_error: Reading of the length sensor minus the true l [m], shape (M,).
-    """
-
-    value: Array
-    length_error: Array
+    value: Array  # target lengths [m] or tensions [N]
+    length_error: Array  # reading of the length sensor minus the true l [m]
+    stuck: Array  # 1 where the motor stands
+    slack: Array  # by how much the wire is too long [m]
+    hot: Array  # least temperature of the housing [°C]
 
 
 class MuscleState(NamedTuple):
@@ -250,6 +248,7 @@ def _wires_and_modules(
             pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
             speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
             speed = min(SPEED_LIMIT, max(-SPEED_LIMIT, speed))
+        speed *= 1.0 - command.stuck[m]
         after = min(body.length_high[m], max(body.length_low[m], before + STEP * speed))
         muscle.length[m] = after
         slid = before - after
@@ -260,7 +259,10 @@ def _wires_and_modules(
             muscle.end_tension[m] = 0.0
         else:
             muscle.end_tension[m] = tension_from_elongation(
-                route - after, body.force[m], body.rate[m], body.wire_stretch[m] * absolute[m]
+                route - after - command.slack[m],
+                body.force[m],
+                body.rate[m],
+                body.wire_stretch[m] * absolute[m],
             )
         muscle.tension[m] = muscle.end_tension[m] * math.exp(
             body.cable_friction[m] * muscle.sliding[m]
@@ -270,6 +272,7 @@ def _wires_and_modules(
         heat = LOSS * muscle.tension[m] * muscle.tension[m]
         muscle.winding[m] += STEP * (heat - inner) / WINDING_CAPACITY
         muscle.housing[m] += STEP * (inner - outer) / HOUSING_CAPACITY
+        muscle.housing[m] = max(muscle.housing[m], command.hot[m])
 
 
 @njit(cache=True)

@@ -42,7 +42,7 @@ NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already
 LIMITS = {
     'θ by ①': 0.5,
     'T by ①': 1.25,
-    'l by ①': 2.1,
+    'l by ①': 1.7,
     'θ by ②': 2.0,
     'T by ②': 1.25,
     'l by ②': 1.3,

@@ -289,11 +289,16 @@ class Learner:
         assert self._mae is not None
         return self._mae
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing is learned, or what is learned is not on disk; or ''."""
+        disk = '' if self._state is None else self._state.trouble
+        return '; '.join(filter(None, (self.training.trouble, disk)))
+
     def report(self) -> Report:
         """Return how it is, for /diagnostics."""
         level: Level = 'warn'
-        disk = '' if self._state is None else self._state.trouble
-        if trouble := '; '.join(filter(None, (self.training.trouble, disk))):
+        if trouble := self.trouble:
             level, message = 'error', trouble
         elif self.checkpoint is None:
             message = 'waiting for a checkpoint: set the parameter `checkpoint`'

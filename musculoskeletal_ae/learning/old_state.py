@@ -15,18 +15,20 @@ from pathlib import Path
 
 import numpy as np
 
+from musculoskeletal_ae.files import read_start
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.robot.robot import Robot
 
 LOG, NETWORK, LOCK = 'samples.log', 'checkpoint.safetensors', 'lock'
 MAGIC = b'MAESMPL1'
 SAMPLE, FORGET = 1, 2
+LARGEST = 1 << 26  # [bytes] of a state; a full one has a tenth
 HEAD = struct.Struct('<II')  # kind, checksum
 
 
 def files(directory: Path) -> list[Path]:
     """Return the files of an old state."""
-    return [file for name in (LOG, NETWORK, LOCK) if (file := directory / name).exists()]
+    return [file for name in (LOG, NETWORK, LOCK) if (file := directory / name).is_file()]
 
 
 def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, bytes | None]:
@@ -38,7 +40,7 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
     problem, log, network = '', directory / LOG, directory / NETWORK
     names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles}).encode()
     header = MAGIC + struct.pack('<II', len(names), zlib.crc32(names)) + names
-    data = log.read_bytes() if log.exists() else b''
+    data = read_start(log, LARGEST)
     size = HEAD.size + 8 * (robot.joint_count + 4 * robot.muscle_count)
     records = [data[at : at + size] for at in range(len(header), len(data) - size + 1, size)]
     whole = [r for r in records if zlib.crc32(r[:4] + r[8:]) == HEAD.unpack_from(r)[1]]
@@ -49,7 +51,7 @@ def read(directory: Path, robot: Robot, samples: SampleStore) -> tuple[str, byte
     else:
         for record in whole:
             _replay(record, robot, samples)
-    return problem, network.read_bytes() if network.exists() else None
+    return problem, read_start(network, LARGEST) or None
 
 
 def _replay(record: bytes, robot: Robot, samples: SampleStore) -> None:

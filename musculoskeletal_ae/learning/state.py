@@ -30,6 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
+from musculoskeletal_ae.files import read_start
 from musculoskeletal_ae.learning import old_state
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint as checkpoints
@@ -99,6 +100,10 @@ class State:
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
+        if self._file.exists() and not self._file.is_file():
+            raise OSError(f'{self._file} is no regular file')  # one that may never end
+        if self._file.exists() and self._file.stat().st_size > old_state.LARGEST:
+            raise sqlite3.DatabaseError('larger than any state')
         self._connection = _connect(self._file)
         self._opened = self._file.stat()
 
@@ -158,7 +163,7 @@ class State:
                 raise sqlite3.DatabaseError(said)
         except (sqlite3.Error, TypeError, ValueError) as error:
             problem = f'{self._file}: damaged ({error})'
-            whole = self._file.read_bytes()
+            whole = read_start(self._file, old_state.LARGEST)
             places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
             records = [whole[place : place + self._size] for place in places]
         unpacked = filter(None, map(self._unpacked, records))

@@ -7,6 +7,7 @@ does is in `update`, which imports torch and is itself imported only where somet
 
 from __future__ import annotations
 
+import faulthandler
 import math
 import multiprocessing
 import os
@@ -260,6 +261,7 @@ def _talk(
 
 def serve(connection: Connection, directory: Path, preset: str, seed: int) -> None:
     """Be the training process: answer until the other end closes, however the node ended."""
+    faulthandler.enable()
     os.nice(NICENESS)
     import torch
 

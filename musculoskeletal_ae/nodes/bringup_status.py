@@ -8,6 +8,7 @@ stdout.
 from __future__ import annotations
 
 import math
+import sys
 import time
 from functools import partial
 from typing import Any
@@ -18,6 +19,7 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 
@@ -29,6 +31,8 @@ class BringupStatus(Shell):
         """Listen; options are those of Node."""
         super().__init__('bringup_status', **options)
         self.duration: float = self.parameter('duration')
+        self.patience: float = self.parameter('patience')
+        self.begun = time.monotonic()
         self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
@@ -65,6 +69,8 @@ class BringupStatus(Shell):
     def _print(self) -> None:
         now = time.monotonic()
         if self.started is None and not self.anomalies:
+            if 0.0 < self.patience < now - self.begun:
+                sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
         error, anomaly = (
@@ -77,6 +83,6 @@ class BringupStatus(Shell):
             line += f'  ANOMALY: {self.suspect}'
         elif self.stopped:
             line += f'  {self.stopped.replace("stopped", "STOPPED", 1)} (controller/reset resumes)'
-        print(line, flush=True)
+        print(printable(line), flush=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

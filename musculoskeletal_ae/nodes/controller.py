@@ -8,10 +8,12 @@ muscle_length_command, or muscle_tension_command with method `tension`.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -24,6 +26,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import array_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_joints
@@ -38,6 +41,8 @@ class Controller(Shell):
         """Declare topics and services; options are those of Node."""
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
+        self.recording = StopRecording(self.resolve_topic_name)
+        self.latched = False  # the stop, as of the last step
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name))
         self.logged: list[str] = []
@@ -61,6 +66,22 @@ class Controller(Shell):
         self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
+
+    def listen(
+        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
+    ) -> None:
+        """Subscribe as every shell does, and remember what came for the next stop's recording."""
+
+        def remembered(message: Any) -> None:
+            self.recording.heard(topic, message)
+            callback(message)
+
+        super().listen(kind, topic, remembered, qos)
+
+    def destroy_node(self) -> None:
+        """Let a recording be finished."""
+        self.recording.close()
+        super().destroy_node()
 
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
@@ -122,7 +143,13 @@ class Controller(Shell):
         command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
             value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
-            self.publishers_of[command.kind].publish(array_message(value, 'muscle'))
+            message = array_message(value, 'muscle')
+            self.publishers_of[command.kind].publish(message)
+            self.recording.heard(f'muscle_{command.kind}_command', message)
+        safety, before = self.core.safety, self.latched
+        self.latched = bool(safety.cause) and not safety.passing
+        if self.latched and not before:
+            self.recording.save(safety.cause, self.parameter('stop_recordings'))
 
     def clock_jumped_back(self) -> None:
         """Count time from here; latches stay."""
@@ -131,6 +158,8 @@ class Controller(Shell):
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
         report = self.core.report(time.monotonic())
+        if kept := self.recording.problem or self.recording.saved:
+            report.values['last stop'] = str(kept)
         stopped = [report.message] if self.core.safety.cause else []
         stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
         for line in stopped + stiffness:

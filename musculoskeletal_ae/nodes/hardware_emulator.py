@@ -37,6 +37,7 @@ class HardwareEmulator(Arm):
         self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)
+        self.follow_parameter('faults', self.arm.faults.set)
         self.follow_parameter('marker_rate', partial(setattr, self, 'marker_rate'))
         self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
@@ -50,7 +51,7 @@ class HardwareEmulator(Arm):
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        return 'arm at rest, modules safe; parameters (ruptures, payload) stay as set'
+        return 'arm at rest, free and cool, modules safe; parameters stay as set'
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -59,8 +60,11 @@ class HardwareEmulator(Arm):
         whole = int(elapsed * 1000.0) / 1000.0
         self.remainder = elapsed - whole
         self.arm.step(whole)
-        reading = self.reading = self.arm.sense()
-        self.publish_state(reading.theta, reading.length, reading.tension, reading.temperature)
+        if self.arm.broken:
+            return
+        self.reading = self.arm.sense()
+        for reading in self.arm.faults.delivered(self.reading, now):
+            self.publish_state(*reading)
         if self.marker_rate > 0.0 and now >= self.pose_due:
             self.pose_due = max(self.pose_due + 1.0 / self.marker_rate, now)
             self._publish_pose()
@@ -78,11 +82,15 @@ class HardwareEmulator(Arm):
     def lines(self) -> list[Line]:
         """Return the arm as lines, along its true routes."""
         arm = self.arm
+        if arm.broken:
+            return []
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())
 
     def report(self) -> Report:
         """Return what /diagnostics shows."""
         values = {'hottest module': f'{self.reading.temperature.max():.1f} °C'}
+        if self.arm.broken:
+            return Report('error', 'broken by forces beyond all bounds: reset it', values)
         if self.arm.safe:
             return Report('warn', 'modules safe: no commands', values)
         return Report('ok', 'following commands', values)

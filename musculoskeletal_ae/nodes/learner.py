@@ -47,7 +47,7 @@ class Learner(Shell):
             directory=self._directory(value('state_directory')),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        self.running = False
+        self.running = self.troubled = False
         self.follow_parameter('fresh', self._start_fresh)
         self.follow_parameter('checkpoint', self._take_checkpoint)
         self.follow_parameter('relearn_muscles', self._relearn)
@@ -109,6 +109,9 @@ class Learner(Shell):
         data = self.core.poll(self._now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
+        if bool(self.core.trouble) != self.troubled:  # is told at once, not with the next report
+            self.troubled = not self.troubled
+            self._report()
 
     def clock_jumped_back(self) -> None:
         """Forget what is not a sample yet."""

@@ -39,6 +39,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'checkpoint': CHECKPOINT,
         'seed': SEED,
         'explore': Parameter(False, 'explore from the start'),
+        'stop_recordings': Parameter(
+            10, 'last seconds before a stop that are kept as bags', '', (0, 1000), settable=True
+        ),
         **parameters_of(ControlSettings),
     },
     'estimator': {
@@ -68,7 +71,17 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(
-            (0.0,), 'error of the length sensors, one for all or one each', 'm', settable=True
+            (0.0,),
+            'error of the length sensors, one for all or one each',
+            'm',
+            (-1.0, 1.0),
+            settable=True,
+        ),
+        'faults': Parameter(
+            ('',),
+            'what is wrong, each KIND [QUANTITY] [MUSCLE] [SIZE], such as "bias tension 40" '
+            '([""] mends; doc/interface.md lists the kinds)',
+            settable=True,
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
         'marker_rate': Parameter(
@@ -111,6 +124,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **SHARED,
         'duration': Parameter(
             0.0, 'time from the first estimate to the end (0: no end)', 's', (0.0, 1e9)
+        ),
+        'patience': Parameter(
+            0.0, 'longest wait for the first estimate (0: no end)', 's', (0.0, 1e9)
         ),
     },
 }

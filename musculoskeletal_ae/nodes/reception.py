@@ -42,14 +42,20 @@ class Reception:
             try:
                 callback(message)
             except MusculoskeletalError as error:
-                self.last_rejected = f'{topic}: {error}'[:LONGEST_TEXT]
-                self.rejected[f'{topic}: {error.reason}'] += 1
-                if self.rejected[f'{topic}: {error.reason}'] == 1:
-                    self._warn(f'rejected {self.last_rejected} (counted in /diagnostics)')
+                self.reject(topic, error.reason, str(error))
             else:
                 self._received[topic] += 1
 
         return receive
+
+    def reject(self, source: str, reason: str, detail: str) -> bool:
+        """Count a message or request; say whether it is the first for this reason."""
+        self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
+        self.rejected[f'{source}: {reason}'] += 1
+        first = self.rejected[f'{source}: {reason}'] == 1
+        if first:
+            self._warn(f'rejected {self.last_rejected} (counted in /diagnostics)')
+        return first
 
     def take_received(self) -> dict[str, int]:
         """Return how many messages were used since the last call, by topic."""

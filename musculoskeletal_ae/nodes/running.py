@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import ast
+import faulthandler
 import signal
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -20,14 +21,15 @@ from rclpy.exceptions import (
     InvalidParameterValueException,
     InvalidTopicNameException,
 )
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.parameters import help_text
+from musculoskeletal_ae.nodes.shield import ShieldedExecutor
 from musculoskeletal_ae.options import exit_status
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
@@ -56,12 +58,15 @@ def run(name: str) -> None:
         source = Path(__file__).with_name(f'{name}.py').read_text(encoding='utf-8')
         print(ast.get_docstring(ast.parse(source)), help_text(name), sep='\n\n')
         return
+    # What ends the interpreter itself says where, on stderr, which bringup.sh keeps.
+    with suppress(AttributeError, ValueError, RuntimeError, OSError):
+        faulthandler.enable()
     node: Node | None = None
     try:
         module = import_module(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
-        executor = SingleThreadedExecutor()
+        executor = ShieldedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -69,10 +74,10 @@ def run(name: str) -> None:
     except MusculoskeletalError as error:
         sys.exit(f'error: {error}')
     except PARAMETER_ERRORS as error:
-        sys.exit(f'error: {reason(error)}')
+        sys.exit(f'error: {printable(reason(error))}')
     except rclpy_implementation.RCLError as error:
         if node is None:
-            sys.exit(f'error: {reason(error)}')
+            sys.exit(f'error: {printable(reason(error))}')
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
             raise
@@ -125,6 +130,7 @@ def run_tool(
     `argv` are the arguments, those for ROS included; None for those of the process.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
+    faulthandler.enable()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -26,12 +27,18 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.estimation.zeroing import Zeros, no_offset
-from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import (
+    CheckpointError,
+    GateError,
+    MusculoskeletalError,
+    printable,
+)
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
+from musculoskeletal_ae.nodes.shield import refuse
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
@@ -65,6 +72,7 @@ class Shell(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
+        self._fault = ''
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -80,6 +88,33 @@ class Shell(Node):
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
+
+    # -- what must not end the node -------------------------------------------------------------
+
+    def survive(self, source: str, error: Exception) -> None:
+        """Count what a callback let out, by topic or service, and go on."""
+        kind = type(error).__name__
+        if source == 'Timer':  # no message did it
+            self._fault = f'fault of its own: {kind}: {error}'
+        if self._reception.reject(source, kind, f'{kind}: {printable(error)}'):
+            self.get_logger().error(printable(traceback.format_exc()))
+
+    def create_service(  # type: ignore[override]
+        self, srv_type: Any, srv_name: str, callback: Any, **options: Any
+    ) -> Any:
+        """Offer a service that answers, whatever its callback lets out."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response = callback(request, response)
+            except Exception as error:  # noqa: BLE001
+                self.survive(srv_name, error)
+                refuse(request, response, printable(error))
+            if hasattr(response, 'message'):
+                response.message = printable(response.message)
+            return response
+
+        return super().create_service(srv_type, srv_name, answer, **options)
 
     # -- parameters -----------------------------------------------------------------------------
 
@@ -216,7 +251,13 @@ class Shell(Node):
     # -- diagnostics ----------------------------------------------------------------------------
 
     def _report(self) -> None:
-        report = self.report()
+        try:
+            report = self.report()
+        except Exception as error:  # noqa: BLE001 - who reports nothing seems well
+            self.survive('Timer', error)
+            report = Report('error', self._fault, {})
+        if self._fault:
+            report, self._fault = Report('error', self._fault, report.values), ''
         now = time.monotonic()
         elapsed, self._reported_at = now - self._reported_at, now
         received = self._reception.take_received()
@@ -229,9 +270,9 @@ class Shell(Node):
         status = DiagnosticStatus(
             level=LEVELS[report.level],
             name=f'{self.get_fully_qualified_name()}: state',
-            message=report.message,
+            message=printable(report.message),
             hardware_id=self.robot.description.directory.name,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

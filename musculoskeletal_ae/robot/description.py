@@ -73,12 +73,13 @@ def load_description(robot: str | Path) -> RobotDescription:
     )
     joints = _read_joints(top['joints'], model)
     default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
+    links = [str(frame.name) for frame in _links(model)]
     names, routes, elastic = [], [], []
     for item in top['muscles'].items(1, 'muscles'):
         entry = item.mapping('name', 'route', 'series_elastic')
         names.append(entry['name'].name())
         muscle = entry.called(f'muscle {names[-1]!r}')
-        routes.append(_read_route(muscle['route'], model))
+        routes.append(_read_route(muscle['route'], links))
         elastic.append(_read_elastic(muscle.get('series_elastic'), default))
     return RobotDescription(
         directory=directory,
@@ -133,11 +134,11 @@ def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _read_route(entry: Entry, model: pin.Model) -> Route:
+def _read_route(entry: Entry, links: list[str]) -> Route:
     points: list[tuple[str, Array]] = []
     for item in entry.items(2, 'points'):
         point = item.mapping('link', 'xyz')
-        link = _read_link(point['link'], model)
+        link = _read_link(point['link'], links)
         xyz = point['xyz'].items(3, 'numbers')
         if len(xyz) != 3:
             raise point['xyz'].fail(f'expected 3 numbers, got {len(xyz)}')
@@ -148,8 +149,8 @@ def _read_route(entry: Entry, model: pin.Model) -> Route:
     return tuple(points)
 
 
-def _read_link(entry: Entry, model: pin.Model) -> str:
-    name, links = entry.name(), [frame.name for frame in _links(model)]
+def _read_link(entry: Entry, links: list[str]) -> str:
+    name = entry.name()
     if name not in links:
         raise entry.fail(f'unknown link {name!r}; links of robot.urdf: {", ".join(links)}')
     return name
@@ -166,7 +167,7 @@ def _read_tension(entry: Entry) -> TensionRange:
 
 def _read_end_effector(entry: Entry, model: pin.Model, joints: tuple[str, ...]) -> str:
     if entry.value is not None:
-        return _read_link(entry, model)
+        return _read_link(entry, [frame.name for frame in _links(model)])
     # The last link of the chain: the one with the most of our joints above it, and of several
     # on the same joint the one listed last.
     depth = [0]

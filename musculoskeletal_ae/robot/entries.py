@@ -4,10 +4,15 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
+
+LARGEST = 1e8  # [SI units] of any number
+LONGEST_NAME = 200
+MOST_ITEMS = 1000  # of any list: muscles, points of a route, joints
 
 
 class Entry:
@@ -48,6 +53,8 @@ class Entry:
     def items(self, at_least: int, of_what: str) -> list[Entry]:
         """Return the entries of a list of at least so many things."""
         value = self.value
+        if isinstance(value, list) and len(value) > MOST_ITEMS:
+            raise self.fail(f'expected at most {MOST_ITEMS} {of_what}, {len(value)} given')
         if not isinstance(value, list) or len(value) < at_least:
             count = f'{len(value)} given' if isinstance(value, list) else f'got {value!r}'
             raise self.fail(f'expected a list of at least {at_least} {of_what}, {count}')
@@ -58,10 +65,10 @@ class Entry:
         value, result = self.value, math.nan
         if isinstance(value, int | float) and not isinstance(value, bool):
             # An integer too long for a float overflows; no such number means anything here.
-            result = float(value) if abs(value) < 1e300 else math.inf
+            result = float(value) if abs(value) <= LARGEST else math.inf
         if not math.isfinite(result):
             hint = ' (YAML reads 1e5 as text; write 1.0e+5)' if isinstance(value, str) else ''
-            raise self.fail(f'expected a finite number, got {value!r}{hint}')
+            raise self.fail(f'expected a finite number up to {LARGEST:g}, got {value!r}{hint}')
         if result <= above or result < least:
             bound = f'> {above:g}' if result <= above else f'>= {least:g}'
             raise self.fail(f'expected a number {bound}, got {result:g}')
@@ -71,12 +78,14 @@ class Entry:
         """Return a text that is not empty."""
         if not isinstance(self.value, str) or not self.value.strip():
             raise self.fail(f'expected a name, got {self.value!r}')
+        if len(self.value) > LONGEST_NAME or printable(self.value) != self.value:
+            raise self.fail(f'expected up to {LONGEST_NAME} characters that can be printed')
         return self.value
 
     def unique(self, names: list[str]) -> tuple[str, ...]:
         """Return the names in this entry, none of which may be there twice."""
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise self.fail(f'{name!r} is listed twice; names must be unique')
         return tuple(names)
 

@@ -8,12 +8,19 @@ drops the whole inertial element and goes on with a link that weighs nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
+
+# A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
+MOST_PARTS, DEEPEST = 2000, 50  # links and joints; levels of elements
+LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
+AXES = ('x', 'y', 'z')
 
 #: how many numbers an attribute holds, by element
 NUMBERS = {
@@ -35,18 +42,35 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         RobotDescriptionError: Naming the file, the link or joint, and what is expected.
     """
     try:
-        # The file is the user's own, and expat bounds the expansion of entities.
-        root = ET.fromstring(text)  # noqa: S314
+        if '<!DOCTYPE' in text:
+            raise ValueError('a URDF has no DOCTYPE')
+        root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
+        if max(_levels(root)) > DEEPEST:
+            raise ValueError(f'more than {DEEPEST} levels')
     except (ET.ParseError, ValueError) as error:
         raise RobotDescriptionError(f'{file}: not valid XML: {error}') from error
-    for part in root:
-        if part.tag in ('link', 'joint'):
-            for element in part.iter():
-                _check(f'{file}: {part.tag} {part.get("name")!r}', element)
+    parts = [part for part in root if part.tag in ('link', 'joint')]
+    if len(parts) > MOST_PARTS:
+        raise RobotDescriptionError(f'{file}: more than {MOST_PARTS} links and joints')
+    for part in parts:
+        where = f'{file}: {part.tag} {part.get("name")!r}'
+        if printable(name := part.get('name', '')) != name:
+            raise RobotDescriptionError(f'{where}: expected a name that can be printed')
+        for element in part.iter():
+            _check(where, element)
     try:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f'{file}: not a valid URDF: {error}') from error
+
+
+def _levels(root: ET.Element) -> Iterator[int]:
+    """Walk the elements and say how deep each is, without recursion."""
+    waiting = [(root, 1)]
+    while waiting:
+        element, level = waiting.pop()
+        yield level
+        waiting += [(child, level + 1) for child in element]
 
 
 def _check(part: str, element: ET.Element) -> None:
@@ -60,9 +84,24 @@ def _check(part: str, element: ET.Element) -> None:
             values = []
         expected = 'a finite number' if count == 1 else f'{count} finite numbers'
         wrong = len(values) != count or not all(map(math.isfinite, values))
+        if (
+            not wrong
+            and attribute not in ('effort', 'velocity')
+            and max(map(abs, values)) > LARGEST
+        ):
+            wrong, expected = True, f'{expected} of at most {LARGEST:g}'
         if not wrong and element.tag == 'mass' and values[0] < 0.0:
             wrong, expected = True, 'a mass >= 0 kg'
         if wrong:
             raise RobotDescriptionError(
                 f'{part}: {element.tag} {attribute}: expected {expected}, got {text!r}'
+            )
+    if element.tag == 'inertia':
+        inertia = [
+            [float(element.get('i' + ''.join(sorted(a + b)), 0.0)) for b in AXES] for a in AXES
+        ]
+        least, *_, most = np.linalg.eigvalsh(inertia)
+        if least < -1e-9 * max(most, 1e-9):
+            raise RobotDescriptionError(
+                f'{part}: inertia: expected principal moments >= 0, got {least:g} kg·m²'
             )

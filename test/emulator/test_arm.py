@@ -13,6 +13,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.validity import MOST_WRENCH
 
 
 @pytest.fixture(scope='module')
@@ -197,3 +198,23 @@ def test_the_marker_is_seen_where_the_hand_is(robot):
     true = robot.kinematics.end_effector_pose(arm.theta).translation
     np.testing.assert_allclose(seen.mean(axis=0), true, atol=1e-3)
     assert 5e-4 < seen.std(axis=0).max() < 1e-2
+
+
+@pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
+def test_no_wrench_that_is_taken_breaks_it_and_reset_mends_one_that_does(name):
+    robot, rng = Robot.load(name), np.random.default_rng(0)
+    arm = EmulatedArm(robot, 1)
+    for payload in (0.0, 20.0):
+        arm.set_payload(payload)
+        for theta in robot.random_postures(5, rng):
+            arm.reset(theta)
+            arm.set_wrench(MOST_WRENCH * rng.choice([-1.0, 1.0], 6))
+            arm.step(1.0)
+            assert not arm.broken
+    arm.set_wrench(np.full(6, 1e7))
+    arm.step(1.0)
+    assert arm.broken
+    arm.reset()
+    arm.step(1.0)
+    assert not arm.broken
+    assert np.abs(arm.velocity).max() < 10.0

@@ -115,13 +115,13 @@ def test_a_learner_publishes_no_network_that_the_gate_refuses_and_goes_back_on_a
     good = learner.poll(0.0)
     with pytest.raises(GateError):
         learner.replace(ATTACKS['weights × 1.5'](trained['default']))
-    update = Update(ATTACKS['weights × 1.5'](trained['default']), 0.0, 0.0, np.zeros(0))
+    update = Update(ATTACKS['weights × 1.5'](trained['default']), 0.0)
     learner._take(update)
     assert learner.poll(10.0) is None
     assert learner.refused == 1
     assert 'limit' in learner.report().values['last refused']
     assert learner.checkpoint == good
-    learner._take(Update(trained['paper'], 0.0, 0.0, np.zeros(0)))
+    learner._take(Update(trained['paper'], 0.0))
     assert learner.poll(20.0) is not None
     learner.anomaly(True)
     assert learner.poll(30.0) is not None

@@ -432,3 +432,29 @@ def test_a_copy_made_at_any_moment_of_a_replacement_is_all_of_one_state(
     assert outcomes == sorted(outcomes, reverse=True)
     assert len(outcomes) > 20
     assert not list(copies[-1].glob('*.tmp'))
+
+
+@pytest.mark.parametrize('name', [FILE, 'samples.log', 'checkpoint.safetensors'])
+@pytest.mark.parametrize('kind', ['fifo', 'endless', 'huge', 'folder'])
+def test_no_file_of_a_state_can_be_anything_else(tmp_path, arm26, stage, name, kind):
+    file, state = tmp_path / name, None
+    if kind == 'fifo':
+        os.mkfifo(file)
+    elif kind == 'endless':
+        file.symlink_to('/dev/zero')
+    elif kind == 'folder':
+        file.mkdir()
+    else:
+        with file.open('wb') as stream:
+            stream.truncate(1 << 31)
+    try:
+        state, store = State(tmp_path, arm26), SampleStore()
+        state.load(store)
+        store.add(stage.sample())
+        state.keep(store, None)
+        assert not state.trouble or str(file) in state.trouble
+    except StateError:  # in one line, which the learner ends with
+        pass
+    finally:
+        if state is not None:
+            state.close()

@@ -9,9 +9,11 @@ from controlled_arm import RATE_LIMIT, ControlledArm
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.control.controller import LONGEST_STEP
 from musculoskeletal_ae.nodes.messages import bytes_message
 from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.stop_recording import FILE
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
@@ -45,6 +47,19 @@ def test_stop_pays_out_keeps_commanding_and_only_reset_ends_it(moving):
     assert 'stopped' in refused.message
     assert reset(arm).success
     arm.goes_to(HERE)
+
+
+def test_the_seconds_before_a_stop_are_kept_as_a_bag(moving, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    arm = moving()
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    files = arm.graph.wait(lambda: list(tmp_path.glob(f'stop_*/{FILE}')), 'the recording')
+    assert files[0].read_text() == 'controller/stop was called\n'
+    bag = Bag.open(files[0].parent)
+    sent = [m for m in bag.messages() if m.topic.endswith('/muscle_length_command')]
+    assert 30 < len(sent) <= len(arm.sent())
+    heard = {name.rpartition('/')[2] for name in bag.topics}
+    assert {'muscle_states', 'estimated_joint_states', 'target_joint_states'} <= heard
 
 
 def test_stop_under_tension_commands_lets_go_to_the_bias(moving):

@@ -143,6 +143,37 @@ def test_reset_brings_it_back(arm, arm26):
     np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
 
 
+def test_what_no_hand_can_take_neither_breaks_it_for_good(arm, arm26):
+    push = arm.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
+    message = WrenchStamped()
+    message.wrench.torque.x = 1000.0
+    push.publish(message)
+    arm.wait(lambda: sum(arm.emulator.rejected.values()), 'the refusal')
+    arm.emulator.arm.set_wrench(np.full(6, 1e9))
+    arm.wait(lambda: arm.emulator.report().level == 'error', 'the report')
+    assert arm.call(Trigger, 'hardware_emulator/reset').success
+    assert np.isfinite(rows(arm, arm26)).all()
+    arm.next('joint_states', 20)
+    assert arm.emulator.report().level != 'error'
+
+
+def test_faults_are_switched_at_run_time(arm, arm26):
+    name = arm26.muscles[1]
+    success, reason = arm.set_parameter('hardware_emulator', 'faults', ['melt'])
+    assert not success and 'stuck_motor' in reason
+    assert arm.set_parameter(
+        'hardware_emulator', 'faults', [f'overheating {name}', f'dead_sensor tension {name}']
+    )[0]
+    arm.wait(lambda: rows(arm, arm26)[1:, 1].tolist()[0] == 0.0, 'the dead sensor')
+    assert rows(arm, arm26)[2, 1] > 80.0
+    assert arm.set_parameter('hardware_emulator', 'faults', ['drop 1'])[0]
+    before = len(arm.received['muscle_states'])
+    arm.spin(0.5)
+    assert len(arm.received['muscle_states']) - before < 10
+    assert arm.set_parameter('hardware_emulator', 'faults', [''])[0]
+    assert rows(arm, arm26)[1, 1] > 10.0
+
+
 def test_without_joint_sensors_there_are_no_joint_states(graph):
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.host(HardwareEmulator, robot='arm26', joint_sensors=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -319,3 +319,24 @@ def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained_f
     assert status == 0
     assert 'Traceback' not in output
     assert not alive(worker)
+
+
+def test_a_deleted_directory_is_an_error_at_once_and_nothing_is_lost(host, state, graph):
+    graph.listen(DiagnosticArray, '/diagnostics', 100)
+    learner = host(state_directory=state)
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+
+    def levels():
+        said = (s for m in graph.received['/diagnostics'] for s in m.status)
+        return [s.level for s in said if s.name.startswith(graph.namespace)]
+
+    shutil.rmtree(state)
+    before = len(levels())
+    graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
+    # The one report that may have been due, and the one that the loss itself brings.
+    assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
+    learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
+    graph.wait(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'its end')
+    count = learner.samples
+    graph.end(learner.node)
+    assert len(host(state_directory=state).node.core.samples) == count

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from graph import DEADLINE, executable
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, yaml_text
@@ -53,6 +54,39 @@ print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
         below = lines[lines.index(told[0]) + 1]
         assert parameter.meaning in below and parameter.unit in below
         assert all(word in below for word in parameter.legal)
+
+
+@pytest.mark.parametrize('node', PARAMETERS)
+def test_every_number_has_a_range_in_which_its_default_is(node):
+    for name, parameter in PARAMETERS[node].items():
+        first = parameter.default[0] if isinstance(parameter.default, tuple) else parameter.default
+        if isinstance(first, int | float) and not isinstance(first, bool):
+            assert parameter.within is not None, name
+            low, high = parameter.within
+            assert low <= first <= high, name
+
+
+@pytest.mark.parametrize(
+    ('node', 'name', 'value'),
+    [
+        ('learner', 'update_steps', '-5'),
+        ('learner', 'update_steps', str(2**63 - 1)),
+        ('controller', 'joint_stiffness', '[1.0e+300, 1.0e+300]'),
+        ('controller', 'joint_stiffness', '[-1.0, -1.0]'),
+        ('controller', 'max_age', '.nan'),
+        ('hardware_emulator', 'length_offset', '[1.0e+308]'),
+        ('hardware_emulator', 'faults', '[melt]'),
+    ],
+)
+def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
+    done = subprocess.run(
+        [*executable(node), '--ros-args', '-p', 'robot:=arm26', '-p', f'{name}:={value}'],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+    )
+    assert done.returncode == 1, done.stderr
+    assert name in done.stderr and 'Traceback' not in done.stderr
 
 
 def test_a_word_that_is_not_legal_is_refused_with_those_that_are():

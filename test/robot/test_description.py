@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles, write_robot
@@ -9,6 +11,7 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.urdf import MOST_PARTS, read_urdf
 
 
 def put(path, value):
@@ -196,3 +199,56 @@ def test_shipped_arms_have_the_sizes_and_names_the_paper_gives_them():
     assert (arm.joint_count, arm.muscle_count) == (2, 6)
     arms = np.abs(arm.routes.muscle_jacobian(arm.random_postures(50, np.random.default_rng(0))))
     assert (np.median(arms, axis=0) > 0.003).all(axis=1).sum() == 2  # biarticular
+
+
+# -- URDFs that nobody writes by mistake ----------------------------------------------------------
+
+
+def chain(links):
+    """A URDF of so many links, one below the other."""
+    joints = ''.join(
+        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
+        f'<child link="l{i + 1}"/></joint>'
+        for i in range(links)
+    )
+    return f'<robot name="r"><link name="l0"/>{joints}</robot>'
+
+
+def in_arm26(old, new):
+    return lambda text: text.replace(old, new, 1)
+
+
+def with_inertia(*moments):
+    values = ' '.join(f'{k}="{v}"' for k, v in zip(('ixx', 'ixy', 'iyy', 'izz'), moments))
+    return lambda text: re.sub(
+        r'<inertia [^>]*>', f'<inertia {values} ixz="0" iyz="0"/>', text, count=1
+    )
+
+
+STRANGE = {
+    'a chain of 38 000 links': (lambda _: chain(38_000), 'more than 2000'),
+    'a million levels': (lambda _: '<a>' * 500_000 + '</a>' * 500_000, 'levels'),
+    'entities': (lambda text: '<!DOCTYPE r [<!ENTITY a "b">]>' + text, 'DOCTYPE'),
+    'a negative moment': (with_inertia(-0.01, 0, 0.01, 0.01), 'principal moments'),
+    'a product too large': (with_inertia(0.01, 0.02, 0.01, 0.01), 'principal moments'),
+    'an absurd moment': (with_inertia(1e300, 0, 0.01, 0.01), 'of at most'),
+    'an absurd place': (in_arm26('xyz="0 0 ', 'xyz="0 1e300 '), 'of at most'),
+    'an escape in a name': (in_arm26('<link name="', '<link name="\x9b1m'), 'printed'),
+}
+
+
+@pytest.mark.parametrize('case', STRANGE)
+def test_a_urdf_that_nobody_writes_by_mistake_is_refused(case, tmp_path):
+    edit, problem = STRANGE[case]
+    file = copy_robot('arm26', tmp_path) / 'robot.urdf'
+    text = file.read_text()
+    assert edit(text) != text
+    file.write_text(edit(text))
+    with pytest.raises(RobotDescriptionError, match=problem) as error:
+        load_description(file.parent)
+    assert str(file) in str(error.value) and str(error.value).isprintable()
+
+
+def test_the_longest_chain_that_is_read_can_be_read(tmp_path):
+    file = copy_robot('arm26', tmp_path) / 'robot.urdf'
+    assert read_urdf(file, chain(MOST_PARTS // 2 - 1)).nframes > MOST_PARTS // 2

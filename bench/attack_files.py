@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile files: robots, tables, networks, states and recordings that are not what they say.
+
+Each must be used or refused in one line, in time and memory that a laptop does not notice. They are
+read in a child process, so that one that ends the interpreter is a finding and not the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from bench import bag_samples, fuzz
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+LONGEST = 5.0  # [s] for one file
+MOST_MEMORY = 300  # [MB] that one file may add to the process's peak
+NASTY = (0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {})
+KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
+
+
+class Attempt(NamedTuple):
+    """What became of one file: `used`, `refused`, or a finding."""
+
+    kind: str
+    outcome: str
+    seconds: float
+    memory: float  # [MB] added to the peak
+
+    @property
+    def broken(self) -> bool:
+        """Whether it is a finding."""
+        sound = self.outcome in ('used', 'refused')
+        return not sound or self.seconds > LONGEST or self.memory > MOST_MEMORY
+
+
+# -- making them ----------------------------------------------------------------------------------
+
+
+def strange_file(file: Path, rng: random.Random) -> None:
+    """Put something that is no such file in the place of one."""
+    file.unlink(missing_ok=True)
+    kind = rng.randrange(7)
+    if kind == 0:
+        os.mkfifo(file)
+    elif kind == 1:
+        file.symlink_to(rng.choice(['/dev/zero', '/dev/tty', '/dev/random', file.name]))
+    elif kind == 2:
+        file.mkdir()
+    elif kind == 3:
+        file.write_bytes(rng.randbytes(rng.choice([0, 1, 1000, 1_000_000])))
+    elif kind == 4:
+        with file.open('wb') as stream:
+            stream.truncate(rng.choice([1 << 22, 1 << 30]))  # zeros that take no disk
+    elif kind == 5:
+        file.write_text(rng.choice(['a,b\n' * 1_000_000, '[' * 400_000, '{"a":' * 400_000]))
+    else:
+        file.write_bytes('<ä/>'.encode('latin-1'))
+
+
+def changed_tree(value: object, rng: random.Random) -> object:
+    """Return a tree of lists and mappings with one entry replaced, dropped or repeated."""
+    if isinstance(value, dict) and value and rng.random() < 0.9:
+        key = rng.choice(list(value))
+        return {**value, key: changed_tree(value[key], rng)}
+    if isinstance(value, list) and value and rng.random() < 0.9:
+        i = rng.randrange(len(value))
+        middle = rng.choice([[changed_tree(value[i], rng)]] * 6 + [[], [value[i]] * 3000])
+        return [*value[:i], *middle, *value[i + 1 :]]
+    return rng.choice(NASTY)
+
+
+def bomb(rng: random.Random) -> str:
+    """Return YAML that asks for more than it is."""
+    inner = rng.choice(['[{}]', '{{<<: [{}]}}'])
+    lines = [f'a{i}: &a{i} ' + inner.format(', '.join([f'*a{i - 1}'] * 9)) for i in range(1, 30)]
+    keys = '\n'.join(f'k{i}: {i}' for i in range(8000))
+    return rng.choice(['\n'.join(['a0: &a0 {k: x}', *lines]), keys, 'a: 1' + ':00' * 100_000])
+
+
+def changed_numbers(text: str, rng: random.Random) -> str:
+    """Return a text with one of its quoted attributes replaced."""
+    parts = text.split('"')
+    parts[rng.randrange(1, len(parts), 2)] = rng.choice(
+        ['nan', '-1', '1e300', '0', '', '0 0', '1 ' * 10_000, '\x9b1m', '1e-300', '-0.001 0 0']
+    )
+    return '"'.join(parts)
+
+
+def chain(links: int) -> str:
+    """Return a URDF of so many links, one below the other."""
+    joints = ''.join(
+        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
+        f'<child link="l{i + 1}"/></joint>'
+        for i in range(links)
+    )
+    return f'<robot name="r"><link name="l0"/>{joints}</robot>'
+
+
+# -- reading them ---------------------------------------------------------------------------------
+
+
+class Reader:
+    """Makes hostile files of every kind in a folder and reads them as the package does."""
+
+    def __init__(self, folder: Path) -> None:
+        """Make the sound files that are damaged."""
+        from musculoskeletal_ae.learning.samples import Sample, SampleStore
+        from musculoskeletal_ae.learning.state import State
+        from musculoskeletal_ae.mae import checkpoint
+        from musculoskeletal_ae.mae.training import initial_mae
+        from musculoskeletal_ae.robot.robot import Robot
+
+        self.folder, self.robot = folder, Robot.load('arm26')
+        self.sound = self.robot.description.directory
+        self.network = checkpoint.to_bytes(initial_mae(self.robot, steps=2).mae)
+        store, state = SampleStore(), State(folder / 'state', self.robot)
+        state.load(store)
+        for theta in self.robot.random_postures(5, np.random.default_rng(0)):
+            tension = np.full(self.robot.muscle_count, 50.0)
+            length = self.robot.muscle_lengths(theta, tension)
+            store.add(Sample(theta, tension, length, np.zeros(self.robot.muscle_count)))
+        state.keep(store, self.network)
+        state.close()
+        self.state = (folder / 'state' / 'learner.sqlite').read_bytes()
+        self.content = bag_samples.samples(20, '/arm', 0)
+        self.bags = fuzz.bases(folder / 'bags', self.content)
+
+    def attempt(self, kind: str, rng: random.Random) -> Callable[[], object]:
+        """Make one hostile file; return what reads it."""
+        trial = self.folder / 'trial'
+        shutil.rmtree(trial, ignore_errors=True)
+        if kind in ('urdf', 'muscles', 'table'):
+            return self._robot(kind, trial, rng)
+        trial.mkdir()
+        if kind == 'checkpoint':
+            return self._checkpoint(trial / 'network.safetensors', rng)
+        if kind == 'state':
+            return self._state(trial, rng)
+        return self._bag(kind, trial, rng)
+
+    def _robot(self, kind: str, trial: Path, rng: random.Random) -> Callable[[], object]:
+        from musculoskeletal_ae.robot.checks import check_robot
+        from musculoskeletal_ae.robot.robot import Robot
+
+        shutil.copytree(self.sound, trial)
+        names = {'urdf': 'robot.urdf', 'muscles': 'muscles.yaml', 'table': 'moment_arms.csv'}
+        file = trial / names[kind]
+        data, way = file.read_bytes(), rng.random()
+        if way < 0.25:
+            strange_file(file, rng)
+        elif way < 0.5:
+            file.write_bytes(fuzz.damage(data, rng.randbytes(300), rng))
+        elif kind == 'muscles':
+            tree = changed_tree(yaml.safe_load(data), rng)
+            text = yaml.safe_dump(tree) if way < 0.9 else data.decode() + bomb(rng)
+            file.write_text(text)
+        elif kind == 'urdf':
+            long = way > 0.95
+            file.write_text(chain(38_000) if long else changed_numbers(data.decode(), rng))
+        else:
+            file.write_text(data.decode() + rng.choice(['x\n', 'a,b,c\n', 'é,é,nan\n' * 100_000]))
+        return lambda: check_robot(Robot.load(trial), postures=5)
+
+    def _checkpoint(self, file: Path, rng: random.Random) -> Callable[[], object]:
+        from musculoskeletal_ae.mae import checkpoint
+
+        size = int.from_bytes(self.network[:8], 'little')
+        way = rng.random()
+        if way < 0.2:
+            strange_file(file, rng)
+        elif way < 0.6:
+            head = json.loads(self.network[8 : 8 + size])
+            text = json.dumps(changed_tree(head, rng)).encode()
+            tensors = self.network[8 + size :]
+            file.write_bytes(len(text).to_bytes(8, 'little') + text + tensors)
+        else:
+            file.write_bytes(fuzz.damage(self.network, rng.randbytes(300), rng))
+        return lambda: checkpoint.load(file, self.robot)
+
+    def _state(self, trial: Path, rng: random.Random) -> Callable[[], object]:
+        from musculoskeletal_ae.learning.samples import SampleStore
+        from musculoskeletal_ae.learning.state import State
+
+        name = rng.choice(['learner.sqlite'] * 4 + ['samples.log', 'checkpoint.safetensors'])
+        if name != 'learner.sqlite' or rng.random() < 0.3:
+            strange_file(trial / name, rng)
+        else:
+            (trial / name).write_bytes(fuzz.damage(self.state, rng.randbytes(300), rng))
+
+        def read() -> None:
+            state = State(trial, self.robot)
+            state.load(SampleStore())
+            state.close()
+
+        return read
+
+    def _bag(self, kind: str, trial: Path, rng: random.Random) -> Callable[[], object]:
+        base = rng.choice([b for b in self.bags if kind == 'mcap' or 'metadata.yaml' in b.files])
+        for file, data in base.files.items():
+            (trial / file).write_bytes(data)
+        victim = trial / (base.mcap if kind == 'mcap' else 'metadata.yaml')
+        way = rng.random()
+        if way < 0.3:
+            strange_file(victim, rng)
+        elif way < 0.6 and kind == 'metadata':
+            tree = changed_tree(yaml.safe_load(victim.read_bytes()), rng)
+            victim.write_text(rng.choice([yaml.safe_dump(tree), bomb(rng)]))
+        else:
+            other = rng.choice(self.bags)
+            victim.write_bytes(fuzz.damage(victim.read_bytes(), other.files[other.mcap], rng))
+        path = victim if 'bare.mcap' in base.files else trial
+
+        def read() -> None:
+            outcome = fuzz.attempt(path, base, self.content, unfinished=rng.random() < 0.5).outcome
+            if outcome not in ('full', 'prefix', 'refused', 'wrong read'):
+                raise RuntimeError(outcome)
+            if outcome == 'refused':
+                raise MusculoskeletalError(outcome)
+
+        return read
+
+
+def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:
+    """Read files number `start` to `count`."""
+    reader = Reader(folder)
+    for i in range(start, count):
+        kind = KINDS[i % len(KINDS)]
+        read = reader.attempt(kind, random.Random(f'{seed}/{i}'))  # noqa: S311 - repeatable
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        begun = time.monotonic()
+        print(json.dumps(['begun', i, kind]), flush=True)
+        try:
+            read()
+            outcome = 'used'
+        except MusculoskeletalError as error:
+            outcome = 'refused' if str(error).isprintable() else 'escapes in the refusal'
+        except Exception as error:  # noqa: BLE001 - whatever is let out is a finding
+            outcome = f'{type(error).__name__}: {error}'[:200]
+        memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        yield Attempt(kind, outcome, time.monotonic() - begun, memory)
+
+
+def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
+    """Read so many hostile files in child processes; return tried, findings, and outcomes."""
+    findings, outcomes, done = [], Counter[str](), 0
+    while done < count:
+        with tempfile.TemporaryDirectory() as folder:
+            words = [sys.executable, '-m', 'bench.attack_files', str(done), str(count), str(seed)]
+            child = subprocess.Popen(
+                [*words, folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            assert child.stdout is not None and child.stderr is not None
+            begun, last = done, ''
+            for line in child.stdout:
+                said = json.loads(line)
+                if said[0] == 'begun':
+                    last = f'file {said[1]}, {said[2]}'
+                    continue
+                result, done = Attempt(*said), done + 1
+                outcomes[f'{result.kind}: {result.outcome.split(":")[0]}'] += 1
+                if result.broken:
+                    findings.append(f'{last}: {result}')
+            if child.wait() != 0:
+                findings.append(f'{last}: status {child.returncode}, {child.stderr.read()[-300:]}')
+                done += 1 if last else count
+                if done == begun:
+                    break
+    return min(done, count), findings, outcomes
+
+
+def _child(start: str, count: str, seed: str, folder: str) -> None:
+    # What hangs ends the child, and that is a finding.
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+    resource.setrlimit(resource.RLIMIT_CPU, (3600, 3600))
+    import faulthandler
+
+    faulthandler.enable()
+    for result in attempts(int(start), int(count), int(seed), Path(folder)):
+        print(json.dumps(result), flush=True)
+        faulthandler.dump_traceback_later(60.0, exit=True)
+
+
+if __name__ == '__main__':
+    _child(*sys.argv[1:])

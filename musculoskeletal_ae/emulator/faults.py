@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of wires, motors, sensors and their cables, switched while the arm moves.
+
+A fault is one line, `KIND [QUANTITY] [MUSCLE] [SIZE]`: 'drop 0.3', 'stuck_motor biceps',
+'bias tension 40'. Without a muscle it is all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import QUANTITIES
+
+SPIKE_SHARE = 0.05  # of the readings have a spike, one muscle each
+
+
+class Kind(NamedTuple):
+    """What can be broken, and what its size means."""
+
+    meaning: str
+    size: float = 0.0  # by default
+    most: float = 0.0  # 0: it has no size
+    unit: str = ''
+    of_muscle: bool = True
+    of_quantity: bool = False
+
+
+#: sizes of spike and bias by quantity, [m], [N], [°C]: default, most
+SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3)}
+KINDS = {
+    'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
+    'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),
+    'duplicate': Kind('readings come twice', 0.5, 1.0, 'share', of_muscle=False),
+    'reorder': Kind('readings come after the next one', 0.5, 1.0, 'share', of_muscle=False),
+    'freeze': Kind('sensors repeat what they read', of_quantity=True),
+    'dead_sensor': Kind('sensors read 0', of_quantity=True),
+    'spike': Kind('sensors are off now and then', *SIZES['length'], of_quantity=True),
+    'bias': Kind('sensors are off', *SIZES['length'], of_quantity=True),
+    'stuck_motor': Kind('motors stand'),
+    'slack_wire': Kind('wires are longer', 0.05, 1.0, 'm'),
+    'overheating': Kind('modules are hot', 90.0, 1e3, '°C'),
+}
+LEGAL = 'KIND [QUANTITY] [MUSCLE] [SIZE]; kinds: ' + ', '.join(KINDS)
+
+
+class Readings(NamedTuple):
+    """One sample of the arm's sensors."""
+
+    theta: Array  # joint angles [rad], (D,)
+    length: Array  # muscle lengths [m], (M,)
+    tension: Array  # muscle tensions [N], (M,)
+    temperature: Array  # housing temperatures of the modules [°C], (M,)
+
+
+class Fault(NamedTuple):
+    """One line, understood."""
+
+    kind: str
+    quantities: tuple[str, ...]
+    muscles: Ints
+    size: float
+
+
+def read_fault(line: str, robot: Robot) -> Fault:
+    """Return what one line says.
+
+    Raises:
+        MusculoskeletalError: If it says nothing legal; the message says what is.
+    """
+    name, *words = line.split() or ['']
+    if name not in KINDS:
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+    kind = KINDS[name]
+    quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
+    size, most = kind.size, kind.most
+    if kind.of_quantity and words and words[0] in QUANTITIES:
+        quantities = (words.pop(0),)
+    elif kind.size:
+        quantities = quantities[:1]  # of a spike or bias: length
+    if quantities and kind.size:
+        size, most = SIZES[quantities[0]]
+    if words and most:
+        try:
+            size = float(words[-1])
+            words.pop()
+        except ValueError:
+            pass
+    if not abs(size) <= most or (size < 0.0 and name not in ('spike', 'bias')):
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: sizes up to {most:g} {kind.unit}')
+    if words and not kind.of_muscle:
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {name} [SIZE], which is of all readings')
+    muscles = robot.muscle_indices([' '.join(words)] if words else robot.muscles)
+    return Fault(name, quantities, np.array(muscles), size)
+
+
+class Faults:
+    """All faults of one arm."""
+
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
+        """Nothing is broken."""
+        self._robot, self._rng = robot, rng
+        self._faults: tuple[Fault, ...] = ()
+        self._frozen: dict[tuple[str, int], float] = {}
+        self._held: Readings | None = None  # to come after the next one
+        self._queue: list[tuple[float, Readings]] = []
+        # What the mechanics follows, each (M,): 1 where the motor stands, wire too long [m],
+        # and the least temperature of the housing [°C].
+        self.stuck, self.slack, self.hot = np.zeros((3, robot.muscle_count))
+        self.set([])
+
+    def set(self, lines: Iterable[str]) -> None:
+        """Break what the lines say and mend all else.
+
+        Raises:
+            MusculoskeletalError: If one says nothing legal; nothing changes then.
+        """
+        self._faults = tuple(read_fault(line, self._robot) for line in lines)
+        self._frozen.clear()
+        for state, name in ((self.stuck, 'stuck_motor'), (self.slack, 'slack_wire')):
+            state[:] = 0.0
+            for fault in self._of(name):
+                state[fault.muscles] = fault.size or 1.0
+        self.hot[:] = -np.inf
+        for fault in self._of('overheating'):
+            self.hot[fault.muscles] = fault.size
+
+    def _of(self, *names: str) -> list[Fault]:
+        return [fault for fault in self._faults if fault.kind in names]
+
+    def sensed(self, readings: Readings) -> Readings:
+        """Return what the broken sensors read instead."""
+        values = {name: getattr(readings, name).copy() for name in QUANTITIES}
+        for fault in self._of('bias', 'spike', 'dead_sensor', 'freeze'):
+            for name in fault.quantities:
+                value, muscles = values[name], fault.muscles
+                if fault.kind == 'bias':
+                    value[muscles] += fault.size
+                elif fault.kind == 'dead_sensor':
+                    value[muscles] = 0.0
+                elif fault.kind == 'freeze':
+                    value[muscles] = [
+                        self._frozen.setdefault((name, m), float(value[m])) for m in muscles
+                    ]
+                elif self._rng.random() < SPIKE_SHARE:
+                    value[self._rng.choice(muscles)] += fault.size
+        return readings._replace(**values)
+
+    def _happens(self, name: str) -> bool:
+        return any(self._rng.random() < fault.size for fault in self._of(name))
+
+    def delivered(self, readings: Readings, now: float) -> list[Readings]:
+        """Return what arrives at `now` [s], in this order, when `readings` have been sent."""
+        sent = [] if self._happens('drop') else [readings]
+        if sent and self._happens('duplicate'):
+            sent *= 2
+        if self._held is not None and sent:
+            sent, self._held = [*sent, self._held], None
+        elif sent and self._happens('reorder'):
+            sent, self._held = [], readings
+        late = sum(fault.size for fault in self._of('delay'))
+        self._queue += [(now + late, one) for one in sent]
+        due = [one for at, one in self._queue if at <= now]
+        self._queue = [(at, one) for at, one in self._queue if at > now]
+        return due

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last seconds before a latched stop, kept as a bag that `replay` plays.
+
+A node remembers what it heard and said, as it came. When it stops, a thread writes that to
+`stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh), so that the commands of the
+stop are not late; the oldest recordings beyond a number are deleted.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections import deque
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rclpy.logging import get_logging_directory
+from rclpy.serialization import serialize_message
+
+from musculoskeletal_ae.bags.metadata import offered_qos
+from musculoskeletal_ae.bags.topics import TOPICS
+from musculoskeletal_ae.bags.writer import BagWriter
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+SECONDS = 10.0  # that are kept
+MOST = 50_000  # messages, however fast they come
+FILE = 'cause.txt'  # why the node stopped, in the bag's directory
+
+
+class Heard(NamedTuple):
+    """A message, and when it came on which topic."""
+
+    time: int  # [ns]
+    topic: str
+    message: Any
+
+
+class StopRecording:
+    """Remembers the last seconds of some topics; writes them on request."""
+
+    def __init__(self, resolve: Any, directory: Path | None = None) -> None:
+        """Remember nothing yet; resolve: a topic's full name; directory: where bags are written."""
+        self._resolve = resolve
+        self._directory = directory or Path(get_logging_directory())
+        self._recent: deque[Heard] = deque(maxlen=MOST)
+        self._latched: dict[str, Heard] = {}
+        self._writing: threading.Thread | None = None
+        self.problem = ''  # why the last recording could not be written
+        self.saved: Path | None = None  # the last one
+
+    def heard(self, topic: str, message: Any) -> None:
+        """Remember a message of one of `bags.topics.TOPICS`."""
+        now = time.time_ns()
+        if TOPICS[topic].latched:
+            self._latched[topic] = Heard(now, topic, message)
+        self._recent.append(Heard(now, topic, message))
+        oldest = now - int(SECONDS * 1e9)
+        while self._recent[0].time < oldest:
+            self._recent.popleft()
+
+    def save(self, cause: str, most: int) -> None:
+        """Write what is remembered, in the background; keep so many recordings (0: none)."""
+        messages = list(self._recent)
+        if not (messages and most) or (self._writing is not None and self._writing.is_alive()):
+            return
+        begin = messages[0].time
+        before = [kept._replace(time=begin) for kept in self._latched.values() if kept.time < begin]
+        self._writing = threading.Thread(target=self._save, args=(cause, most, before + messages))
+        self._writing.start()
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        if self._writing is not None:
+            self._writing.join()
+
+    def _save(self, cause: str, most: int, messages: list[Heard]) -> None:
+        bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
+        try:
+            with BagWriter(bag) as writer:
+                numbers: dict[str, int] = {}
+                for when, name, message in messages:
+                    if name not in numbers:
+                        topic = TOPICS[name]
+                        qos = [offered_qos(topic.latched)]
+                        numbers[name] = writer.add_topic(self._resolve(name), topic.type, qos)
+                    writer.write(numbers[name], when, when, serialize_message(message))
+            (bag / FILE).write_text(f'{cause}\n', encoding='utf-8')
+            for old in sorted(self._directory.glob(f'stop_*/{FILE}'))[:-most]:
+                shutil.rmtree(old.parent)
+        except (MusculoskeletalError, OSError) as error:
+            self.problem = f'the seconds before the stop could not be kept: {error}'
+            return
+        self.saved, self.problem = bag, ''

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Emulator, estimator and controller stepped together: what each fault of the arm may do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.faults import KINDS
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+MUSCLE = ROBOT.muscles[3]
+DT = 0.01
+
+
+class Loop:
+    """The arm under control, on a clock of its own."""
+
+    def __init__(self, mae):
+        self.arm, self.estimator = EmulatedArm(ROBOT, 1), Estimator(ROBOT)
+        self.controller = Controller(ROBOT)
+        self.estimator.use(mae)
+        self.controller.use(mae)
+        self.now, self.commands, self.pulls = 0.0, [], []
+        middle = 0.5 * (ROBOT.lower + ROBOT.upper)
+        self.run(0.5)
+        self.controller.target({n: (a, 0.0) for n, a in zip(ROBOT.joints, middle)})
+        self.run(8.0)
+        self.commands.clear()
+        self.pulls.clear()
+
+    @property
+    def cause(self):
+        return self.controller.safety.cause
+
+    def run(self, seconds):
+        """Let time pass as it does between the nodes."""
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            self.arm.step(DT)
+            for reading in self.arm.faults.delivered(self.arm.sense(), self.now):
+                self.read(reading)
+            command = self.controller.step(self.now)
+            if command is not None:
+                self.arm.command_length(command.value)
+                self.commands.append(command.value)
+                self.pulls.append(self.arm.tension)
+
+    def read(self, reading):
+        try:
+            self.controller.muscles(Muscles(*reading[1:]), self.now)
+            estimate = self.estimator.step(reading.tension, reading.length, self.now, self.now)
+            if estimate is not None:
+                self.controller.estimated(estimate.state.theta, self.now)
+                if estimate.detected:
+                    self.controller.anomaly(True)
+        except MessageError:
+            pass
+
+    def mend(self):
+        """Do what a person does then."""
+        self.arm.faults.set([])
+        self.arm.reset(self.arm.theta)
+        self.run(3.0)
+        self.estimator.reset()
+        self.controller.anomaly(False)
+        refused = self.controller.reset(self.now)
+        self.run(6.0)
+        return refused
+
+
+@pytest.fixture
+def loop(trained):
+    return Loop(trained['default'])
+
+
+#: what may stop the arm under a fault, '' for going on
+PROMISES = {
+    'drop 0.5': '',
+    'drop 1': 'older than',
+    'delay': '',
+    'duplicate': '',
+    'reorder': '',
+    f'spike length {MUSCLE}': '',
+    f'spike tension {MUSCLE} 400': '',
+    'spike temperature': '',
+    f'bias length {MUSCLE} 0.3': 'muscle_states',
+    f'bias tension {MUSCLE} 400': 'tension above',
+    f'bias temperature {MUSCLE} 90': 'overheated',
+    f'overheating {MUSCLE}': '',  # it pulls with T_bias only
+    f'overheating {MUSCLE} 120': 'overheated',
+    f'freeze {MUSCLE}': None,
+    'freeze': None,
+    f'dead_sensor {MUSCLE}': None,
+    f'dead_sensor tension {MUSCLE}': None,
+    f'stuck_motor {MUSCLE}': None,
+    f'slack_wire {MUSCLE}': None,
+}
+
+
+@pytest.mark.parametrize('fault', PROMISES)
+def test_under_a_fault_no_command_jumps_and_once_mended_the_arm_goes_on(loop, fault):
+    held = loop.arm.theta
+    loop.arm.faults.set([fault])
+    loop.run(4.0)
+    cause, expected = loop.cause, PROMISES[fault]
+    steps = np.diff(loop.commands, axis=0)
+    tick = loop.controller.settings.rate_limit * DT * (1.0 + 1e-9)
+    eased = np.array(loop.pulls)[1:] > ROBOT.tension.limit
+    assert np.isfinite(steps).all()
+    assert steps.min() >= -tick
+    assert steps[~eased].max(initial=0.0) <= tick
+    if expected is not None:
+        assert expected in cause if expected else cause == '', cause
+    assert loop.mend() == ''
+    assert loop.cause == ''
+    assert np.linalg.norm(loop.arm.theta - held) < 0.35
+
+
+def test_every_kind_of_fault_has_its_promise():
+    assert {fault.split()[0] for fault in PROMISES} == set(KINDS)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults on request: each does what it is named after, and only that, until it is mended."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+
+MUSCLE = 2
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('arm26')
+
+
+@pytest.fixture
+def arm(robot):
+    return EmulatedArm(robot, 1)
+
+
+def numbered(robot, i):
+    """Return readings that say which they are."""
+    return Readings(np.zeros(robot.joint_count), *np.full((3, robot.muscle_count), float(i)))
+
+
+def delivered(robot, line, count=400, period=0.0078125):
+    faults = Faults(robot, np.random.default_rng(0))
+    faults.set([line])
+    arrived = [faults.delivered(numbered(robot, i), i * period) for i in range(count)]
+    return [[int(one.length[0]) for one in readings] for readings in arrived]
+
+
+def test_readings_get_lost_come_late_twice_or_after_the_next(robot):
+    assert delivered(robot, 'drop 0') == [[i] for i in range(400)]
+    lost = delivered(robot, 'drop 0.25')
+    assert 40 < sum(one == [] for one in lost) < 160
+    assert all(one in ([], [i]) for i, one in enumerate(lost))
+    assert delivered(robot, 'drop 1', 50) == [[]] * 50
+    late = delivered(robot, 'delay 0.0390625', 50)
+    assert late == [[]] * 5 + [[i] for i in range(45)]
+    twice = delivered(robot, 'duplicate')
+    assert {len(one) for one in twice} == {1, 2}
+    swapped = delivered(robot, 'reorder')
+    assert {tuple(np.diff(one)) for one in swapped} == {(), (-1,)}
+    order = np.concatenate(swapped)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
+
+
+def sensed(arm, line, count=300):
+    arm.faults.set([line])
+    return [np.stack(arm.sense()[1:]) for _ in range(count)]
+
+
+def test_sensors_are_off_repeat_themselves_or_die(arm, robot):
+    healthy = np.mean(sensed(arm, 'drop 0'), axis=0)
+    others = np.arange(robot.muscle_count) != MUSCLE
+    name = robot.muscles[MUSCLE]
+    for line, row, size in (
+        ('bias', 0, 0.05),
+        ('bias tension', 1, 100.0),
+        ('bias length', 0, -0.1),
+    ):
+        text = f'{line} {name}' + (f' {size}' if size < 0.0 else '')
+        off = np.mean(sensed(arm, text), axis=0) - healthy
+        assert off[row, MUSCLE] == pytest.approx(size, rel=0.05)
+        assert np.abs(off[:, others]).max() < 0.5
+    dead = sensed(arm, f'dead_sensor tension {name}', 3)[-1]
+    assert dead[1, MUSCLE] == 0.0 and dead[1, others].min() > 5.0 and dead[0, MUSCLE] != 0.0
+    assert not np.any(sensed(arm, 'dead_sensor', 1))
+    frozen = np.array(sensed(arm, f'freeze {name}', 50))
+    assert np.ptp(frozen[:, :, MUSCLE], axis=0).max() == 0.0
+    assert np.ptp(frozen[:, 1, :], axis=0)[others].min() > 0.0
+    spikes = np.array(sensed(arm, 'spike temperature 80', 300))[:, 2]
+    assert 1 <= np.sum(spikes > 90.0) < 60
+    assert np.all(np.sum(spikes > 90.0, axis=1) <= 1)
+
+
+def hold(arm, robot, lines, seconds=1.5, tension=80.0):
+    arm.faults.set(lines)
+    theta = 0.5 * (robot.lower + robot.upper)
+    tensions = np.full(robot.muscle_count, tension)
+    command = robot.muscle_lengths(theta, tensions) - (tension - 30.0) / robot.stiffness
+    for _ in range(round(seconds / 0.01)):
+        arm.command_length(command)
+        arm.step(0.01)
+    return arm.sense()
+
+
+def test_a_stuck_motor_stands_and_goes_on(arm, robot):
+    before = arm.sense().length
+    after = hold(arm, robot, [f'stuck_motor {robot.muscles[MUSCLE]}']).length
+    assert after[MUSCLE] == pytest.approx(before[MUSCLE], abs=1e-3)
+    assert np.abs(after - before).max() > 0.01
+    assert abs(hold(arm, robot, []).length[MUSCLE] - before[MUSCLE]) > 0.005
+
+
+def test_a_slack_wire_is_wound_in(robot):
+    healthy, slack = (EmulatedArm(robot, 1) for _ in range(2))
+    before = hold(healthy, robot, []).length
+    slack.faults.set([f'slack_wire {robot.muscles[MUSCLE]}'])
+    slack.step(0.01)
+    assert slack.tension[MUSCLE] < 5.0
+    after = hold(slack, robot, [f'slack_wire {robot.muscles[MUSCLE]}'], 4.0).length
+    assert after[MUSCLE] - before[MUSCLE] < -0.02
+
+
+def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
+    name = robot.muscles[MUSCLE]
+    hot = hold(arm, robot, [f'overheating {name} 95'], 0.1).temperature
+    assert hot[MUSCLE] > 90.0 and np.delete(hot, MUSCLE).max() < 40.0
+    arm.faults.set([])
+    arm.step(0.1)
+    assert arm.sense().temperature[MUSCLE] > 90.0  # a body cools slowly
+    arm.reset()
+    assert arm.sense().temperature.max() < 40.0
+
+
+@pytest.mark.parametrize(
+    'line',
+    ['', 'melt', 'drop 2', 'drop -0.1', 'drop nan', 'delay 11', 'drop arm26', 'stuck_motor nobody',
+     'stuck_motor 3', 'bias pressure', 'spike length inf', 'freeze length 1', 'slack_wire 1e308'],
+)  # fmt: skip
+def test_what_is_no_fault_is_refused_with_what_is_legal(line, arm):
+    arm.faults.set(['stuck_motor'])
+    with pytest.raises(MusculoskeletalError, match='legal'):
+        arm.faults.set(['drop', line])
+    assert arm.faults.stuck.all()
+
+
+@pytest.mark.parametrize('name', KINDS)
+def test_every_kind_is_legal_by_its_name_alone_and_mended(name, arm, robot):
+    assert read_fault(name, robot).kind == name
+    arm.faults.set([name])
+    hold(arm, robot, [name], 0.2)
+    hold(arm, robot, [], 0.5)
+    assert arm.faults.delivered(arm.sense(), 100.0)
+    assert not arm.faults.stuck.any() and not arm.faults.slack.any()
+    assert np.isfinite(arm.theta).all()

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept of the seconds before a stop."""
+
+from __future__ import annotations
+
+import pytest
+from std_msgs.msg import Bool, Float64MultiArray
+
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.nodes import stop_recording
+from musculoskeletal_ae.nodes.stop_recording import FILE, SECONDS, StopRecording
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """Return a clock in a list."""
+    now = [1_000_000_000_000]
+    monkeypatch.setattr(stop_recording.time, 'time_ns', lambda: now[0])
+    return now
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return StopRecording(lambda topic: f'/arm/{topic}', tmp_path)
+
+
+def states(value):
+    return Float64MultiArray(data=[value] * 3)
+
+
+def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
+    recording.heard('anomaly_detected', Bool(data=True))
+    for n in range(400):
+        now[0] += 100_000_000
+        recording.heard('muscle_states', states(float(n)))
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    messages = list(bag.messages())
+    times = [m.log_time for m in messages]
+    assert len(messages) == 102
+    assert max(times) - min(times) == int(SECONDS * 1e9)
+    assert set(bag.topics) == {'/arm/anomaly_detected', '/arm/muscle_states'}
+    assert (recording.saved / FILE).read_text() == 'a cause\n'
+
+
+def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path):
+    (tmp_path / 'stop_of_mine').mkdir()
+    for n in range(5):
+        now[0] += 1_000_000
+        recording.heard('muscle_states', states(float(n)))
+        recording.save(f'cause {n}', 2)
+        recording.close()
+    causes = sorted(file.read_text() for file in tmp_path.glob(f'*/{FILE}'))
+    assert causes == ['cause 3\n', 'cause 4\n']
+    assert (tmp_path / 'stop_of_mine').is_dir()
+
+
+def test_none_are_kept_where_none_are_wanted(recording, tmp_path):
+    recording.heard('muscle_states', states(1.0))
+    recording.save('a cause', 0)
+    recording.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_takes_nothing_is_said_and_ends_nothing(tmp_path):
+    (tmp_path / 'file').write_text('')
+    recording = StopRecording(str, tmp_path / 'file')
+    recording.heard('muscle_states', states(1.0))
+    recording.save('a cause', 1)
+    recording.close()
+    assert recording.saved is None
+    assert 'could not be kept' in recording.problem

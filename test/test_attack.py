@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The attack of `bench.attack`: its judgement, and a quick form of it."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+
+from bench import attack
+from bench.attack_files import KINDS, Reader
+from bench.attack_graph import digest, filled
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+RATE = 0.1  # [m/s]
+TIME = np.arange(50) * 0.01
+NUMBER = np.arange(50)
+NEVER = np.zeros((50, 2), dtype=bool)
+
+
+def steps(value, number=NUMBER, eased=NEVER):
+    return attack.changes(TIME, number, value, RATE, eased)
+
+
+def test_commands_that_change_too_fast_are_found():
+    ramp = np.stack([RATE * TIME, -RATE * TIME], axis=1)
+    judged = steps(ramp)
+    assert judged.too_fast == []
+    assert judged.largest_in == pytest.approx(0.001) == judged.largest_out
+    jump = ramp.copy()
+    jump[20:, 1] -= 0.01
+    (found,) = steps(jump).too_fast
+    assert 'muscle 1 by -11.0 mm' in found
+    assert steps(jump).largest_in == pytest.approx(0.011)
+    # Of a message that was missed the change is known, the tick's is not.
+    assert steps(jump, NUMBER + (NUMBER >= 20)).largest_in == pytest.approx(0.001)
+    assert steps(np.where(TIME[:, None] > 0.2, np.nan, ramp)).too_fast
+
+
+def test_only_paying_out_a_muscle_that_pulls_too_much_may_be_faster():
+    out, load = np.zeros((50, 2)), [(t, np.array([50.0, 300.0 * (t > 0.15)])) for t in TIME]
+    out[20:] += 0.02
+    eased = attack.relieved(TIME, load, 200.0, 2)
+    (found,) = steps(out, eased=eased).too_fast
+    assert 'muscle 0' in found
+    assert len(steps(-out, eased=eased).too_fast) == 2
+
+
+def test_what_is_hostile_can_be_sent_and_told_from_what_is_not():
+    rng = random.Random(0)
+    for kind in (Float64MultiArray, UInt8MultiArray):
+        messages = [filled(kind(), rng) for _ in range(50)]
+        assert len({digest(message) for message in messages}) > 10
+    assert digest(Float64MultiArray(data=[1.0])) == digest(Float64MultiArray(data=[1.0]))
+
+
+@pytest.fixture(scope='module')
+def reader(tmp_path_factory):
+    return Reader(tmp_path_factory.mktemp('hostile'))
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_hostile_files_are_read_or_refused(kind, reader):
+    outcomes = set()
+    for i in range(12):
+        read = reader.attempt(kind, random.Random(i))
+        try:
+            read()
+            outcomes.add('used')
+        except MusculoskeletalError:
+            outcomes.add('refused')
+    assert outcomes
+
+
+@pytest.mark.slow
+def test_a_quick_attack_breaks_no_promise(trained_file, tmp_path, capsys):
+    status = attack.main(['--quick', '--initial', trained_file, '--out', str(tmp_path)])
+    assert status == 0, capsys.readouterr().out
