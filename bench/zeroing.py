@@ -40,9 +40,10 @@ from musculoskeletal_ae.robot.robot import Robot
 LEAST, MOST = 0.05, 0.13  # [m]
 MINUTES, HELD_OUT, AFTER = 10.0, 300.0, 30.0  # [s] but for the first
 LONGEST = 120.0  # [s] until it is given up
-#: by how much a user's idea of the posture is off [rad]
-STATED = 0.02
-GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.2)}
+SETTLING = 20.0  # [s] until it hangs still
+#: by how much a stated posture is off: adds to the error of each joint as it is [rad]
+STATED = 0.0
+GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 
 class Loop:
@@ -86,7 +87,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     offset = rng.uniform(LEAST, MOST, robot.muscle_count)
     offset *= rng.choice([-1.0, 1.0], robot.muscle_count)
     arm = EmulatedArm(robot, seed)
-    arm.step(2.0)
+    arm.step(SETTLING)
     arm.set_length_offset(offset)
     loop, posture = Loop(robot, mae, arm, seed), tuple[float, ...]()
     if how == 'posture':

@@ -35,6 +35,7 @@ SETTLED = 20.0  # [s] of motion after which the guess is only made better
 MOST = 240  # moments
 
 LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
+WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best and least
 #: μ of a wire, with its mean; Coulomb torque of a joint over the largest that the weight needs
 FRICTION_MEAN, FRICTION, JOINT_FRICTION = 0.05, 0.05, 0.03
 TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
@@ -116,6 +117,8 @@ class Zeroing:
         self._mean = np.repeat([0.0, FRICTION_MEAN, 0.0, 0.0], counts)
         spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight.max()
         self._spread = np.repeat(spread, counts)
+        noise = LENGTH_NOISE * _worse(mae), np.full(robot.joint_count, TORQUE_NOISE)
+        self._noise = np.concatenate(noise)  # of the residuals, (M + D,)
         self._before: Array = np.zeros(robot.muscle_count)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
         self._work: Generator[None, None, Fit] | None = None
@@ -150,7 +153,7 @@ class Zeroing:
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
         """Take T [N] and readings of l [m] (M,), dt [s] after the last, and θ (D,) if measured."""
-        if self.done:
+        if self.done or (self.stands and self.trouble):
             return
         known = self._posture if self._posture is not None else theta
         unknown = np.full(self._robot.joint_count, np.nan)
@@ -186,9 +189,12 @@ class Zeroing:
         if self._moments:
             before = self._moments[0][1] if self.stands else self._before
             gone = np.abs(length - before).max()
-            if self.stands and gone > MOVED:  # it does not
-                self._moments, self.moving = [], 0.0
-            elif not self.stands and gone < MOVED:
+            if self.stands and gone > MOVED:
+                self.trouble = (
+                    'it moved away from there; let it stand and call estimator/zero again'
+                )
+                return
+            if not self.stands and gone < MOVED:
                 return
             self._before = length
             if not self.stands and gone > FASTEST * WINDOW:
@@ -281,7 +287,7 @@ class Zeroing:
         length = self._mae.lengths(fit.theta, end)
         torque, jacobian = self._torque(fit.theta, pull)
         left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
-        noise = np.repeat([LENGTH_NOISE, TORQUE_NOISE], [muscles, joints])
+        noise = self._noise
         outside = self._outside(fit.theta) / OUTSIDE
         if not slopes:
             return Linear(left / noise, outside, left, left)
@@ -346,6 +352,18 @@ class Zeroing:
             if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
+
+
+def _worse(mae: Mae) -> Array:
+    """Return how much worse than the middle one the network knows each muscle, (M,).
+
+    A muscle that ② restores badly from healthy messages pulls the zeros of all others along, since
+    a network's error is the same in neighbouring postures: its weight falls as that grows squared.
+    """
+    if mae.anomaly is None:
+        return np.ones(len(mae.muscles))
+    variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
+    return np.clip(variance / np.median(variance), *WORST)
 
 
 def _turning(theta: Array) -> Array:
