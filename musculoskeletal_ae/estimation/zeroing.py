@@ -29,7 +29,7 @@ WINDOW = 0.25  # [s] that one moment averages
 MOVED = 0.002  # [m] of some muscle since the last moment that counts
 FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small beside the weight
 #: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
-ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 46.0, 1.0
+ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 43.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
 SETTLED = 20.0  # [s] of motion after which the guess is only made better
 MOST = 240  # moments
@@ -170,7 +170,7 @@ class Zeroing:
             except StopIteration as ended:
                 self._work = None
                 self._judge(ended.value)
-        elif self._since >= (AGAIN if self._fit else FIRST) and self._moments:
+        elif self._since >= (AGAIN if self._fit and not self.stands else FIRST) and self._moments:
             self._since = 0.0
             seen = self._seen()
             if np.isnan(seen.theta).any():

@@ -58,6 +58,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             'where the arm stands when estimator/zero is called, one angle for each joint (0 or '
             '[]: unknown, zeros are found while it moves gently)',
             'rad',
+            (-100.0, 100.0),
             settable=True,
         ),
         'zero_at_start': Parameter(
