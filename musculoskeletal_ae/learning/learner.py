@@ -136,6 +136,7 @@ class Learner:
     def zeros(self, known: bool) -> None:
         """Take lengths from other zeros; nothing is learned of them while those are not known."""
         self.reset()
+        self._gate.forget()
         self._zeroed = known
 
     def enable(self, enabled: bool) -> None:

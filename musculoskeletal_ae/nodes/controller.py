@@ -53,7 +53,7 @@ class Controller(Shell):
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
-        self.follow_zeros(self.core.zeros)
+        self.follow_zeros(self._shift)
         self.follow_muscle_states(self._muscles)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
@@ -85,6 +85,10 @@ class Controller(Shell):
 
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
+
+    def _shift(self, known: bool, less: Array) -> None:
+        self.core.zeros(known, less)
+        self.gate.forget()
 
     def _muscles(self, states: Array) -> None:
         muscles, now = Muscles(*states), time.monotonic()

@@ -50,6 +50,7 @@ class Estimator(Shell):
         self.follow_checkpoints(self.core.use)
         for name in parameters_of(Slack):
             self.follow_parameter(name, partial(self._take_slack, name))
+        self.zeros = self.core.zeros
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscles('muscle_states', self._estimate, len(QUANTITIES), SENSOR)

@@ -230,7 +230,7 @@ class Shell(Node):
 
         self.follow_muscles('muscle_states', from_zero, len(QUANTITIES), SENSOR)
 
-    def follow_zeros(self, changed: Callable[[bool, Array], object] = lambda *_: None) -> None:
+    def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
         """Take zeros that the estimator found; `changed` is told whether they are known now.
 
         And how much less l [m] (M,) is than with those before.
@@ -238,7 +238,6 @@ class Shell(Node):
 
         def take(rows: Array) -> None:
             less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
-            self.gate.forget()
             changed(self.zeros.known, less)
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)

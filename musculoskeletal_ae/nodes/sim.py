@@ -43,7 +43,7 @@ class Sim(Arm):
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.follow_checkpoints(self._use_checkpoint)
-        self.follow_zeros()
+        self.follow_zeros(lambda *_: self.gate.forget())
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench(partial(setattr, self, 'wrench'))
         if not as_robot:

@@ -47,7 +47,7 @@ def loop(trained):
 
 def test_a_target_waits_for_the_zeros(loop):
     loop.run(0.1)
-    loop.core.target({name: (0.5, 0.0) for name in loop.arm.robot.joints})
+    loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
     loop.run(0.5)
     assert not loop.commands
     assert 'length zeros are unknown' in loop.core.report(loop.now).message
