@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
@@ -58,6 +59,10 @@ class Estimator(Shell):
         self.posture: tuple[float, ...] = ()
         self.follow_parameter('zero_posture', self._take_posture)
         self.unzeroed = self.parameter('zero_at_start')
+        if self.unzeroed:  # nobody moves on what sensors say before the network is there
+            unknown = np.zeros((2, self.robot.muscle_count))
+            unknown[1] = UNKNOWN
+            self.told.publish(array_message(unknown, 'quantity', 'muscle'))
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
