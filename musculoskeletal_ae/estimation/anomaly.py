@@ -15,7 +15,8 @@ there as anywhere: while one is slack, nothing widens.
 
 Physics needs no statistics: a module holds at least T_bias, so a muscle whose tension stays near
 zero while much is commanded has no wire, or a slack one. Slack is wound in by a slow winch, and no
-longer than it can be; meanwhile the rule waits.
+longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
+② restores it: slack wire is too long, and what is left of a cut one too short.
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ class AnomalyDetector:
         self._statistics: AnomalyStatistics | None = None
         #: [s] without tension, without winding in; l [m] when tension went, when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
+        self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._beyond = 0
         self.commanded()
 
@@ -110,7 +112,10 @@ class AnomalyDetector:
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < DEAD_SHARE * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
-        cause = self._beyond_threshold(size, distance, state.theta, slack) if self.judges else ''
+        waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any())
+        cause = ''
+        if self.judges:
+            cause = self._beyond_threshold(size, distance, state.theta, slack, waits)
         return Verdict(size, distance, suspect, cause)
 
     def unfamiliar(self, theta: Array) -> float:
@@ -122,7 +127,9 @@ class AnomalyDetector:
         nearest = float(np.sqrt(np.square(share).sum(axis=1).min()))
         return max(0.0, (nearest - NEAR) / FAR)
 
-    def _beyond_threshold(self, anomaly: float, distance: float, theta: Array, slack: Bools) -> str:
+    def _beyond_threshold(
+        self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
+    ) -> str:
         limit, value, what, where = self.threshold, anomaly, 'A', ''
         if limit <= 0.0:
             if self._statistics is None or not self._statistics.calibrated:
@@ -131,7 +138,7 @@ class AnomalyDetector:
             value, what = distance, 'd'
             if value > limit and not slack.any() and (far := self.unfamiliar(theta)) > 0.0:
                 limit, where = limit * min(WIDEST, 1.0 + SLOPE * far), ' in an unfamiliar posture'
-        self._beyond = self._beyond + 1 if value > limit else 0
+        self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''
         return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running{where}'
@@ -143,6 +150,7 @@ class AnomalyDetector:
             demand = bias + np.maximum(0.0, pulled)
         if demand is None:
             self._torn[:] = self._stood[:] = 0.0
+            self._winds_slack[:] = False
             return None
         torn = (tension < DEAD_SHARE * demand) & (demand >= bias)
         begins = torn & (self._torn == 0.0)
@@ -153,5 +161,7 @@ class AnomalyDetector:
         self._wound = np.where(winds, length, self._wound)
         self._stood = np.where(winds | ~torn, 0.0, self._stood + dt)
         spent = length < self._tight - self.slack.slack_length
-        dead = (self._torn >= DEAD_TIME) & ((self._stood >= DEAD_TIME - dt) | spent)
+        gone = (self._stood >= DEAD_TIME - dt) | spent
+        self._winds_slack = torn & ~gone
+        dead = (self._torn >= DEAD_TIME) & gone
         return int(np.argmax(np.where(dead, self._torn, 0.0))) if dead.any() else None

@@ -61,3 +61,19 @@ def test_the_limits_are_parameters(noticed):
 
 def test_noise_of_the_sensor_is_no_winding(noticed):
     assert noticed(0.001, 1.0) <= 2.0 * DEAD_TIME
+
+
+@pytest.mark.parametrize(('loose', 'found'), [(0.04, False), (-0.02, True)])
+def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, loose, found):
+    """By a slow winch both look alike, but what is left of a cut wire is too short."""
+    detector = AnomalyDetector(robot)
+    detector.use(calibrated)
+    one = np.eye(6)[MUSCLE]
+    tension, start = healthy.tension * (1.0 - one), healthy.length + loose * one
+    causes = []
+    for n in range(60):
+        length = start - 0.009 * n * DT * one
+        detector.commanded(length=length - 0.003)
+        state = calibrated.estimate(tension, length)
+        causes.append(detector.step(state, tension, length, DT).cause)
+    assert any(cause.startswith('d = ') for cause in causes[:50]) == found
