@@ -31,7 +31,6 @@ FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small besi
 #: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
 ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 43.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
-SETTLED = 20.0  # [s] of motion after which the guess is only made better
 MOST = 240  # moments
 
 LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
@@ -43,13 +42,14 @@ STICKING = 0.003  # [rad] that turn a joint's friction round
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
 #: postures tried as the first one, moments that tell how good they are, those that are pursued
-POSTURES, TOLD_BY, SHORTLIST, PURSUED = 400, 24, 30, 4
+POSTURES, TOLD_BY, SHORTLIST, PURSUED = 400, 24, 30, 6
 COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or much in that choice
 FARTHEST = 0.3  # [m] of a zero; [rad] of a step
 ROUNDS, FIRST_ROUNDS = 20, 6
 STEP = 1e-3  # [rad] of differences
-#: [m] median of what is left, beyond which zeros are not found but guessed wrong
-LARGEST_LEFT = 0.004
+#: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which zeros are
+#: not found but guessed wrong: right ones leave 0.3 mm and cost 0.2–0.5, of a wrong posture 1.1
+LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
 UNKNOWN = 1.0  # [m] standard deviation of a zero that is being found
 KNOWN = 0.05  # [m] and below, of one that was
 
@@ -206,16 +206,17 @@ class Zeroing:
         self._moments.append(moment)
 
     def _judge(self, fit: Fit) -> None:
-        """Take a fit as the guess, or as known when it rests on enough."""
+        """Take a fit as the guess, or as known when it rests on enough and explains that."""
         seen, offset = self._seen(len(fit.theta)), fit.constants[: self._robot.muscle_count]
         left = np.abs(seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
-        bad = float(np.median(left, axis=0).max())
-        self._fit = fit
+        self._fit, self.trouble = fit, ''
         enough = self.moving >= self.enough
-        self.trouble = ''
-        if enough and bad > LARGEST_LEFT:
+        if enough and (bad := float(np.median(left, axis=0).max())) > LARGEST_LEFT:
             name = self._robot.muscles[int(np.median(left, axis=0).argmax())]
             self.trouble = f'{1e3 * bad:.1f} mm of {name} are left unexplained'
+        elif enough and (cost := fit.cost / len(left) / len(self._noise)) > LARGEST_COST:
+            # Found without angles: another posture may look alike.
+            self.trouble = f'lengths and tensions do not agree yet: {cost:.2f} of {LARGEST_COST:g}'
         deviation = np.full(len(offset), UNKNOWN)
         if enough and not self.trouble:
             deviation = 1.48 * np.median(left, axis=0) / np.sqrt(max(1.0, len(left) / 10.0))
@@ -225,16 +226,19 @@ class Zeroing:
 
     def _search(self, seen: Moments) -> Generator[None, None, Fit]:
         """Find what explains the moments; yields between its parts."""
-        guesses = [] if self._fit is None else [self._fit.constants]
-        if self.moving < SETTLED:
-            guesses += [*(yield from self._guesses(seen))]
-        rows = _spaced(seen)
-        fits = []
-        for constants in guesses:
-            part = seen.some(rows)
-            fits.append((yield from self._refine(self._start(constants, part), part, FIRST_ROUNDS)))
-        best = min(fits, key=lambda fit: fit.cost)
-        return (yield from self._refine(self._start(best.constants, seen), seen))
+        guesses = yield from self._guesses(seen)
+        likeliest = yield from self._best(guesses, seen.some(_spaced(seen)), FIRST_ROUNDS)
+        # Few moments may be mistaken: all of them choose between the newest guess and the last.
+        last = [] if self._fit is None else [self._fit.constants]
+        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS))
+
+    def _best(self, guesses: list[Array], seen: Moments, rounds: int) -> Generator[None, None, Fit]:
+        """Return the best of the fits near each guess."""
+        best = yield from self._refine(self._start(guesses[0], seen), seen, rounds)
+        for constants in guesses[1:]:
+            fit = yield from self._refine(self._start(constants, seen), seen, rounds)
+            best = min(best, fit, key=lambda one: one.cost)
+        return best
 
     def _start(self, constants: Array, seen: Moments) -> Fit:
         length = seen.length - constants[: seen.length.shape[1]]
