@@ -41,8 +41,8 @@ TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
 STICKING = 0.003  # [rad] that turn a joint's friction round
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
-#: postures tried as the first one, moments that tell how good they are, those that are pursued
-POSTURES, TOLD_BY, SHORTLIST, PURSUED = 400, 24, 30, 6
+#: postures drawn and tried as the first one, moments that tell how good they are, and those pursued
+DRAWN, POSTURES, TOLD_BY, SHORTLIST, PURSUED = 3200, 400, 24, 30, 6
 COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or much in that choice
 FARTHEST = 0.3  # [m] of a zero; [rad] of a step
 ROUNDS, FIRST_ROUNDS = 20, 6
@@ -248,11 +248,18 @@ class Zeroing:
     def _guesses(self, seen: Moments) -> Generator[None, None, list[Array]]:
         """Return constants with the zeros of the likeliest of many random first postures."""
         robot, mae, muscles = self._robot, self._mae, self._robot.muscle_count
-        first = robot.random_postures(POSTURES, self._rng)
+        # The weight tells most postures from the first one before lengths say anything.
+        drawn, size = [], []
+        for _ in range(DRAWN // POSTURES):
+            drawn.append(robot.random_postures(POSTURES, self._rng))
+            pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
+            size.append(np.linalg.norm(self._torque(drawn[-1], pull)[0], axis=1))
+            yield
+        first = np.concatenate(drawn)[np.argsort(np.concatenate(size))[:POSTURES]]
         pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
         offset = seen.length[0] - mae.lengths(first, pull)
-        size = np.abs(offset).max(axis=1)
-        offset = offset[np.argsort(size)[: max(PURSUED, int((size < FARTHEST).sum()))]]
+        largest = np.abs(offset).max(axis=1)
+        offset = offset[np.argsort(largest)[: max(PURSUED, int((largest < FARTHEST).sum()))]]
         part = seen.some(_spaced(seen))
         cost, postures = np.empty(len(offset)), []
         for n, zero in enumerate(offset):
