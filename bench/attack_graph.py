@@ -116,15 +116,16 @@ class Process:
 class Attack:
     """The system under attack. Use as a context manager, which ends what was started."""
 
-    def __init__(self, folder: Path, initial: Path, seed: int) -> None:
+    def __init__(self, folder: Path, initial: Path, seed: int, rate: float = 100.0) -> None:
         """Join the graph of ROS_DOMAIN_ID and start the system.
 
         Args:
             folder: Of logs and of the learner's state.
             initial: The network to start from.
             seed: Random seed of what is done; when it takes effect is the machine's.
+            rate: Of the muscle modules' messages [Hz].
         """
-        self.folder, self.initial = folder, initial
+        self.folder, self.initial, self.rate = folder, initial, rate
         self.robot = Robot.load('arm26')
         self.rng = random.Random(seed)  # noqa: S311 - must be repeatable
         self.namespace = f'/attack_{os.getpid()}'
@@ -173,7 +174,7 @@ class Attack:
             'learner': [f'state_directory:={self.folder / "state"}'],
             'hardware_emulator': ['marker_rate:=10.0'],
         }
-        parameters = ['robot:=arm26', *own.get(name, [])]
+        parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]
         if 'checkpoint' in PARAMETERS[name]:
             parameters.append(f'checkpoint:={self.initial}')
         words = [part for parameter in parameters for part in ('-p', parameter)]

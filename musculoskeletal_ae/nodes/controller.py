@@ -31,8 +31,6 @@ from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_joints
 
-LOOK_AROUND = 0.1  # [s] between looks at who publishes
-
 
 class Controller(Shell):
     """Node shell of control."""
@@ -54,7 +52,7 @@ class Controller(Shell):
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
         self.follow_zeros(self._shift)
-        self.follow_muscle_states(self._muscles)
+        self.follow_muscle_states(self._muscles, partial(setattr, self.core, 'intruder'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
@@ -63,7 +61,6 @@ class Controller(Shell):
         serve(self, Trigger, 'controller/reset', self._reset)
         # Watches ages and keeps publishing when no sensor message does it.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
-        self.create_timer(LOOK_AROUND, self._look_around, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
 
@@ -128,16 +125,6 @@ class Controller(Shell):
         if reason := self.core.reset(time.monotonic()):
             raise MusculoskeletalError(f'refused: {reason}')
         return 'going on to the last target, if any; controller/explore explores again'
-
-    def _look_around(self) -> None:
-        """Let nobody else say how the muscles are."""
-        topic, names = self.resolve_topic_name('muscle_states'), list[str]()
-        if self.count_publishers(topic) > 1:
-            for publisher in self.get_publishers_info_by_topic(topic):
-                names.append(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
-        # One name twice: a node that was killed stays known for a while beside its successor.
-        several = sorted(set(names)) if len(set(names)) > 1 else []
-        self.core.intruder = f'muscle_states come from {" and ".join(several)}' if several else ''
 
     def _watch(self) -> None:
         if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:

@@ -29,7 +29,7 @@ from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import QUANTITIES, read_pose
+from musculoskeletal_ae.validity import read_pose
 
 
 class Estimator(Shell):
@@ -54,7 +54,7 @@ class Estimator(Shell):
         self.zeros = self.core.zeros
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
-        self.follow_muscles('muscle_states', self._estimate, len(QUANTITIES), SENSOR)
+        self.follow_muscle_states(self._estimate, as_read=True)
         self.follow_posture('joint_states', lambda theta: self.core.joints(theta, time.monotonic()))
         self.posture: tuple[float, ...] = ()
         self.follow_parameter('zero_posture', self._take_posture)

@@ -30,6 +30,7 @@ from musculoskeletal_ae.estimation.zeroing import Zeros, no_offset
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     GateError,
+    MessageError,
     MusculoskeletalError,
     printable,
 )
@@ -46,6 +47,7 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+LOOK_AROUND = 0.1  # [s] between looks at who publishes
 
 LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
 
@@ -219,16 +221,42 @@ class Shell(Node):
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-    def follow_muscle_states(self, follow: Callable[[Array], object]) -> None:
+    def follow_muscle_states(
+        self,
+        follow: Callable[[Array], object],
+        warn: Callable[[str], object] | None = None,
+        as_read: bool = False,
+    ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
-        Zeros are taken off l, here and nowhere else.
+        If several nodes publish them, `warn` is told who, '' once it is one; without it their
+        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`.
         """
+        intruders = ['']
 
-        def from_zero(states: Array) -> object:
-            return follow(np.stack([states[0] - self.zeros.offset, *states[1:]]))
+        def look_around() -> None:
+            if (who := self._several_publishers('muscle_states')) != intruders[0]:
+                intruders[0] = who
+                if warn:
+                    warn(who)
 
-        self.follow_muscles('muscle_states', from_zero, len(QUANTITIES), SENSOR)
+        def from_one(states: Array) -> None:
+            if intruders[0] and not warn:
+                raise MessageError('several publishers', intruders[0])
+            zero = np.zeros(states.shape[1]) if as_read else self.zeros.offset
+            follow(np.stack([states[0] - zero, *states[1:]]))
+
+        self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
+        self.follow_muscles('muscle_states', from_one, len(QUANTITIES), SENSOR)
+
+    def _several_publishers(self, name: str) -> str:
+        """Return which nodes publish a topic, '' if it is one."""
+        topic, names = self.resolve_topic_name(name), set[str]()
+        if self.count_publishers(topic) > 1:
+            for publisher in self.get_publishers_info_by_topic(topic):
+                names.add(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
+        # One name twice: a node that was killed stays known for a while beside its successor.
+        return f'{name} come from {" and ".join(sorted(names))}' if len(names) > 1 else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
         """Take zeros that the estimator found; `changed` is told whether they are known now.
