@@ -38,6 +38,7 @@ WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best an
 #: μ of a wire, with its mean; Coulomb torque of a joint over the largest that the weight needs
 FRICTION_MEAN, FRICTION, JOINT_FRICTION = 0.05, 0.05, 0.03
 TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
+AT_STOP = 0.03  # [rad] from a joint limit, where its stop may bear torque
 STICKING = 0.003  # [rad] that turn a joint's friction round
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
@@ -298,13 +299,17 @@ class Zeroing:
         length = self._mae.lengths(fit.theta, end)
         torque, jacobian = self._torque(fit.theta, pull)
         left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
+        # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
+        ends = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
+        free = ((ends[0] < fit.theta) & (fit.theta < ends[1])).astype(float)
+        left[:, muscles:] = np.where(free > 0.0, left[:, muscles:], TORQUE_NOISE)
         noise = self._noise
         outside = self._outside(fit.theta) / OUTSIDE
         if not slopes:
             return Linear(left / noise, outside, left, left)
         turned = [self._torque(fit.theta + STEP * row, pull)[0] for row in np.eye(joints)]
         slope = (np.stack(turned, axis=-1) - torque[..., None]) / STEP
-        by_theta = np.concatenate([-jacobian, slope], axis=1)
+        by_theta = np.concatenate([-jacobian, slope * free[..., None]], axis=1)
         by = np.zeros((len(left), muscles + joints, len(fit.constants)))
         m, j = np.arange(muscles), np.arange(joints)
         by[:, m, m] = -1.0
@@ -317,6 +322,7 @@ class Zeroing:
             jacobian * passed[..., None], 1, 2
         )
         by[:, muscles + j, 3 * muscles + j] = turning
+        by[:, muscles:] *= free[..., None]
         return Linear(left / noise, outside, by_theta / noise[:, None], by / noise[:, None])
 
     def _cost(self, left: Linear, constants: Array) -> float:
