@@ -300,8 +300,8 @@ class Zeroing:
         torque, jacobian = self._torque(fit.theta, pull)
         left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
         # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
-        ends = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
-        free = ((ends[0] < fit.theta) & (fit.theta < ends[1])).astype(float)
+        low, high = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
+        free = ((low < fit.theta) & (fit.theta < high)).astype(float)
         left[:, muscles:] = np.where(free > 0.0, left[:, muscles:], TORQUE_NOISE)
         noise = self._noise
         outside = self._outside(fit.theta) / OUTSIDE
