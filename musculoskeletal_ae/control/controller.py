@@ -25,6 +25,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.gentle import GentleMotion, gentle_limit
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
@@ -74,6 +75,7 @@ class Controller:
         self._mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = Exploration(robot, seed)
+        self.gentle = GentleMotion(robot, seed)
         self._plausibility = Plausibility(robot)
         self._temperatures: deque[Array] = deque(maxlen=5)
         self._warm: Array | None = None  # their median [°C], (M,)
@@ -137,6 +139,14 @@ class Controller:
         """
         self._plausibility.check_estimate(theta, now)
         self._estimate, self._estimate_at = theta, now - self._asleep
+
+    def zeros(self, known: bool, less: Array) -> None:
+        """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
+        self.safety.shift(less)
+        self._plausibility = Plausibility(self._robot)
+        self._starts |= known != self.safety.zeroed or bool(less.any())
+        self.safety.zeroed = known
+        self.gentle.start()
 
     def anomaly(self, detected: bool) -> None:
         """Take anomaly_detected."""
@@ -258,6 +268,8 @@ class Controller:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
             warnings.append('the target needs more torque than the muscles have')
+        if not self.safety.zeroed:
+            warnings.append('length zeros are unknown: the arm only explores, gently')
         if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
             warnings.append(f'tension above {robot.tension.limit:g} N: {", ".join(tense)}')
         hot = {n: t for n, t in zip(robot.muscles, self.limit) if t < robot.tension.max}
@@ -307,7 +319,10 @@ class Controller:
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
         fresh = not late.startswith('muscle')
-        command = self.safety.step(desired, self.limit, 0.0 if waits else dt, fresh)
+        limit = self.limit
+        if not self.safety.zeroed:
+            limit = np.minimum(limit, gentle_limit(self._robot))
+        command = self.safety.step(desired, limit, 0.0 if waits else dt, fresh)
         if self.safety.cause and not self.safety.passing:
             self.explore(False)
         return command
@@ -337,6 +352,14 @@ class Controller:
         # No present cause: all are there.
         assert mae is not None and muscles is not None and estimate is not None
         posture, in_tension = self.posture, self._in_tension
+        if not self.safety.zeroed:
+            if not posture.exploring:
+                return None
+            last = self.safety.command
+            if last is None or last.kind != LENGTH:
+                last = safety.unchanging(self._robot, LENGTH, muscles)
+            now = muscles.tension, muscles.length, estimate
+            return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
         if self._starts:
             self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.

@@ -83,7 +83,18 @@ class SafetyFilter:
         #: medians of the last three messages
         self.now: Muscles | None = None
         postures = robot.random_postures(200, np.random.default_rng(0))
-        self._longest = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
+        self.zeroed = True  # else no limit of tension rests on how long muscles are at most
+        self._model = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
+
+    @property
+    def _longest(self) -> Array:
+        return self._model if self.zeroed else np.full_like(self._model, np.inf)
+
+    def shift(self, less: Array) -> None:
+        """Take lengths that are less [m] (M,) from now on: the same muscles, another zero."""
+        self._readings = deque((m._replace(length=m.length - less) for m in self._readings), 3)
+        if self.command is not None and self.command.kind == LENGTH:
+            self.command = Command(LENGTH, self.command.value - less)
 
     def muscles(self, muscles: Muscles) -> Muscles:
         """Take new muscle_states; return the medians of the last three."""

@@ -9,8 +9,14 @@ d, in which every muscle's residual is measured in units of its healthy spread (
 arXiv 2407.08050). Healthy statistics come from the real arm; those of the geometric model would
 call most healthy postures anomalous, so without calibrated ones nothing is latched from d.
 
+What the network restores is worse in postures that nothing was calibrated in, so the threshold
+widens with the distance to the nearest that was (`unfamiliar`). A muscle that is cut pulls nothing,
+there as anywhere: while one is slack, nothing widens.
+
 Physics needs no statistics: a module holds at least T_bias, so a muscle whose tension stays near
-zero while much is commanded has no wire.
+zero while much is commanded has no wire, or a slack one. Slack is wound in by a slow winch, and no
+longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
+② restores it: slack wire is too long, and what is left of a cut one too short.
 """
 
 from __future__ import annotations
@@ -19,7 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
@@ -31,6 +38,9 @@ DISTANCE = 'distance'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
+#: the threshold grows by SLOPE of itself for each FAR of distance beyond NEAR, up to WIDEST times;
+#: distances are shares of the joint ranges (`python -m bench unfamiliar`: what healthy arms need)
+NEAR, FAR, SLOPE, WIDEST = 0.25, 0.1, 0.5, 3.0
 
 
 class Verdict(NamedTuple):
@@ -52,8 +62,12 @@ class AnomalyDetector:
         """Watch `robot`."""
         self._robot = robot
         self.threshold = threshold
+        self.slack = Slack()
+        self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
-        self._torn = np.zeros(robot.muscle_count)  # [s]
+        #: [s] without tension, without winding in; l [m] when tension went, when it wound last
+        self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
+        self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._beyond = 0
         self.commanded()
 
@@ -71,7 +85,7 @@ class AnomalyDetector:
 
     def reset(self) -> None:
         """Forget counts, as after a jump of the clock or a reset by the user."""
-        self._torn[:] = 0.0
+        self._torn[:] = self._stood[:] = 0.0
         self._beyond = 0
 
     def commanded(self, length: Array | None = None, tension: Array | None = None) -> None:
@@ -98,19 +112,36 @@ class AnomalyDetector:
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
-        return Verdict(size, distance, suspect, self._beyond_threshold(size, distance))
+        waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any())
+        cause = ''
+        if self.judges:
+            cause = self._beyond_threshold(size, distance, state.theta, slack, waits)
+        return Verdict(size, distance, suspect, cause)
 
-    def _beyond_threshold(self, anomaly: float, distance: float) -> str:
-        limit, value, what = self.threshold, anomaly, 'A'
+    def unfamiliar(self, theta: Array) -> float:
+        """Return how far θ [rad] (D,) is beyond NEAR from every calibrated posture, in FARs."""
+        known = None if self._statistics is None else self._statistics.postures
+        if known is None or not len(known):
+            return 0.0
+        share = (known - theta) / (self._robot.upper - self._robot.lower)
+        nearest = float(np.sqrt(np.square(share).sum(axis=1).min()))
+        return max(0.0, (nearest - NEAR) / FAR)
+
+    def _beyond_threshold(
+        self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
+    ) -> str:
+        limit, value, what, where = self.threshold, anomaly, 'A', ''
         if limit <= 0.0:
             if self._statistics is None or not self._statistics.calibrated:
                 return ''
             limit = self._statistics.thresholds.get(DISTANCE, np.inf)
             value, what = distance, 'd'
-        self._beyond = self._beyond + 1 if value > limit else 0
+            if value > limit and not slack.any() and (far := self.unfamiliar(theta)) > 0.0:
+                limit, where = limit * min(WIDEST, 1.0 + SLOPE * far), ' in an unfamiliar posture'
+        self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''
-        return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running'
+        return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running{where}'
 
     def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
         bias, demand = self._robot.tension.bias, self._tension_command
@@ -121,10 +152,20 @@ class AnomalyDetector:
             # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
             lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
             if not lost or (tension < SLACK * bias).all():
-                self._torn[:] = 0.0
+                self._torn[:] = self._stood[:] = 0.0
+                self._winds_slack[:] = False
                 return None
             demand = np.full(len(tension), bias)
         torn = (tension < SLACK * demand) & (demand >= bias)
+        begins = torn & (self._torn == 0.0)
+        self._tight = np.where(begins, length, self._tight)
         self._torn = np.where(torn, self._torn + dt, 0.0)
-        worst = int(np.argmax(self._torn))
-        return worst if self._torn[worst] >= DEAD_TIME else None
+        # It winds as long as every DEAD_TIME brings a new shortest length, by the slowest winch's.
+        winds = begins | (length < self._wound - self.slack.slack_speed * DEAD_TIME)
+        self._wound = np.where(winds, length, self._wound)
+        self._stood = np.where(winds | ~torn, 0.0, self._stood + dt)
+        spent = length < self._tight - self.slack.slack_length
+        gone = (self._stood >= DEAD_TIME - dt) | spent
+        self._winds_slack = torn & ~gone
+        dead = (self._torn >= DEAD_TIME) & gone
+        return int(np.argmax(np.where(dead, self._torn, 0.0))) if dead.any() else None

@@ -2,6 +2,7 @@
 """Joint angles from muscle length and tension, message by message; is the body still healthy.
 
     (T, l) ─② of the MAE→ θ, T, l ─→ detector ─→ anomaly, latched until `reset`
+    while zeros are sought: no judgement, but `zeroing` finds them and the estimate follows
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
 
 What was detected first names the suspect for as long as the latch holds.
@@ -12,11 +13,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
-from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros, no_offset
+from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.report import Report
@@ -31,6 +34,8 @@ LONGEST_PERIOD = 0.1  # [s]
 SILENCE = 1.0  # [s]
 # A marker that the arm cannot reach to within these is another one, or its calibration is off.
 MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
+JOINTS_AGE = 0.05  # [s] that joint angles belong to a message
+SHIFTED = 0.02  # [m] by which a guess of a zero may be off before it is told anew
 
 
 class Estimate(NamedTuple):
@@ -52,6 +57,9 @@ class Estimator:
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
+        self.zeros = no_offset(robot.muscle_count)  # of the length sensors, as all nodes are told
+        self._zeroing: Zeroing | None = None
+        self._joints: tuple[float, Array | None] = -math.inf, None
         self._time = math.inf  # of the last message; none yet
         self._stepped_at = self._commanded_at = -math.inf
 
@@ -67,22 +75,80 @@ class Estimator:
         self.detector.commanded(length, tension)
         self._commanded_at = now
 
+    def joints(self, theta: Array, now: float) -> None:
+        """Take measured θ [rad] (D,): only zeroing uses it, where there is any."""
+        self._joints = now, theta
+
+    def check_posture(self, posture: tuple[float, ...]) -> None:
+        """Raise a MusculoskeletalError unless an arm can stand in θ [rad] (D,); () is legal."""
+        limits = [*zip(self._robot.lower, self._robot.upper, strict=True)]
+        inside = len(posture) == len(limits)
+        inside = inside and all(low <= t <= high for t, (low, high) in zip(posture, limits))
+        if posture and not inside:
+            legal = ', '.join(f'{low:.2f} to {high:.2f}' for low, high in limits)
+            raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal} [rad]')
+
+    def zero(self, posture: tuple[float, ...] = ()) -> None:
+        """Begin to find the zeros of the length sensors; the arm stands in `posture` [rad] (D,).
+
+        Without one they are found while the arm moves gently.
+
+        Raises:
+            MusculoskeletalError: If there is no network, or no such posture.
+        """
+        if self.mae is None:
+            raise MusculoskeletalError('no checkpoint, and zeros are found with a network')
+        self.check_posture(posture)
+        robot = self._robot
+        self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
+        self.zeros = Zeros(np.zeros(robot.muscle_count), np.full(robot.muscle_count, UNKNOWN))
+        self.detector.judges, self._verdict = False, None
+        self.reset()
+
     def step(self, tension: Array, length: Array, time: float, now: float) -> Estimate | None:
-        """Return the estimate from measured T [N] (M,) and l [m] (M,); None without a network."""
+        """Return the estimate from measured T [N] (M,) and read l [m] (M,).
+
+        None without a network, or while nothing is known of the zeros of l.
+        """
         if self.mae is None:
             return None
         dt = min(max(time - self._time, 0.0), LONGEST_PERIOD)
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
-        state = self.mae.estimate(tension, length)
-        self._theta = state.theta
+        guess: Zeros | None = self.zeros
+        if self._zeroing is not None:
+            guess = self._zero_on(self._zeroing, tension, length, dt, now)
+        if guess is None:
+            return None
+        state = self.mae.estimate(tension, length - guess.offset)
+        self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
         verdict = self._verdict = self.detector.step(state, tension, length, dt)
         detected = bool(verdict.cause) and not self.cause
         if detected:
             self._suspect = self._robot.muscles[verdict.suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
         return Estimate(state, verdict.anomaly, detected)
+
+    def _zero_on(
+        self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
+    ) -> Zeros | None:
+        came, theta = self._joints
+        zeroing.step(tension, length, dt, theta if now - came < JOINTS_AGE else None)
+        guess = zeroing.zeros
+        if zeroing.stands and not zeroing.done:
+            return None  # nobody shall move
+        # A guess is told anew only when it is another one: whoever follows it goes on from there.
+        if guess is not None and (
+            guess.known
+            or self._verdict is None
+            or np.abs(guess.offset - self.zeros.offset).max() > SHIFTED
+        ):
+            self.zeros = guess
+        if zeroing.done:
+            self._zeroing, self.detector.judges = None, True
+            self.detector.reset()
+        return guess
 
     def see(self, pose: pin.SE3) -> Array:
         """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame.
@@ -121,9 +187,16 @@ class Estimator:
                 'd': f'{self._verdict.distance:.1f}',
                 'suspect muscle': self._suspect or self._robot.muscles[self._verdict.suspect],
             }
+        if self.zeros.offset.any():
+            zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
+            values['length zeros'] = ', '.join(f'{n} {o:.1f} ± {d:.1f} mm' for n, o, d in zeros)
+        far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
+        values['posture'] = f'unfamiliar ({far:.1f})' if far > 0.0 else 'familiar'
         if self.cause:
             return Report('error', f'anomaly detected: {self.cause}', values)
         if now - self._stepped_at > SILENCE:
             return Report('warn', 'no muscle_states', values)
+        if self._zeroing is not None:
+            return Report('warn', f'finding the length zeros: {self._zeroing.progress}', values)
         calibrated = '' if self.detector.calibrated else ', uncalibrated'
         return Report('ok', f'estimating{calibrated}', values)

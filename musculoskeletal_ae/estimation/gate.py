@@ -85,6 +85,10 @@ class Gate:
         while now - self._messages[0][0] > SPAN:
             self._messages.popleft()
 
+    def forget(self) -> None:
+        """Forget the messages, as when lengths are measured from other zeros."""
+        self._messages.clear()
+
     def check(self, mae: Mae) -> None:
         """Try a network.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration
+from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
@@ -44,7 +44,11 @@ class Motion(NamedTuple):
 
 
 def record(
-    arm: EmulatedArm, mae: Mae, stream: int, duration: float, script: Script | None = None
+    arm: EmulatedArm,
+    mae: Mae,
+    stream: int | Iterable[Step],
+    duration: float,
+    script: Script | None = None,
 ) -> Recording:
     """Drive an arm through the exploration's three steps, as one fixed list of commands.
 
@@ -54,14 +58,14 @@ def record(
     Args:
         arm: Is moved on from the state it is in.
         mae: Computes the commands.
-        stream: Random seed of the postures.
+        stream: Random seed of the postures, or the steps themselves.
         duration: How long [s], rounded up to whole steps of the exploration.
         script: What happens to the arm on the way.
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts where the arm is, so that it does not jump.
     command = arm.sense().length
-    for step in Exploration(arm.robot, stream):
+    for step in Exploration(arm.robot, stream) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
         start, goal = command, first_command(arm.robot, mae, step.theta, step.tension)

@@ -39,6 +39,7 @@ YOUNG = 20.0
 DIAGONAL_SHARE = 0.1
 #: this share of the messages is left out at most, and what is so many times beyond all others
 GLITCHES, GLITCH = 0.002, 3.0
+POSTURES = 200  # that tell where it was calibrated
 
 
 class Healthy(NamedTuple):
@@ -125,7 +126,8 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     if len(healthy.messages) < 2:
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
-    error = residuals(mae.estimate(tension, length), tension, length)
+    state = mae.estimate(tension, length)
+    error = residuals(state, tension, length)
     sound = ~_glitches(error)
     known = min(samples, healthy.rests)
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
@@ -141,7 +143,19 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
         DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
         'norm': float(anomaly(error[sound]).max()),
     }
-    return replace(statistics, thresholds=thresholds)
+    return replace(
+        statistics, thresholds=thresholds, postures=_spread_out(state.theta[sound], POSTURES)
+    )
+
+
+def _spread_out(theta: Array, count: int) -> Array:
+    """Return at most `count` of many θ (N, D), each the farthest from those before it."""
+    share = theta / (np.ptp(theta, axis=0) + 1e-9)
+    distance, chosen = np.full(len(theta), np.inf), [0]
+    for _ in range(min(count, len(theta)) - 1):
+        distance = np.minimum(distance, np.square(share - share[chosen[-1]]).sum(axis=1))
+        chosen.append(int(distance.argmax()))
+    return theta[chosen]
 
 
 def _glitches(error: Array) -> Bools:

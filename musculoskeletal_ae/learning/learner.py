@@ -64,7 +64,7 @@ class Learner:
         self.samples = SampleStore(settings)  # what is learned from
         self._mae: Mae | None = None
         self.checkpoint: bytes | None = None  # the network as learned so far
-        self.enabled = True
+        self.enabled = self._zeroed = True
         self.last_update: Update | None = None
         self.updates = self.published = 0  # updates made, checkpoints given out
         self._pairing = Pairing(period)
@@ -105,7 +105,7 @@ class Learner:
     def muscles(self, time: float, tension: Array, length: Array) -> None:
         """Take T [N] and l [m] (M,) that came at `time` [s]."""
         paired = self._pairing.muscles(time, tension, length)
-        if paired is None or not self.enabled:
+        if paired is None or not (self.enabled and self._zeroed):
             return
         _, tension, length, dt, theta = paired
         self._gate_time += dt
@@ -132,6 +132,12 @@ class Learner:
         before = self._gate.anomaly(detected, self._gate_time)
         if before is not None:
             self._use(self._numbered(before))
+
+    def zeros(self, known: bool) -> None:
+        """Take lengths from other zeros; nothing is learned of them while those are not known."""
+        self.reset()
+        self._gate.forget()
+        self._zeroed = known
 
     def enable(self, enabled: bool) -> None:
         """Stop or resume learning; samples and network stay."""
@@ -299,6 +305,8 @@ class Learner:
             message = 'waiting for a checkpoint: set the parameter `checkpoint`'
         elif not self.enabled:
             message = 'stopped by learner/enable'
+        elif not self._zeroed:
+            message = 'waiting until the estimator has found the length zeros'
         elif self._rests.anomaly:
             message = 'stopped by an anomaly until estimator/reset'
         else:

@@ -67,6 +67,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anomaly_calibrated: bool | None
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
+    anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -98,6 +99,8 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.anomaly_calibrated is not None:
             muscles = 2 * len(self.muscles)
             shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
+        if self.anomaly_postures:
+            shapes['anomaly.postures'] = self.anomaly_postures, len(self.joints)
         return shapes
 
 
@@ -110,12 +113,15 @@ def to_bytes(mae: Mae) -> bytes:
             tensors |= {f'{name}.{i}.weight': weight, f'{name}.{i}.bias': bias}
     if anomaly is not None:
         tensors |= {'anomaly.mean': anomaly.mean, 'anomaly.covariance': anomaly.covariance}
+        if len(anomaly.postures):
+            tensors['anomaly.postures'] = anomaly.postures
     entries = {name: getattr(mae, name) for name in (*SHARED, 'layer_sizes')} | {
         'format_version': FORMAT_VERSION,
         'units': UNITS,
         'anomaly_calibrated': None if anomaly is None else anomaly.calibrated,
         'anomaly_samples': 0 if anomaly is None else anomaly.samples,
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
+        'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
     }
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
@@ -232,6 +238,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
             meta.anomaly_calibrated,
             meta.anomaly_samples,
             meta.anomaly_thresholds,
+            tensors.get('anomaly.postures', np.empty((0, 0))),
         )
     return Mae(
         encoder=stack('encoder'),

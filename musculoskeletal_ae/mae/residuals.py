@@ -46,6 +46,8 @@ class AnomalyStatistics:
     calibrated: bool  # from the real arm, not from geometry
     samples: int  # that they rest on
     thresholds: Mapping[str, float] = field(default_factory=dict)  # of a detector, by name; finite
+    #: θ [rad] (K, D) that they were seen in, far apart from each other; K may be 0
+    postures: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod
     def of(cls, error: Array, calibrated: bool) -> AnomalyStatistics:

@@ -52,6 +52,7 @@ class Controller(Shell):
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
+        self.follow_zeros(self._shift)
         self.follow_muscle_states(self._muscles, partial(setattr, self.core, 'intruder'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
@@ -83,10 +84,15 @@ class Controller(Shell):
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
 
+    def _shift(self, known: bool, less: Array) -> None:
+        self.core.zeros(known, less)
+        self.gate.forget()
+
     def _muscles(self, states: Array) -> None:
         muscles, now = Muscles(*states), time.monotonic()
         self.core.muscles(muscles, now)
-        self.gate.message(muscles.tension, muscles.length, now)
+        if self.zeros.known:
+            self.gate.message(muscles.tension, muscles.length, now)
 
     def _anomaly(self, message: Bool) -> None:
         self.core.anomaly(message.data)
@@ -128,7 +134,8 @@ class Controller(Shell):
     def _step(self) -> None:
         command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
         if command is not None:
-            message = array_message(command.value, 'muscle')
+            value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
+            message = array_message(value, 'muscle')
             self.publishers_of[command.kind].publish(message)
             self.recording.heard(f'muscle_{command.kind}_command', message)
         safety, before = self.core.safety, self.latched

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
-muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected;
+muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected,
+muscle_length_zeros (joint_states help to find those);
 marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,9 +21,12 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
+from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import read_pose
@@ -45,23 +50,69 @@ class Estimator(Shell):
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.needed.append('muscle_states')
         self.follow_checkpoints(self.core.use)
-        self.follow_muscle_states(self._estimate)
+        for name in parameters_of(Slack):
+            self.follow_parameter(name, partial(self._take_slack, name))
+        self.zeros = self.core.zeros
+        self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+        # As the sensors read them: the core knows the zeros first.
+        self.follow_muscle_states(self._estimate, as_read=True)
+        self.follow_posture('joint_states', lambda theta: self.core.joints(theta, time.monotonic()))
+        self.posture: tuple[float, ...] = ()
+        self.follow_parameter('zero_posture', self._take_posture)
+        self.unzeroed = self.parameter('zero_at_start')
+        if self.unzeroed:  # nobody moves on what sensors say before the network is there
+            unknown = np.zeros((2, self.robot.muscle_count))
+            unknown[1] = UNKNOWN
+            self.told.publish(array_message(unknown, 'quantity', 'muscle'))
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
         serve(self, Trigger, 'estimator/reset', self._reset)
+        serve(self, Trigger, 'estimator/zero', self._zero)
+
+    def _take_slack(self, name: str, value: float) -> None:
+        self.core.detector.slack = replace(self.core.detector.slack, **{name: value})
+
+    def _take_posture(self, posture: tuple[float, ...]) -> None:
+        posture = () if posture == (0.0,) else posture
+        self.core.check_posture(posture)
+        self.posture = posture
+
+    def _zero(self, _: Trigger.Request) -> str:
+        self.core.zero(self.posture)
+        self._tell_zeros()
+        self._reset(_)
+        what = 'while the arm stands in zero_posture' if self.posture else 'while it moves gently'
+        return f'finding the zeros of the lengths {what}; /diagnostics says how far it is'
+
+    def _tell_zeros(self) -> None:
+        if self.core.zeros is not self.zeros:
+            self.zeros = self.core.zeros
+            self.plausibility = Plausibility(self.robot)
+            self.gate.forget()
+            rows = np.stack(self.zeros)
+            self.told.publish(array_message(rows, 'quantity', 'muscle'))
 
     def _commanded(self, kind: str, command: Array) -> None:
+        if kind == 'length':
+            command = command - self.zeros.offset
         self.core.commanded(time.monotonic(), **{kind: command})
 
     def _estimate(self, states: Array) -> None:
         length, tension, temperature = states
         clock, now = self.get_clock().now(), time.monotonic()
-        self.plausibility.check_muscles(tension, length, temperature, now)
+        if self.unzeroed and self.core.mae is not None:
+            self.unzeroed = False
+            self._zero(Trigger.Request())
+        known = self.zeros.known and not self.unzeroed
+        from_zero = length - self.zeros.offset if known else np.zeros_like(length)
+        self.plausibility.check_muscles(tension, from_zero, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
+        self._tell_zeros()
         if estimate is None:
             return
-        self.gate.message(tension, length, now)
+        if known:
+            self.gate.message(tension, from_zero, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
         restored = np.stack([state.length, state.tension])

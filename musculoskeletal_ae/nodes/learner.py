@@ -54,6 +54,7 @@ class Learner(Shell):
         self.running = True
         self.needed = [JOINT_TOPICS[value('joint_source')], 'muscle_states']
         self.follow_posture(self.needed[0], self._joints)
+        self.follow_zeros(lambda known, _: self.core.zeros(known))
         self.follow_muscle_states(self._muscles)
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         serve(self, SetBool, 'learner/enable', self._enable)

@@ -16,6 +16,7 @@ from collections import Counter
 from dataclasses import replace
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
+from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
@@ -52,6 +53,18 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             (0.0, 1e6),
             settable=True,
         ),
+        'zero_posture': Parameter(
+            (0.0,),
+            'where the arm stands when estimator/zero is called, one angle for each joint (0 or '
+            '[]: unknown, zeros are found while it moves gently)',
+            'rad',
+            (-100.0, 100.0),
+            settable=True,
+        ),
+        'zero_at_start': Parameter(
+            False, 'winches that forget their zeros: find them at the start'
+        ),
+        **parameters_of(Slack),
     },
     'hardware_emulator': {
         **SHARED,

@@ -27,6 +27,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.zeroing import Zeros, no_offset
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     GateError,
@@ -70,6 +71,7 @@ class Shell(Node):
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected  # messages, by topic and reason
+        self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
@@ -242,11 +244,12 @@ class Shell(Node):
         self,
         follow: Callable[[Array], object],
         warn: Callable[[str], object] | None = None,
+        as_read: bool = False,
     ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
         If several nodes publish them, `warn` is told who, '' once it is one; without it their
-        messages are rejected.
+        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`.
         """
         intruders = ''
 
@@ -259,6 +262,8 @@ class Shell(Node):
         def from_one(states: Array) -> None:
             if intruders and not warn:
                 raise MessageError('several publishers', intruders)
+            if not as_read:
+                states[0] -= self.zeros.offset
             follow(states)
 
         self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
@@ -272,6 +277,18 @@ class Shell(Node):
                 names.add(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
         # One name twice: a node that was killed stays known for a while beside its successor.
         return f'{name} come from {" and ".join(sorted(names))}' if len(names) > 1 else ''
+
+    def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
+        """Take zeros that the estimator found; `changed` is told whether they are known now.
+
+        And how much less l [m] (M,) is than with those before.
+        """
+
+        def take(rows: Array) -> None:
+            less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
+            changed(self.zeros.known, less)
+
+        self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
     def follow_posture(self, topic: str, follow: Callable[[Array], object]) -> None:
         """Give `follow` the θ [rad] (D,) that comes on a topic of joint states."""

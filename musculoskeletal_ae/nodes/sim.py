@@ -44,7 +44,8 @@ class Sim(Arm):
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.needed.append('muscle_length_command')
         self.follow_checkpoints(self._use_checkpoint)
-        self.follow_muscles('muscle_length_command', partial(setattr, self, 'command'))
+        self.follow_zeros(lambda *_: self.gate.forget())
+        self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench(partial(setattr, self, 'wrench'))
         if not as_robot:
             self.follow_muscle_states(self._note)
@@ -61,9 +62,13 @@ class Sim(Arm):
         else:
             self.arm.use(mae)
 
+    def _command(self, length: Array) -> None:
+        self.command = length - self.zeros.offset
+
     def _note(self, states: Array) -> None:
         length, tension, _ = states
-        self.gate.message(tension, length, time.monotonic())
+        if self.zeros.known:
+            self.gate.message(tension, length, time.monotonic())
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

@@ -16,7 +16,7 @@ from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
 
-LATCHED = ('robot_description', 'anomaly_detected', 'mae_checkpoint')
+LATCHED = ('robot_description', 'anomaly_detected', 'mae_checkpoint', 'muscle_length_zeros')
 
 
 @pytest.mark.parametrize('type_name', sorted({topic.type for topic in TOPICS.values()}))

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Individuals that were learned, kept in a folder for the benches that start from one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import Exploration, Step
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    SAMPLE_TIME,
+    Recording,
+    record,
+)
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+
+SELDOM, STEPS = 20.0, 400  # [s] of news between updates, and their steps: as good, and cheaper
+OF_A_POSTURE = 3  # steps of the exploration
+
+
+class Seldom(Training):
+    """Training that waits for more news than the node's."""
+
+    _asked = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether there was news for long enough."""
+        self._asked += 1
+        if self._asked < SELDOM / SAMPLE_TIME or not super().ready:
+            return False
+        self._asked = 0
+        return True
+
+
+class LearnedArm(NamedTuple):
+    """An individual's network, the one that drives it, and what it was learned from."""
+
+    mae: Mae
+    driver: Mae  # of the geometric model
+    exploring: Recording
+
+
+def initial(robot: Robot, folder: Path) -> Mae:
+    """Return the network of the geometric model."""
+    file = folder / 'initial.safetensors'
+    if not file.exists():
+        checkpoint.save(initial_mae(robot).mae, file)
+    return checkpoint.load(file, robot)
+
+
+def learned_arm(
+    robot: Robot, seed: int, folder: Path, minutes: float, where: Callable[[Array], bool] = bool
+) -> LearnedArm:
+    """Return an individual that learned in postures θ (D,) for which `where` is true."""
+    folder.mkdir(parents=True, exist_ok=True)
+    driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
+    messages = folder / f'exploring_{seed}.npz'
+    if not file.exists():
+        stream = EXPLORATION_STREAM + seed
+        steps = postures(robot, stream, where) if where is not bool else stream
+        exploring = record(EmulatedArm(robot, seed), driver, steps, 60.0 * minutes)
+        learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
+        for n, row in enumerate(zip(exploring.theta_sensor, exploring.tension, exploring.length)):
+            learner.step(n * SAMPLE_TIME, *row)
+        np.savez(messages, *exploring)
+        checkpoint.save(learner.mae, file)
+    with np.load(messages) as arrays:
+        return LearnedArm(checkpoint.load(file, robot), driver, Recording(*arrays.values()))
+
+
+def postures(robot: Robot, stream: int, where: Callable[[Array], bool]) -> Iterator[Step]:
+    """Return the exploration's steps to postures θ (D,) for which `where` is true."""
+    steps = iter(Exploration(robot, stream))
+    while posture := [*islice(steps, OF_A_POSTURE)]:
+        if where(posture[0].theta):
+            yield from posture

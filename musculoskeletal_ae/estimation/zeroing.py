@@ -1,0 +1,397 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find the zeros of the length sensors after power-on: what every reading is too long by.
+
+    l_read = l(θ, T) + o                       M equations a moment, D unknown angles
+    0 = g(θ) + G(θ, T)ᵀ T                      D more while the arm moves slowly
+
+With θ known, from a stated posture or joint sensors, o is what is left of the first line. Without,
+o and the postures of all moments are found together, by maximum likelihood with Student's noise and
+the network's ① for l and G: muscles outnumber joints, and G changes from posture to posture, so one
+o explains all of them while the arm wanders; the weight says where it stands (before anything else,
+from a single posture). Damped Gauss–Newton with the postures eliminated, from the best of many
+random first postures. Friction lengthens and shortens by turns, so postures must be many and be
+reached from different sides; only messages at which the arm has moved on count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.learning.rest import FrictionDirection
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+WINDOW = 0.25  # [s] that one moment averages
+MOVED = 0.002  # [m] of some muscle since the last moment that counts
+FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small beside the weight
+#: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
+ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 43.0, 1.0
+FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
+MOST = 240  # moments
+
+LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
+WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best and least
+#: μ of a wire, with its mean; Coulomb torque of a joint over the largest that the weight needs
+FRICTION_MEAN, FRICTION, JOINT_FRICTION = 0.05, 0.05, 0.03
+TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
+AT_STOP = 0.03  # [rad] from a joint limit, where its stop may bear torque
+STICKING = 0.003  # [rad] that turn a joint's friction round
+OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
+FREEDOM = 4.0  # of the Student distribution
+#: postures drawn and tried as the first one, moments that tell how good they are, and those pursued
+DRAWN, POSTURES, TOLD_BY, SHORTLIST, PURSUED = 3200, 400, 24, 30, 6
+COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or much in that choice
+FARTHEST = 0.3  # [m] of a zero; [rad] of a step
+ROUNDS, FIRST_ROUNDS = 20, 6
+STEP = 1e-3  # [rad] of differences
+#: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which zeros are
+#: not found but guessed wrong: right ones leave 0.3 mm and cost 0.2–0.5, of a wrong posture 1.1
+LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
+UNKNOWN = 1.0  # [m] standard deviation of a zero that is being found
+KNOWN = 0.05  # [m] and below, of one that was
+
+
+class Zeros(NamedTuple):
+    """Zeros of the length sensors and how well they are known."""
+
+    offset: Array  # o [m], (M,)
+    deviation: Array  # standard deviation [m], (M,)
+
+    @property
+    def known(self) -> bool:
+        """Whether lengths can be relied on."""
+        return bool(self.deviation.max() < KNOWN)
+
+
+def no_offset(muscles: int) -> Zeros:
+    """Return the zeros of sensors that know them."""
+    return Zeros(np.zeros(muscles), np.zeros(muscles))
+
+
+class Moments(NamedTuple):
+    """Means of K short windows."""
+
+    tension: Array  # T [N], (K, M)
+    length: Array  # l as it was read [m], (K, M)
+    direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (K, M)
+    theta: Array  # θ [rad] or NaN, (K, D)
+
+    def some(self, rows: Ints) -> Moments:
+        """Return some of them."""
+        return Moments(*(part[rows] for part in self))
+
+
+class Fit(NamedTuple):
+    """What explains K moments."""
+
+    cost: float
+    #: o [m], μ of the wires, zeros of the tensions [N], Coulomb torques [N·m], (3M + D,)
+    constants: Array
+    theta: Array  # postures [rad], (K, D)
+
+
+class Linear(NamedTuple):
+    """Residuals of K moments, lengths and then torques, each in its noise; and their slopes."""
+
+    value: Array  # (K, M + D)
+    outside: Array  # beyond the joint limits, (K, D)
+    by_theta: Array  # (K, M + D, D)
+    by_constants: Array  # (K, M + D, 3M + D)
+
+
+class Zeroing:
+    """Collects moments and finds the zeros a little at every message. Lengths here are readings."""
+
+    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None, seed: int = 0) -> None:
+        """Find zeros with a network; `posture` [rad] (D,) if the arm stands in a known one."""
+        self._robot, self._mae, self._posture = robot, mae, posture
+        self._rng = np.random.default_rng([seed, 0x2E])
+        self._direction = FrictionDirection()
+        self._window: list[tuple[Array, ...]] = []  # rows of Moments
+        self._moments: list[tuple[Array, ...]] = []
+        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng)))
+        counts = *(3 * [robot.muscle_count]), robot.joint_count
+        self._mean = np.repeat([0.0, FRICTION_MEAN, 0.0, 0.0], counts)
+        spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight.max()
+        self._spread = np.repeat(spread, counts)
+        noise = LENGTH_NOISE * _worse(mae), np.full(robot.joint_count, TORQUE_NOISE)
+        self._noise = np.concatenate(noise)  # of the residuals, (M + D,)
+        self._before: Array = np.zeros(robot.muscle_count)  # l_read of the last moment that moved
+        self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
+        self._work: Generator[None, None, Fit] | None = None
+        self._fit: Fit | None = None  # the best so far
+        self.zeros: Zeros | None = None  # the guess so far, known or not; None before the first
+        self.trouble = ''
+
+    @property
+    def stands(self) -> bool:
+        """Whether the arm is said to stand in a posture."""
+        return self._posture is not None
+
+    @property
+    def enough(self) -> float:
+        """Seconds of gentle motion that it takes, or of standing still where the arm is said to."""
+        if self._posture is not None:
+            return STANDING
+        sees = bool(self._moments) and not np.isnan(self._moments[-1][-1]).any()
+        return ENOUGH_SEEN if sees else ENOUGH
+
+    @property
+    def progress(self) -> str:
+        """How far it is, and what is in its way."""
+        how = 'of standing still' if self._posture is not None else 'of gentle motion'
+        told = f'{self.moving:.0f} of {self.enough:.0f} s {how}'
+        return f'{told}; {self.trouble}' if self.trouble else told
+
+    @property
+    def done(self) -> bool:
+        """Whether the zeros are known."""
+        return self.zeros is not None and self.zeros.known
+
+    def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
+        """Take T [N] and readings of l [m] (M,), dt [s] after the last, and θ (D,) if measured."""
+        if self.done or (self.stands and self.trouble):
+            return
+        known = self._posture if self._posture is not None else theta
+        unknown = np.full(self._robot.joint_count, np.nan)
+        direction = self._direction.step(length, dt)
+        self._window.append((tension, length, direction, unknown if known is None else known))
+        self._span += dt
+        self._since += dt
+        if self._span >= WINDOW:
+            self._take(*(np.mean(part, axis=0) for part in zip(*self._window)))
+            self._window, self._span = [], 0.0
+        if self._work is not None:
+            try:
+                next(self._work)
+            except StopIteration as ended:
+                self._work = None
+                self._judge(ended.value)
+        elif self._since >= (AGAIN if self._fit and not self.stands else FIRST) and self._moments:
+            self._since = 0.0
+            seen = self._seen()
+            if np.isnan(seen.theta).any():
+                self._work = self._search(seen)
+            else:  # with the angles known, zeros are what is left
+                left = seen.length - self._mae.lengths(seen.theta, seen.tension)
+                offset = left.mean(axis=0)
+                constants = np.concatenate([offset, self._mean[len(offset) :]])
+                self._judge(Fit(0.0, constants, seen.theta))
+
+    def _seen(self, count: int | None = None) -> Moments:
+        return Moments(*map(np.array, zip(*self._moments[:count])))
+
+    def _take(self, *moment: Array) -> None:
+        length = moment[1]
+        if self._moments:
+            before = self._moments[0][1] if self.stands else self._before
+            gone = np.abs(length - before).max()
+            if self.stands and gone > MOVED:
+                self.trouble = (
+                    'it moved away from there; let it stand and call estimator/zero again'
+                )
+                return
+            if not self.stands and gone < MOVED:
+                return
+            self._before = length
+            if not self.stands and gone > FASTEST * WINDOW:
+                return
+            self.moving += WINDOW
+        self._before = length
+        if len(self._moments) >= MOST:
+            del self._moments[0]
+        self._moments.append(moment)
+
+    def _judge(self, fit: Fit) -> None:
+        """Take a fit as the guess, or as known when it rests on enough and explains that."""
+        seen, offset = self._seen(len(fit.theta)), fit.constants[: self._robot.muscle_count]
+        left = np.abs(seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
+        self._fit, self.trouble = fit, ''
+        enough = self.moving >= self.enough
+        if enough and (bad := float(np.median(left, axis=0).max())) > LARGEST_LEFT:
+            name = self._robot.muscles[int(np.median(left, axis=0).argmax())]
+            self.trouble = f'{1e3 * bad:.1f} mm of {name} are left unexplained'
+        elif enough and (cost := fit.cost / len(left) / len(self._noise)) > LARGEST_COST:
+            # Found without angles: another posture may look alike.
+            self.trouble = f'lengths and tensions do not agree yet: {cost:.2f} of {LARGEST_COST:g}'
+        deviation = np.full(len(offset), UNKNOWN)
+        if enough and not self.trouble:
+            deviation = 1.48 * np.median(left, axis=0) / np.sqrt(max(1.0, len(left) / 10.0))
+        self.zeros = Zeros(offset, deviation)
+
+    # -- without joint angles -------------------------------------------------------------------
+
+    def _search(self, seen: Moments) -> Generator[None, None, Fit]:
+        """Find what explains the moments; yields between its parts."""
+        guesses = yield from self._guesses(seen)
+        likeliest = yield from self._best(guesses, seen.some(_spaced(seen)), FIRST_ROUNDS)
+        # Few moments may be mistaken: all of them choose between the newest guess and the last.
+        last = [] if self._fit is None else [self._fit.constants]
+        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS))
+
+    def _best(self, guesses: list[Array], seen: Moments, rounds: int) -> Generator[None, None, Fit]:
+        """Return the best of the fits near each guess."""
+        best = yield from self._refine(self._start(guesses[0], seen), seen, rounds)
+        for constants in guesses[1:]:
+            fit = yield from self._refine(self._start(constants, seen), seen, rounds)
+            best = min(best, fit, key=lambda one: one.cost)
+        return best
+
+    def _start(self, constants: Array, seen: Moments) -> Fit:
+        length = seen.length - constants[: seen.length.shape[1]]
+        theta = self._mae.estimate(seen.tension, length).theta
+        return Fit(np.inf, constants, np.clip(theta, self._robot.lower, self._robot.upper))
+
+    def _guesses(self, seen: Moments) -> Generator[None, None, list[Array]]:
+        """Return constants with the zeros of the likeliest of many random first postures."""
+        robot, mae, muscles = self._robot, self._mae, self._robot.muscle_count
+        # The weight tells most postures from the first one before lengths say anything.
+        drawn, size = [], []
+        for _ in range(DRAWN // POSTURES):
+            drawn.append(robot.random_postures(POSTURES, self._rng))
+            pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
+            size.append(np.linalg.norm(self._torque(drawn[-1], pull)[0], axis=1))
+            yield
+        first = np.concatenate(drawn)[np.argsort(np.concatenate(size))[:POSTURES]]
+        pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
+        offset = seen.length[0] - mae.lengths(first, pull)
+        largest = np.abs(offset).max(axis=1)
+        offset = offset[np.argsort(largest)[: max(PURSUED, int((largest < FARTHEST).sum()))]]
+        part = seen.some(_spaced(seen))
+        cost, postures = np.empty(len(offset)), []
+        for n, zero in enumerate(offset):
+            theta = mae.estimate(part.tension, part.length - zero).theta
+            postures.append(theta)
+            left = part.length - zero - mae.lengths(theta, part.tension)
+            parts = left / COARSE[0], self._outside(theta) / COARSE[2]
+            cost[n] = sum(np.log1p(each**2).sum() for each in parts)
+            if n % 40 == 39:
+                yield
+        order = np.argsort(cost)[:SHORTLIST]
+        for n in order:
+            torque = self._torque(postures[n], part.tension)[0] / COARSE[1]
+            cost[n] += np.log1p(torque**2).sum()
+            yield
+        best = order[np.argsort(cost[order])][:PURSUED]
+        return [np.concatenate([offset[n], self._mean[muscles:]]) for n in best]
+
+    def _outside(self, theta: Array) -> Array:
+        robot = self._robot
+        return np.maximum(theta - robot.upper, 0.0) + np.minimum(theta - robot.lower, 0.0)
+
+    def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
+        """Return what torque is not balanced [N·m] (K, D), and G (K, M, D)."""
+        jacobian = self._mae.muscle_jacobian(theta, tension)
+        pull = np.einsum('kmd,km->kd', jacobian, tension)
+        return self._robot.kinematics.holding_torque(theta) + pull, jacobian
+
+    def _residuals(self, fit: Fit, seen: Moments, turning: Array, slopes: bool = False) -> Linear:
+        """Return residuals, with slopes only if asked; `turning` is which way joints turned."""
+        muscles, joints = self._robot.muscle_count, self._robot.joint_count
+        ends = [muscles, 2 * muscles, 3 * muscles]
+        offset, friction, zero, sticking = np.split(fit.constants, ends)
+        passed = np.exp(-friction * seen.direction)  # from the motor to the elastic unit
+        end, pull = seen.tension * passed, (seen.tension - zero) * passed
+        length = self._mae.lengths(fit.theta, end)
+        torque, jacobian = self._torque(fit.theta, pull)
+        left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
+        # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
+        low, high = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
+        free = ((low < fit.theta) & (fit.theta < high)).astype(float)
+        left[:, muscles:] = np.where(free > 0.0, left[:, muscles:], TORQUE_NOISE)
+        noise = self._noise
+        outside = self._outside(fit.theta) / OUTSIDE
+        if not slopes:
+            return Linear(left / noise, outside, left, left)
+        turned = [self._torque(fit.theta + STEP * row, pull)[0] for row in np.eye(joints)]
+        slope = (np.stack(turned, axis=-1) - torque[..., None]) / STEP
+        by_theta = np.concatenate([-jacobian, slope * free[..., None]], axis=1)
+        by = np.zeros((len(left), muscles + joints, len(fit.constants)))
+        m, j = np.arange(muscles), np.arange(joints)
+        by[:, m, m] = -1.0
+        rubbed = self._mae.lengths(fit.theta, end * np.exp(-STEP * seen.direction))
+        by[:, m, muscles + m] = (length - rubbed) / STEP
+        by[:, muscles:, muscles : 2 * muscles] = -np.swapaxes(
+            jacobian * (pull * seen.direction)[..., None], 1, 2
+        )
+        by[:, muscles:, 2 * muscles : 3 * muscles] = -np.swapaxes(
+            jacobian * passed[..., None], 1, 2
+        )
+        by[:, muscles + j, 3 * muscles + j] = turning
+        by[:, muscles:] *= free[..., None]
+        return Linear(left / noise, outside, by_theta / noise[:, None], by / noise[:, None])
+
+    def _cost(self, left: Linear, constants: Array) -> float:
+        student = (FREEDOM + 1.0) * np.log1p(left.value**2 / FREEDOM).sum()
+        prior = np.square((constants - self._mean) / self._spread).sum()
+        return float(student + np.square(left.outside).sum() + prior)
+
+    def _refine(self, fit: Fit, seen: Moments, rounds: int = ROUNDS) -> Generator[None, None, Fit]:
+        """Return the best fit near one, after so many Gauss–Newton steps at most."""
+        eye, own_eye = np.eye(self._robot.joint_count), np.eye(len(fit.constants))
+        damping, turning = 1e-3, _turning(fit.theta)
+        fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning), fit.constants))
+        for _ in range(rounds):
+            yield
+            left = self._residuals(fit, seen, turning, slopes=True)
+            weight = (FREEDOM + 1.0) / (FREEDOM + left.value**2)
+            weighted = weight[..., None] * left.by_theta
+            normal = np.swapaxes(left.by_theta, 1, 2) @ weighted
+            normal += (left.outside != 0.0)[:, :, None] * eye / OUTSIDE**2
+            gradient = np.einsum('krd,kr->kd', weighted, left.value) + left.outside / OUTSIDE
+            cross = np.swapaxes(left.by_constants, 1, 2) @ weighted
+            own = np.einsum('krp,kr,krq->pq', left.by_constants, weight, left.by_constants)
+            own += np.diag(self._spread**-2)
+            down = np.einsum('krp,kr->p', left.by_constants, weight * left.value)
+            down += (fit.constants - self._mean) / self._spread**2
+            before = fit.cost
+            while damping < 1e4:
+                inverse = np.linalg.inv(normal * (1.0 + damping * eye) + 1e-6 * eye)
+                through = cross @ inverse
+                reduced = own * (1.0 + damping * own_eye)
+                reduced = reduced - np.einsum('kpd,kqd->pq', through, cross)
+                shift = -np.linalg.solve(reduced, down - np.einsum('kpd,kd->p', through, gradient))
+                turn = gradient + np.einsum('kpd,p->kd', cross, shift)
+                turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)
+                tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
+                cost = self._cost(self._residuals(tried, seen, turning), tried.constants)
+                if cost < fit.cost:
+                    break
+                damping *= 5.0
+                yield
+            else:
+                break
+            fit, damping = tried._replace(cost=cost), max(0.2 * damping, 1e-6)
+            if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
+                break
+        return fit
+
+
+def _worse(mae: Mae) -> Array:
+    """Return how much worse than the middle one the network knows each muscle, (M,).
+
+    A muscle that ② restores badly from healthy messages pulls the zeros of all others along, since
+    a network's error is the same in neighbouring postures: its weight falls as that grows squared.
+    """
+    if mae.anomaly is None:
+        return np.ones(len(mae.muscles))
+    variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
+    return np.clip(variance / np.median(variance), *WORST)
+
+
+def _turning(theta: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
+    result, reference = np.zeros_like(theta), theta[0].copy()
+    for k, posture in enumerate(theta):
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
+    return result
+
+
+def _spaced(seen: Moments) -> Ints:
+    """Return which few of the moments stand for all."""
+    return np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(np.int64))

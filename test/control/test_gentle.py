@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moves, and how, while nobody knows the zeros of the lengths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.gentle import SPEED, gentle_limit
+from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.robot.robot import Robot
+
+DT = 0.01
+
+
+class Loop:
+    """A controller whose arm reads lengths that are too long by `offset`."""
+
+    def __init__(self, robot, mae):
+        self.arm, self.core, self.now = EmulatedArm(robot, 1), Controller(robot), 0.0
+        self.offset = np.zeros(robot.muscle_count)
+        self.core.use(mae)
+        self.core.zeros(False, self.offset)
+        self.commands, self.pulls = [], []
+
+    def run(self, seconds):
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            read = self.arm.sense()
+            length = read.length + self.offset
+            self.core.muscles(Muscles(length, read.tension, read.temperature), self.now)
+            self.core.estimated(self.arm.theta, self.now)
+            command = self.core.step(self.now)
+            if command is not None:
+                self.arm.command_length(command.value - self.offset)
+                self.commands.append(command.value - self.offset)
+            self.pulls.append(read.tension.max())
+            self.arm.step(DT)
+
+
+@pytest.fixture
+def loop(trained):
+    return Loop(Robot.load('arm26'), trained['default'])
+
+
+def test_a_target_waits_for_the_zeros(loop):
+    loop.run(0.1)
+    loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
+    loop.run(0.5)
+    assert not loop.commands
+    assert 'length zeros are unknown' in loop.core.report(loop.now).message
+    loop.core.zeros(True, loop.offset)
+    loop.run(0.5)
+    assert loop.commands
+
+
+def test_exploring_is_slow_moves_the_arm_and_spares_it(loop):
+    loop.offset[:] = [0.1, -0.13, 0.08, -0.06, 0.12, 0.05]
+    loop.core.explore(True)
+    seen = []
+    for _ in range(200):
+        loop.run(0.1)
+        seen.append(loop.arm.theta)
+    assert not loop.core.safety.cause
+    assert np.ptp(seen, axis=0).min() > 0.3
+    speed = np.abs(np.diff(loop.commands, axis=0)) / DT
+    # What is faster pays out, so that no tension passes its limit.
+    assert np.quantile(speed, 0.99) < 1.2 * SPEED
+    assert max(loop.pulls) < gentle_limit(loop.arm.robot) + 30.0
+
+
+def test_other_zeros_move_nothing(loop):
+    loop.core.explore(True)
+    loop.run(1.0)
+    less = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
+    before = loop.commands[-1]
+    loop.offset = loop.offset - less
+    loop.core.zeros(True, less)
+    loop.run(DT)
+    assert np.abs(loop.commands[-1] - before).max() < 0.002

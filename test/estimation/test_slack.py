@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A muscle without tension: cut, or a slow winch that takes up slack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, AnomalyDetector
+from musculoskeletal_ae.estimation.settings import Slack
+
+DT = 0.01
+MUSCLE = 2
+
+
+@pytest.fixture
+def noticed(robot, mae, slack):
+    """Return a function that says after how long [s] a muscle without tension is called cut."""
+
+    def run(speed, until, longest=20.0, settings=None):
+        """Wind in at a speed [m/s] for so far [m], then stand."""
+        detector, rng = AnomalyDetector(robot), np.random.default_rng(0)
+        detector.slack = settings or Slack()
+        detector.use(mae)
+        state = mae.estimate(*slack)
+        for n in range(round(longest / DT)):
+            wound = min(until, speed * n * DT) * np.eye(6)[MUSCLE]
+            length = slack.length - wound + 1e-4 * rng.standard_normal(6)
+            detector.commanded(length=length - 0.003)
+            verdict = detector.step(state, slack.tension, length, DT)
+            if verdict.cause:
+                assert verdict.suspect == MUSCLE and 'no tension' in verdict.cause
+                return n * DT
+        return np.inf
+
+    return run
+
+
+def test_a_module_that_stands_has_a_cut_muscle_after_half_a_second(noticed):
+    assert noticed(0.0, 0.0) <= DEAD_TIME + DT
+
+
+@pytest.mark.parametrize('speed', [0.009, 0.036])
+def test_a_slow_winch_may_take_up_slack(noticed, speed):
+    slack = 0.03
+    assert noticed(speed, slack) >= slack / speed
+    assert noticed(speed, slack) <= slack / speed + DEAD_TIME + 3 * DT
+
+
+@pytest.mark.parametrize('speed', [0.009, 0.036, 0.25])
+def test_no_slack_is_longer_than_the_limit(noticed, speed):
+    longest = Slack().slack_length
+    expected = max(DEAD_TIME, longest / speed)
+    assert expected - 2 * DT <= noticed(speed, 1.0) <= expected + DEAD_TIME
+
+
+def test_the_limits_are_parameters(noticed):
+    assert noticed(0.036, 0.2, settings=Slack(slack_length=0.15)) >= 0.15 / 0.036 - DT
+    assert noticed(0.036, 0.2, settings=Slack(slack_speed=0.05)) <= DEAD_TIME + DT
+
+
+def test_noise_of_the_sensor_is_no_winding(noticed):
+    assert noticed(0.001, 1.0) <= 2.0 * DEAD_TIME
+
+
+@pytest.mark.parametrize(('loose', 'found'), [(0.04, False), (-0.02, True)])
+def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, loose, found):
+    """By a slow winch both look alike, but what is left of a cut wire is too short."""
+    detector = AnomalyDetector(robot)
+    detector.use(calibrated)
+    one = np.eye(6)[MUSCLE]
+    tension, start = healthy.tension * (1.0 - one), healthy.length + loose * one
+    causes = []
+    for n in range(60):
+        length = start - 0.009 * n * DT * one
+        detector.commanded(length=length - 0.003)
+        state = calibrated.estimate(tension, length)
+        causes.append(detector.step(state, tension, length, DT).cause)
+    assert any(cause.startswith('d = ') for cause in causes[:50]) == found

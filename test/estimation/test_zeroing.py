@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Zeros of the lengths, found on the network's own body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation import zeroing
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.zeroing import WINDOW, Zeroing
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.tension import least_tension
+
+OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
+
+
+@pytest.fixture
+def moment(robot, mae):
+    """Return T [N] and l [m] at the t-th second of a slow swing, as the network's body holds it."""
+
+    def at(t):
+        middle, half = 0.5 * (robot.lower + robot.upper), 0.4 * (robot.upper - robot.lower)
+        theta = middle + half * np.sin(np.array([0.11, 0.17])[: len(middle)] * t + 0.5)
+        tension = np.full(robot.muscle_count, robot.tension.bias)
+        for _ in range(3):
+            jacobian, torque = (
+                mae.muscle_jacobian(theta, tension),
+                robot.kinematics.holding_torque(theta),
+            )
+            tension = least_tension(
+                jacobian, torque, robot.tension.bias, robot.tension.limit
+            ).tension
+        return theta, tension, mae.lengths(theta, tension)
+
+    return at
+
+
+def run(zeros, moment, seconds, sees, begin=0.0):
+    for n in range(round(seconds / WINDOW)):
+        theta, tension, length = moment(begin + n * WINDOW)
+        for _ in range(25):
+            zeros.step(tension, length + OFFSET, WINDOW / 25, theta if sees else None)
+        if zeros.done:
+            break
+    return zeros
+
+
+def test_joint_sensors_tell_the_zeros(robot, mae, moment):
+    found = run(Zeroing(robot, mae), moment, 40.0, sees=True)
+    assert found.done and found.moving < 30.0
+    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=1e-3)
+
+
+def test_lengths_and_tensions_tell_them_without(robot, mae, moment):
+    found = run(Zeroing(robot, mae), moment, 90.0, sees=False)
+    assert found.done and found.moving < 60.0
+    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=3e-3)
+
+
+def test_a_stated_posture_tells_them_if_the_arm_stands(robot, mae, moment):
+    theta, *standing = moment(3.0)
+    moved = run(Zeroing(robot, mae, theta), moment, 5.0, sees=False, begin=3.0)
+    assert not moved.done and 'call estimator/zero again' in moved.progress
+    found = run(Zeroing(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False)
+    assert found.done
+    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=1e-3)
+
+
+def test_an_arm_that_stands_tells_too_little(robot, mae, moment):
+    found = run(Zeroing(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
+    assert found.zeros is not None and not found.zeros.known
+    assert f'0 of {zeroing.ENOUGH:.0f} s of gentle motion' in found.progress
+
+
+def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
+    estimator = Estimator(robot)
+    with pytest.raises(MusculoskeletalError, match='no checkpoint'):
+        estimator.zero()
+    estimator.use(mae)
+    for posture in ((0.1,), tuple(robot.upper + 0.1)):
+        with pytest.raises(MusculoskeletalError, match='legal'):
+            estimator.zero(posture)
+    assert estimator.zeros.known
+
+
+def test_while_zeros_are_unknown_nothing_is_judged_but_a_muscle_without_tension(
+    robot, calibrated, moment
+):
+    estimator = Estimator(robot)
+    estimator.use(calibrated)
+    estimator.zero()
+    assert not estimator.zeros.known
+    now, detected = 0.0, []
+    for n in range(300):
+        _, tension, length = moment(0.01 * n)
+        now += 0.01
+        estimator.commanded(now, length=length + OFFSET - estimator.zeros.offset)
+        if n > 200:
+            tension = tension * (np.arange(6) != 2)
+        estimate = estimator.step(tension, length + OFFSET, now, now)
+        detected += [n] * bool(estimate is not None and estimate.detected)
+    assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
+    assert 'finding the length zeros' in str(estimator.report(now)) or estimator.cause
