@@ -10,7 +10,7 @@ from setuptools import find_packages, setup
 
 NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
-ROS_TOOLS = ['check_driver', 'record', 'render', 'replay']
+ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
 
 

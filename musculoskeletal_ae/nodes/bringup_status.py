@@ -22,6 +22,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.situation import Situation
 
 
 class BringupStatus(Shell):
@@ -36,16 +37,16 @@ class BringupStatus(Shell):
         self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.detected = self.explored = False
+        self.situation = Situation(self.get_namespace())
         self.checkpoints = 0
-        self.samples = self.suspect = self.stopped = ''
         self.started: float | None = None
         self.follow_posture('joint_states', partial(setattr, self, 'theta'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        self.listen(Bool, 'anomaly_detected', lambda m: setattr(self, 'detected', m.data), LATCHED)
+        detected = partial(setattr, self.situation, 'detected')
+        self.listen(Bool, 'anomaly_detected', lambda m: detected(m.data), LATCHED)
         self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
-        self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
+        self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
 
     def _estimated(self, theta: Array) -> None:
@@ -54,30 +55,6 @@ class BringupStatus(Shell):
 
     def _count_checkpoint(self, _: UInt8MultiArray) -> None:
         self.checkpoints += 1
-
-    def _diagnosed(self, message: DiagnosticArray) -> None:
-        here = self.get_namespace().rstrip('/')
-        for status in message.status:
-            values = {value.key: value.value for value in status.values}
-            if status.name.startswith(f'{here}/learner:'):
-                self.samples = values.get('samples', '')
-            elif status.name.startswith(f'{here}/estimator:'):
-                self.suspect = values.get('suspect muscle', '')
-            elif status.name.startswith(f'{here}/controller:'):
-                self.stopped = status.message if status.message.startswith('stopped') else ''
-                if not self.stopped:
-                    self.explored = 'exploring' in (status.message, values.get('doing'))
-
-    def _trouble(self) -> str:
-        """Return what keeps the arm from going on, and every step that is to be taken."""
-        told, steps = [], []
-        if self.detected:
-            told.append(f'ANOMALY: {self.suspect}')
-            steps += ['mend it', 'estimator/reset']
-        if self.stopped:
-            told.append(self.stopped.replace('stopped', 'STOPPED', 1))
-            steps += ['controller/reset', *['controller/explore'] * self.explored]
-        return f'  {", ".join(told)} (to go on: {", ".join(steps)})' if told else ''
 
     def _print(self) -> None:
         now = time.monotonic()
@@ -91,7 +68,9 @@ class BringupStatus(Shell):
         )
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
-        line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
-        print(printable(line + self._trouble()), flush=True)
+        told = self.situation
+        line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
+        more = told.trouble() or told.hint()
+        print(printable(f'{line}  {more}'.rstrip()), flush=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

@@ -69,6 +69,8 @@ class Shell(Node):
         self._take_old_names()
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
+        #: name of the root link's frame in messages that are published
+        self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by

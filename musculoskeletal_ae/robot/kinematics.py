@@ -136,3 +136,12 @@ class Kinematics:
         """Return the pose of the end effector in the root link's frame."""
         pin.forwardKinematics(self.model, self.data, self._q(theta))
         return pin.updateFramePlacement(self.model, self.data, self.end_effector_frame).copy()
+
+    def link_poses(self, theta: Array) -> dict[str, pin.SE3]:
+        """Return the poses of all links in the root link's frame, by name."""
+        pin.framesForwardKinematics(self.model, self.data, self._q(theta))
+        return {
+            frame.name: pose
+            for frame, pose in zip(self.model.frames, self.data.oMf)
+            if frame.type == pin.FrameType.BODY
+        }

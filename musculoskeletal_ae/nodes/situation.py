@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a running arm is, from what all nodes say of themselves on /diagnostics."""
+
+from __future__ import annotations
+
+import math
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+
+class Situation:
+    """What the newest diagnostics of one namespace said, and what to do about it."""
+
+    def __init__(self, namespace: str) -> None:
+        """Nothing has been said yet."""
+        self._here = namespace.rstrip('/')
+        self.detected = self.explored = False
+        self.samples = self.checkpoints = self.suspect = self.doing = self.stopped = ''
+        self.distance = self.limit = math.nan  # d of the detector, and what is an anomaly
+        self.played = ''  # '12.3 of 60.0 s' of a bag
+
+    def diagnosed(self, message: DiagnosticArray) -> None:
+        """Take a message of /diagnostics."""
+        for status in message.status:
+            node, _, _ = status.name.partition(':')
+            values = {value.key: value.value for value in status.values}
+            if node == f'{self._here}/learner':
+                self.samples = values.get('samples', '')
+                self.checkpoints = values.get('checkpoints', '')
+            elif node == f'{self._here}/estimator':
+                self.suspect = values.get('suspect muscle', '')
+                self.distance = _number(values.get('d', ''))
+                self.limit = _number(values.get('d limit', ''))
+            elif node == f'{self._here}/controller':
+                self.doing = status.message
+                self.stopped = status.message if status.message.startswith('stopped') else ''
+                if not self.stopped:
+                    self.explored = 'exploring' in (status.message, values.get('doing'))
+            elif node == f'{self._here}/replay':
+                self.played = values.get('position', '')
+
+    def trouble(self) -> str:
+        """Return what keeps the arm from going on, and every step that is to be taken."""
+        told, steps = [], []
+        if self.detected:
+            told.append(f'ANOMALY: {self.suspect}')
+            steps += ['mend it', 'estimator/reset']
+        if self.stopped:
+            told.append(self.stopped.replace('stopped', 'STOPPED', 1))
+            steps += ['controller/reset', *['controller/explore'] * self.explored]
+        return f'{", ".join(told)} (to go on: {", ".join(steps)})' if told else ''
+
+    def hint(self) -> str:
+        """Return why the error may rise before anything is learned, '' once something is."""
+        if self.samples != '0':  # '' without a learner
+            return ''
+        return 'nothing learned yet: the error may rise while the arm leaves its first posture'
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
