@@ -10,9 +10,12 @@ from argparse import Namespace
 from pathlib import Path
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -74,7 +77,16 @@ class Replay(Node):
             for recorded, name in names.items()
         }
         self._recorded_clock = RecordedClock(self, options.rate) if options.clock else None
-        self._next_service = 0.0
+        self._next_service = self._next_report = 0.0
+        self._sought: int | None = None  # where to go on [ns]
+        number = FloatingPointRange(from_value=0.0, to_value=(self._stop - self._start) / 1e9)
+        told = ParameterDescriptor(
+            description='go on from here, counted from where the replay began [s]',
+            floating_point_range=[number],
+        )
+        self.declare_parameter('position', 0.0, told)
+        self.add_on_set_parameters_callback(self._seek)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -99,11 +111,22 @@ class Replay(Node):
         # Just before the first message, so that it is not due when the lap begins paused.
         self._timeline.jump(self._start - 1, time.monotonic())
         progress.reset()
-        for message in lap(self._bag, self._names, self._start, self._stop):
+        start: int | None = self._start
+        while start is not None:
+            start = self._play_from(start, progress)
+
+    def _play_from(self, start: int, progress: tqdm) -> int | None:
+        """Publish everything from here; return where to go on if somebody seeks [ns]."""
+        for message in lap(self._bag, self._names, start, self._stop):
             self._wait(message.log_time, progress)
+            if self._sought is not None:
+                sought, self._sought = self._sought, None
+                self._timeline.jump(sought - 1, time.monotonic())
+                return sought
             self._timeline.catch_up(message.log_time, time.monotonic())
             self._tick()
             self._publisher[message.topic].publish(message.data)
+        return None
 
     def play_again_and_again(self, progress: tqdm) -> None:
         """Publish everything until the process is ended."""
@@ -122,6 +145,8 @@ class Replay(Node):
         """Answer services and publish the clock until a recorded time [ns] is due."""
         self._next_time = recorded
         while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
+            if self._sought is not None:
+                return
             self._tick()
             wait = min(due, SERVICE_PERIOD)
             if self._recorded_clock:
@@ -129,6 +154,9 @@ class Replay(Node):
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.spin_once(timeout_sec=wait)
+                if now > self._next_report:
+                    self._next_report = now + 1.0
+                    self._report()
                 done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
                 progress.update(max(0.0, done - progress.n))
             else:
@@ -138,6 +166,25 @@ class Replay(Node):
         now = time.monotonic()
         if self._recorded_clock:
             self._recorded_clock.tick(self._timeline.recorded(now), now)
+
+    def _seek(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            if parameter.name == 'position':
+                self._sought = self._start + int(1e9 * parameter.value)
+        return SetParametersResult(successful=True)
+
+    def _report(self) -> None:
+        at = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
+        position = f'{max(at, 0.0):.1f} of {(self._stop - self._start) / 1e9:.1f} s'
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.OK,
+            name=f'{self.get_fully_qualified_name()}: state',
+            message='paused' if self._timeline.paused else 'playing',
+            values=[KeyValue(key='position', value=position)],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""
@@ -186,7 +233,8 @@ def parse(arguments: list[str]) -> Namespace:
         'replay',
         'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,
         'While it plays, the services replay/pause, replay/resume and replay/step '
-        '(std_srvs/Trigger) stop it, go on, and publish the messages of the next recorded time.',
+        '(std_srvs/Trigger) stop it, go on, and play the messages of the next recorded time. Its '
+        'parameter `position` [s] goes there.',
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a bag directory or an mcap file')

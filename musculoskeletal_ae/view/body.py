@@ -30,7 +30,8 @@ from musculoskeletal_ae.robot.robot import Robot
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
 DASHES = 5  # of a straight segment of a muscle; whole muscles show no gaps
-LOOSE, TIGHT = np.array([0.0, 114.0, 178.0]), np.array([230.0, 97.0, 0.0])  # red, green, blue
+#: red, green, blue at T_bias and at T_limit
+ENDS = LOOSE, TIGHT = np.array([0.0, 114.0, 178.0]), np.array([230.0, 97.0, 0.0])
 
 
 class Kind(IntEnum):

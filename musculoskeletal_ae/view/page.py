@@ -29,6 +29,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view.body import (
     DASHES,
+    ENDS,
     MARKS,
     Kind,
     colours,
@@ -45,6 +46,16 @@ PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
 MOST_PAYLOAD = 5.0  # [kg]
 HOT = 80.0  # [°C] at the right end of a bar
 ERROR, ANOMALY, DISTANCE, LIMIT = range(4)  # columns of the curves
+
+
+SPOT = '<span style="color:rgb{}">●</span> {} &nbsp; '
+GRADIENT = 'linear-gradient(90deg,rgb{},rgb{})'.format(*(tuple(c.astype(int)) for c in ENDS))
+LEGEND = (
+    '<div style="font-size:11px;padding:6px 10px">'
+    + ''.join(SPOT.format(colour, arm) for arm, colour in ARMS.items())
+    + '<br>T_bias <span style="display:inline-block;width:90px;height:8px;border-radius:3px;'
+    f'background:{GRADIENT}"></span> T_limit &nbsp; ✂ cut &nbsp; ? suspect &nbsp; ⊘ isolated</div>'
+)
 
 
 def _is_local(host: str) -> bool:
@@ -118,7 +129,8 @@ class Page:
         solids, self.notes = link_solids(robot)
         middle = 0.5 * (robot.lower + robot.upper)
         points = robot.routes.points(middle[None])[0]
-        centre, reach = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+        points = np.vstack([points, kin.end_effector_pose(middle).translation])
+        centre, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), float(np.ptp(points))
         self._joints: dict[str, list[viser.FrameHandle]] = {}
         for arm, colour in ARMS.items():
             scene.add_frame(f'/{arm}', show_axes=False, visible=False)
@@ -134,10 +146,11 @@ class Page:
                     mesh.faces,
                     color=colour,
                     opacity=OPACITIES[arm],
-                    cast_shadow=arm == 'measured',
+                    cast_shadow=False,
                 )
         self._arms = {arm: scene.get_handle_by_name(f'/{arm}') for arm in ARMS}
-        tube = trimesh.creation.cylinder(1.0, 1.0, sections=10)
+        tube = trimesh.creation.cylinder(1.0, 1.0, sections=12)
+        tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)  # open ends leave no seams
         kinds = np.zeros(robot.muscle_count, dtype=int)
         tubes = muscle_tubes(robot, middle, np.zeros(robot.muscle_count), kinds)
         self._tubes = scene.add_batched_meshes_simple(
@@ -149,6 +162,8 @@ class Page:
             batched_scales=tubes.scales,
             batched_colors=tubes.colours.astype(np.uint8),
             lod='off',
+            side='double',
+            cast_shadow=False,
             visible=False,
         )
         self._labels = [
@@ -160,9 +175,14 @@ class Page:
             '/floor', 4.0 * reach, 4.0 * reach, plane='xy', position=(*centre[:2], low),
             cell_size=0.1, section_size=0.5, cell_color=(225,) * 3, section_color=(200,) * 3,
         )  # fmt: skip
+        # Lights that leave colours what they are.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_ambient('/light', intensity=1.5)
+        scene.add_light_directional('/lamp', intensity=1.0, position=(2.0, -1.0, 3.0))
         camera = self._server.initial_camera
-        camera.look_at = centre - np.array([0.0, 0.0, 0.15 * reach])
-        camera.position = centre + reach * np.array([1.35, -1.0, 0.35])
+        camera.look_at = centre
+        camera.position = centre + reach * np.array([1.6, 1.5, 0.4])
         camera.fov = 0.8
         self._reach = reach
 
@@ -181,6 +201,7 @@ class Page:
                 self._plot('d (dashed: what is an anomaly)', ['#0072b2', '#c80082']),
             ]
             self._bars = gui.add_html('')
+            gui.add_html(LEGEND)
         panel.dock_left()
         panel.set_width(350)
         with gui.add_folder('Show'):
@@ -202,7 +223,7 @@ class Page:
             (np.array([-HISTORY, 0.0]), *[empty] * len(strokes)),
             tuple(series),
             title=title,
-            height=120,
+            height=96,
             scales={'x': {'time': False, 'auto': False, 'range': (-HISTORY, 0.0)}},
             legend={'show': False},
             cursor={'show': False},
@@ -290,13 +311,13 @@ class Page:
             warmth = f'{temperature[m]:.0f} °C' if known else 'not measured'
             word = f', {kind.name.lower()}' if kind else ''
             title = f'{name}: {tension[m]:.0f} N, {warmth}{word}'
-            weight = 'font-weight:700;' * bool(kind)
+            weight = 'white-space:nowrap;' + 'font-weight:700;' * bool(kind)
             rows.append(
                 f'<tr title="{html.escape(title)}"><td {cell.format(weight)}>'
                 f'{MARKS[kind]}{html.escape(name)}</td>'
                 f'<td {cell.format("width:42%")}><div style="{track.format(70)}"><div style="width:'
                 f'{width:.0f}%;height:9px;border-radius:3px;background:{colour}"></div></div></td>'
-                f'<td {cell.format("text-align:right")}>{tension[m]:.0f} N</td>'
+                f'<td {cell.format("text-align:right;white-space:nowrap")}>{tension[m]:.0f} N</td>'
                 f'<td {cell.format("width:16%")}><div style="{track.format(26)}"><div style="width:'
                 f'{hot:.0f}%;height:9px;border-radius:3px;background:#8c6d1f"></div></div></td>'
                 f'<td {cell.format("text-align:right;white-space:nowrap")}>'

@@ -88,8 +88,8 @@ class Browser:
         while True:
             answer = json.loads(self._socket.recv(timeout=DEADLINE))
             if answer.get('id') == message['id']:
-                assert 'error' not in answer, (method, answer)
-                return answer['result']
+                # While a page is loaded there is nothing to evaluate in.
+                return answer.get('result') or {'result': {}, 'error': answer.get('error')}
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression."""
@@ -99,7 +99,7 @@ class Browser:
     @property
     def text(self) -> str:
         """All that can be read on the page."""
-        return self.evaluate(TEXT)
+        return self.evaluate(TEXT) or ''
 
     def wait_for(self, text: str) -> None:
         """Wait until a text can be read."""
@@ -145,6 +145,12 @@ class Browser:
             f'the button {button}',
         )
         return found[0], found[1]
+
+    def close_notifications(self) -> None:
+        """Click away what covers the arm, such as the warning that there is no graphics card."""
+        button = '.mantine-Notification-closeButton'
+        self.evaluate(f'document.querySelectorAll("{button}").forEach(each => each.click())')
+        time.sleep(0.5)
 
     def screenshot(self, file: Path) -> bytes:
         """Save what is seen as a PNG."""
