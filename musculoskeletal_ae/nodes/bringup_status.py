@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, /diagnostics →
-stdout.
+On a terminal, where rich is installed (`--view` brings it), one screen instead, with muscles.
+
+joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, muscle_states,
+/diagnostics → stdout.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -23,6 +26,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.robot.robot import Robot
 
 
 class BringupStatus(Shell):
@@ -47,7 +51,17 @@ class BringupStatus(Shell):
         self.listen(Bool, 'anomaly_detected', lambda m: detected(m.data), LATCHED)
         self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
         self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
+        self.states: Array | None = None
+        self.screen = open_screen()
+        if self.screen is not None:
+            self.follow_muscle_states(partial(setattr, self, 'states'))
         self.create_timer(1.0, self._print, clock=STEADY)
+
+    def destroy_node(self) -> None:
+        """Leave the last screen standing."""
+        if self.screen is not None:
+            self.screen.stop()
+        super().destroy_node()
 
     def _estimated(self, theta: Array) -> None:
         if self.theta is not None:
@@ -71,6 +85,41 @@ class BringupStatus(Shell):
         told = self.situation
         line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
         more = told.trouble() or told.hint()
-        print(printable(f'{line}  {more}'.rstrip()), flush=True)
+        if self.screen is None:
+            print(printable(f'{line}  {more}'.rstrip()), flush=True)
+        else:
+            self.screen.update(muscle_table(self.robot, self.states, [line, more]), refresh=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException
+
+
+def open_screen() -> Any:
+    """Return a rich display that is redrawn in place, None without rich or without a terminal."""
+    if not sys.stdout.isatty():
+        return None
+    try:
+        from rich.live import Live
+    except ImportError:
+        return None
+    screen = Live(auto_refresh=False)
+    screen.start()
+    return screen
+
+
+def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> Any:
+    """Return lines, and l [m], T [N] and °C (3, M) as a table with bars, for a terminal."""
+    from rich.bar import Bar
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, padding=(0, 1))
+    for title in ('muscle', 'l [mm]', 'T [N]', '', '°C'):
+        table.add_column(title, justify='left' if title in ('muscle', '') else 'right')
+    for m, name in enumerate(robot.muscles if states is not None else ()):
+        length, tension, temperature = states[:, m]  # type: ignore[index]
+        colour = 'blue' if tension < robot.tension.limit else 'dark_orange'
+        bar = Bar(robot.tension.limit, 0.0, max(tension, 0.0), width=30, color=colour)
+        table.add_row(name, f'{1e3 * length:.0f}', f'{tension:.0f}', bar, f'{temperature:.0f}')
+    texts = [Text(printable(lines[0])), Text(printable(lines[1]), style='bold red')]
+    return Group(*filter(None, texts), table)

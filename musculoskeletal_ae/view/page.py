@@ -9,6 +9,7 @@ What a visitor asks for goes to `act`, called in viser's threads with a name and
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import html
 import io
@@ -86,7 +87,10 @@ class Page:
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
         # A tunnel to the world is nothing that a visitor may ask for.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        self._server._websock_server.on_client_connect(self._check_origin)
+        sockets = self._server._websock_server
+        sockets.on_client_connect(self._check_origin)
+        for early in [*sockets._live_connections.values()]:  # a browser comes again by itself
+            asyncio.run_coroutine_threadsafe(early.close(), self._server.get_event_loop())
         self._server.on_client_connect(lambda client: self._count(client.client_id, True))
         self._server.on_client_disconnect(lambda client: self._count(client.client_id, False))
         self._curves: deque[tuple[float, ...]] = deque(maxlen=int(HISTORY / SAMPLING))
