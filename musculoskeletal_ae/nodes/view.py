@@ -194,7 +194,7 @@ class View(Node):
             error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
         anomaly = self._newest('anomaly')
         self.error, self.anomaly = error, math.nan if anomaly is None else anomaly
-        self.page.sample(error, self.anomaly, told.distance, told.limit)
+        self.page.sample(time.monotonic(), error, self.anomaly, told.distance, told.limit)
 
     def _kinds(self) -> Any:
         from musculoskeletal_ae.view.body import Kind

@@ -14,7 +14,6 @@ import contextlib
 import html
 import io
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from ipaddress import ip_address
@@ -94,7 +93,7 @@ class Page:
         self._server.on_client_connect(lambda client: self._count(client.client_id, True))
         self._server.on_client_disconnect(lambda client: self._count(client.client_id, False))
         self._curves: deque[tuple[float, ...]] = deque(maxlen=int(HISTORY / SAMPLING))
-        self._sampled = 0.0
+        self._sampled = -HISTORY
         self._kinds: Ints = np.full(robot.muscle_count, -1)
         self._posture: dict[str, Array] = {}
         self._targeted = self._pushing = False
@@ -276,9 +275,10 @@ class Page:
             word = '' if kind <= Kind.SOUND else f' {Kind(kind).name.lower()}'
             label.text = f'{MARKS.get(Kind(max(kind, 0)), "")}{name}{word}'
 
-    def sample(self, error: float, anomaly: float, distance: float, limit: float) -> None:
-        """Remember what the curves show; NaN where it is not known."""
-        now = time.monotonic()
+    def sample(
+        self, now: float, error: float, anomaly: float, distance: float, limit: float
+    ) -> None:
+        """Remember what the curves show at a time [s]; NaN where it is not known."""
         if now - self._sampled >= SAMPLING:
             self._sampled = now
             self._curves.append((now, error, anomaly, distance, limit))
