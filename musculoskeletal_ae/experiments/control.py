@@ -227,11 +227,18 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
 
 
 ROWS = (
+    Row('`geometric`, distance from θ_eval [rad]', NOTHING, '', 'geometric.error_rad'),
+    Row('`first`, distance from θ_eval [rad]', 'far below `geometric`', '', 'first.error_rad'),
+    Row('`second`, distance from θ_eval [rad]', 'far below `geometric`', '', 'second.error_rad'),
     Row('`proposed`, distance from θ_eval [rad]', 'as `second`',
         'proposed_paper.error_rad', 'proposed.error_rad', '', 0.06),
-    Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`',
-        'proposed_paper.tension_n', 'proposed.tension_n', 'qp_bound_n', digits=0),
-    Row('`proposed`, ‖T‖ beside the QP bound [ratio]', NOTHING,
+    Row('`geometric`, ‖T‖ [N]', NOTHING, '', 'geometric.tension_n', 'geometric.bound_reached_n',
+        digits=0),
+    Row('`first`, ‖T‖ [N]', NOTHING, '', 'first.tension_n', 'first.bound_reached_n', digits=0),
+    Row('`second`, ‖T‖ [N]', NOTHING, '', 'second.tension_n', 'second.bound_reached_n', digits=0),
+    Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`', 'proposed_paper.tension_n',
+        'proposed.tension_n', 'proposed.bound_reached_n', digits=0),
+    Row('`proposed`, ‖T‖ beside the QP bound at θ_eval [ratio]', NOTHING,
         'proposed_paper.tension_to_bound', 'proposed.tension_to_bound', '', 1.1, 2),
 )  # fmt: skip
 EXPERIMENT = Experiment(__doc__, measure, (control, control_all), 10.0, ROWS)
