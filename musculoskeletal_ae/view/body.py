@@ -132,6 +132,7 @@ def _capsules(robot: Robot) -> list[Solid]:
         length = float(np.linalg.norm(end))
         if length > SHORTEST_BONE:
             mesh = trimesh.creation.capsule(length, 0.8 * BONE_WIDTH, count=[12, 12])
+            mesh.apply_translation([0.0, 0.0, 0.5 * length] - mesh.bounds.mean(axis=0))
             mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length))
             solids.append(Solid(int(joint), mesh))
     return solids

@@ -49,12 +49,12 @@ ERROR, ANOMALY, DISTANCE, LIMIT = range(4)  # columns of the curves
 
 
 SPOT = '<span style="color:rgb{}">●</span> {} &nbsp; '
-GRADIENT = 'linear-gradient(90deg,rgb{},rgb{})'.format(*(tuple(c.astype(int)) for c in ENDS))
+GRADIENT = 'linear-gradient(90deg,rgb{},rgb{})'.format(*(tuple(map(int, c)) for c in ENDS))
 LEGEND = (
     '<div style="font-size:11px;padding:6px 10px">'
     + ''.join(SPOT.format(colour, arm) for arm, colour in ARMS.items())
     + '<br>T_bias <span style="display:inline-block;width:90px;height:8px;border-radius:3px;'
-    f'background:{GRADIENT}"></span> T_limit &nbsp; ✂ cut &nbsp; ? suspect &nbsp; ⊘ isolated</div>'
+    f'background:{GRADIENT}"></span> T_limit<br>✂ cut &nbsp; ? suspect &nbsp; ⊘ isolated</div>'
 )
 
 
@@ -295,6 +295,9 @@ class Page:
         self._bars.content = self._bar_chart(tension, temperature)
         if len(self._curves) > 1:
             table = np.array(self._curves)
+            # The page draws no curve that has a NaN in it.
+            table[:, 1 + LIMIT] = np.where(np.isnan(table[:, 1 + LIMIT]), *table[:, 3:].T)
+            table = np.nan_to_num(table)
             x = table[:, 0] - table[-1, 0]
             for plot, columns in zip(self._plots, ([ERROR], [ANOMALY], [DISTANCE, LIMIT])):
                 plot.data = (x, *(table[:, 1 + column] for column in columns))

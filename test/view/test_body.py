@@ -84,7 +84,10 @@ def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path)
     folder = tmp_path / 'arm'
     shutil.copytree(Robot.load('arm26').description.directory, folder)
     solids, notes = link_solids(Robot.load(folder))
-    assert len(solids) == 2 and not notes  # upper arm and forearm
+    assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down from the joints
+    elbow = Robot.load('arm26').kinematics.placement_translation[2, 2]
+    low, high = solids[0].mesh.bounds[:, 2]
+    assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     (folder / 'box.stl').write_bytes(box.export(file_type='stl'))
     os.mkfifo(folder / 'fifo.stl')
