@@ -36,7 +36,7 @@ from browser import Browser
 MUSCLE = 'deltoid_anterior'
 CUT, END = 50.0, 54.0  # [s] of the arm's time
 EVERY, EVERY_LATER = 0.8, 0.2  # [s] between frames, before and around the cut
-SIZE, SCALED, COLOURS = (1180, 740), (885, 555), 64
+SIZE, SCALED, COLOURS = (1180, 740), (885, 555), 200
 FRAME, LAST = 130, 2500  # [ms]
 PORT = 8099
 
@@ -110,7 +110,11 @@ def main() -> None:
         finally:
             browser.close()
             page.close()
-    palette = frames[-1].quantize(COLOURS)
+    several = frames[:: max(1, len(frames) // 8)]  # so that the palette has every arm's colours
+    collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
+    for i, frame in enumerate(several):
+        collage.paste(frame, (0, SCALED[1] * i))
+    palette = collage.quantize(COLOURS, method=Image.Quantize.FASTOCTREE)
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [FRAME] * (len(small) - 1) + [LAST]
     small[0].save(

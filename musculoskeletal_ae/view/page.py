@@ -185,7 +185,7 @@ class Page:
         scene.add_light_directional('/lamp', intensity=1.0, position=(2.0, -1.0, 3.0))
         camera = self._server.initial_camera
         camera.look_at = centre
-        camera.position = centre + reach * np.array([1.6, 1.5, 0.4])
+        camera.position = centre + reach * np.array([1.25, 1.15, 0.35])
         camera.fov = 0.8
         self._reach = reach
 
