@@ -9,8 +9,8 @@ import time
 from argparse import Namespace
 from pathlib import Path
 
+import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
@@ -25,8 +26,8 @@ from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import serve
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import array_message, serve
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
@@ -86,7 +87,7 @@ class Replay(Node):
         )
         self.declare_parameter('position', 0.0, told)
         self.add_on_set_parameters_callback(self._seek)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -175,16 +176,8 @@ class Replay(Node):
 
     def _report(self) -> None:
         at = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
-        position = f'{max(at, 0.0):.1f} of {(self._stop - self._start) / 1e9:.1f} s'
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.OK,
-            name=f'{self.get_fully_qualified_name()}: state',
-            message='paused' if self._timeline.paused else 'playing',
-            values=[KeyValue(key='position', value=position)],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        length = (self._stop - self._start) / 1e9
+        self._told.publish(array_message(np.array([max(at, 0.0), length]), 'position'))
 
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""

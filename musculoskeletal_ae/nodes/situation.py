@@ -17,7 +17,6 @@ class Situation:
         self.detected = self.explored = False
         self.samples = self.checkpoints = self.suspect = self.doing = self.stopped = ''
         self.distance = self.limit = math.nan  # d of the detector, and what is an anomaly
-        self.played = ''  # '12.3 of 60.0 s' of a bag
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Take a message of /diagnostics."""
@@ -36,8 +35,6 @@ class Situation:
                 self.stopped = status.message if status.message.startswith('stopped') else ''
                 if not self.stopped:
                     self.explored = 'exploring' in (status.message, values.get('doing'))
-            elif node == f'{self._here}/replay':
-                self.played = values.get('position', '')
 
     def trouble(self) -> str:
         """Return what keeps the arm from going on, and every step that is to be taken."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import queue
-import re
 import time
 from argparse import Namespace
 from collections.abc import Callable
@@ -77,6 +76,7 @@ class View(Node):
         self.ruptured: list[str] = []
         self.isolated: set[str] = set()
         self.payload = 0.0
+        self.played: tuple[float, float] | None = None  # where in a bag, and how long it is [s]
         self.pending: list[tuple[Any, Callable[[Any], object]]] = []
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
@@ -121,9 +121,14 @@ class View(Node):
             lambda m: self._note('muscles', read_array(m, len(QUANTITIES), muscles)),
         )
         take(Float64, 'anomaly', NEWEST, lambda m: self._note('anomaly', float(m.data)))
+        take(Float64MultiArray, 'replay/position', NEWEST, self._played)
         take(Bool, 'anomaly_detected', LATCHED, self._detected)
         take(String, 'isolated_muscles', LATCHED, self._isolated)
         take(DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed)
+
+    def _played(self, message: Float64MultiArray) -> None:
+        at, length = read_array(message, 1, 2).tolist()
+        self.played = at, length
 
     def _detected(self, message: Bool) -> None:
         self.situation.detected = message.data
@@ -222,8 +227,7 @@ class View(Node):
         if states is None:
             lines = ['waiting for muscle_states', *lines[1:]]
         self.page.tell(lines, told.trouble(), tension, temperature)
-        played = re.match(r'([\d.]+) of ([\d.]+) s', told.played)
-        self.page.follow(self.payload, played and (float(played[1]), float(played[2])))
+        self.page.follow(self.payload, self.played)
 
     def _look(self) -> None:
         """Offer what the nodes that are there can do, and ask the emulator how it is."""
