@@ -138,14 +138,28 @@ def _capsules(robot: Robot) -> list[Solid]:
     return solids
 
 
-def joint_poses(kin: Kinematics, theta: Array) -> tuple[Array, Array]:
-    """Return where joints are in their parents: positions [m] (J, 3), quaternions wxyz (J, 4)."""
-    angle = np.append(0.0, theta[kin.theta_index[1:]])[:, None]
-    slide = kin.prismatic[:, None]
-    turn = Rotation.from_matrix(kin.placement_rotation)
-    position = kin.placement_translation + turn.apply(kin.local_axis * np.where(slide, angle, 0.0))
-    turn *= Rotation.from_rotvec(kin.local_axis * np.where(slide, 0.0, angle))
-    return position, turn.as_quat(scalar_first=True)
+class JointChain:
+    """Where joints are in their parents."""
+
+    def __init__(self, kin: Kinematics) -> None:
+        """Take the fixed placements of the joints of a tree."""
+        self._kin = kin
+        turn = Rotation.from_matrix(kin.placement_rotation)
+        self._turn = turn.as_quat(scalar_first=True)
+        self._axis = turn.apply(kin.local_axis)  # in the parent's frame
+
+    def poses(self, theta: Array) -> tuple[Array, Array]:
+        """Return positions [m] (J, 3) and turns, quaternions wxyz (J, 4), at θ [rad] (D,)."""
+        kin = self._kin
+        angle = np.append(0.0, theta[kin.theta_index[1:]])
+        slide = self._axis * np.where(kin.prismatic, angle, 0.0)[:, None]
+        half = 0.5 * np.where(kin.prismatic, 0.0, angle)[:, None]
+        # The turn about the axis, after the placement: a product of two quaternions.
+        w, v = np.cos(half), np.sin(half) * self._axis
+        first, rest = self._turn[:, :1], self._turn[:, 1:]
+        scalar = w * first - (v * rest).sum(axis=1, keepdims=True)
+        turn = np.hstack([scalar, w * rest + first * v + np.cross(v, rest)])
+        return kin.placement_translation + slide, turn
 
 
 class Tubes(NamedTuple):

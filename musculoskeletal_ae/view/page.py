@@ -31,9 +31,9 @@ from musculoskeletal_ae.view.body import (
     DASHES,
     ENDS,
     MARKS,
+    JointChain,
     Kind,
     colours,
-    joint_poses,
     link_solids,
     muscle_tubes,
     tension_share,
@@ -134,6 +134,7 @@ class Page:
         points = robot.routes.points(middle[None])[0]
         points = np.vstack([points, kin.end_effector_pose(middle).translation])
         centre, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), float(np.ptp(points))
+        self._chain, self._placed = JointChain(kin), set[str]()
         self._joints: dict[str, list[viser.FrameHandle]] = {}
         for arm, colour in ARMS.items():
             scene.add_frame(f'/{arm}', show_axes=False, visible=False)
@@ -246,9 +247,12 @@ class Page:
                     handle.visible = visible
                 if not visible:
                     continue
-                positions, turns = joint_poses(kin, posture[arm])
+                positions, turns = self._chain.poses(posture[arm])
                 for i, joint in enumerate(self._joints[arm], 1):
-                    joint.position, joint.wxyz = positions[i], turns[i]
+                    joint.wxyz = turns[i]
+                    if arm not in self._placed or kin.prismatic[i]:
+                        joint.position = positions[i]
+                self._placed.add(arm)
             body = posture.get('measured', posture.get('estimated'))
             self._tubes.visible = body is not None and tension is not None
             if body is None or tension is None:

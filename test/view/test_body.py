@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from musculoskeletal_ae.robot.robot import Robot  # noqa: E402
 from musculoskeletal_ae.view.body import (  # noqa: E402
     DASHES,
+    JointChain,
     Kind,
-    joint_poses,
     link_solids,
     muscle_tubes,
 )
@@ -35,7 +35,7 @@ def theta(robot):
 
 def test_chained_joint_poses_are_those_of_the_kinematics(robot, theta):
     kin = robot.kinematics
-    positions, turns = joint_poses(kin, theta)
+    positions, turns = JointChain(kin).poses(theta)
     poses = [np.eye(4)]
     for i in range(1, len(kin.parent)):
         local = np.eye(4)
