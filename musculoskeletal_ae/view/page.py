@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import html
 import io
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -79,6 +80,8 @@ class Page:
         self._robot, self._act, self._host = robot, act, host
         self._visitors: set[int] = set()
         self.looked_at = threading.Event()
+        # A browser opens connections that it never uses; no traceback of each.
+        logging.getLogger('websockets.server').setLevel(logging.CRITICAL)
         with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
             self._server = viser.ViserServer(host, port, verbose=False)
         if self._server.get_port() != port:
