@@ -205,7 +205,7 @@ class Page:
             self._plots = [
                 self._plot('error [rad]', ['#009e73']),
                 self._plot('A', ['#0072b2']),
-                self._plot('d (dashed: what is an anomaly)', ['#0072b2', '#c80082']),
+                self._plot('d (dashed: what is an anomaly)', ['#c80082', '#0072b2']),
             ]
             self._bars = gui.add_html('')
             gui.add_html(LEGEND)
@@ -302,11 +302,11 @@ class Page:
         self._bars.content = self._bar_chart(tension, temperature)
         if len(self._curves) > 1:
             table = np.array(self._curves)
-            # The page draws no curve that has a NaN in it.
+            # No curve that has a NaN in it is drawn: an unknown limit hides below d.
             table[:, 1 + LIMIT] = np.where(np.isnan(table[:, 1 + LIMIT]), *table[:, 3:].T)
             table = np.nan_to_num(table)
             x = table[:, 0] - table[-1, 0]
-            for plot, columns in zip(self._plots, ([ERROR], [ANOMALY], [DISTANCE, LIMIT])):
+            for plot, columns in zip(self._plots, ([ERROR], [ANOMALY], [LIMIT, DISTANCE])):
                 plot.data = (x, *(table[:, 1 + column] for column in columns))
 
     def _bar_chart(self, tension: Array, temperature: Array) -> str:
