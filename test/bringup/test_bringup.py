@@ -29,14 +29,17 @@ STATUS = re.compile(
 
 
 @pytest.fixture(scope='module')
-def environment(tmp_path_factory):
+def environment(tmp_path_factory, trained_file):
     """Return an environment in which all runs of this module share a cache of their own."""
     cache = tmp_path_factory.mktemp('cache')
-    return {**os.environ, 'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
+    folders = {'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
+    return {**os.environ, **folders, 'TRAINED': trained_file}
 
 
 def bringup(environment, *arguments):
     command = [str(REPOSITORY / 'bringup.sh'), *arguments]
+    if 'arm26' in arguments:  # another robot's network is trained here
+        command += ['--checkpoint', environment['TRAINED']]
     return Process('bringup.sh', command, env=environment, start_new_session=True)
 
 
