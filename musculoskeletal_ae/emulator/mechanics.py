@@ -248,8 +248,8 @@ def _wires_and_modules(
         else:
             pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
             speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
-            speed = min(SPEED_LIMIT, max(-SPEED_LIMIT, speed))
-        speed *= 1.0 - command.stuck[m]
+        most = SPEED_LIMIT * (1.0 - command.stuck[m])
+        speed = min(most, max(-most, speed))
         after = min(body.length_high[m], max(body.length_low[m], before + STEP * speed))
         muscle.length[m] = after
         slid = before - after

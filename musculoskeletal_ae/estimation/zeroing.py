@@ -106,7 +106,8 @@ class Zeroing:
         self._robot, self._mae, self._posture = robot, mae, posture
         self._rng = np.random.default_rng([seed, 0x2E])
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, ...]] = []  # rows of Moments
+        self._window: list[tuple[Array, Array, Array]] = []  # T, l, s
+        self._angles: list[Array] = []  # θ in the same time, where measured
         self._moments: list[tuple[Array, ...]] = []
         muscles, joints = robot.muscle_count, robot.joint_count
         self._mean = np.repeat([0.0, FRICTION], muscles)  # of the constants, beforehand
@@ -115,8 +116,9 @@ class Zeroing:
         self._noise = np.concatenate(noise)  # of the residuals, (M + 2D,)
         self._before: Array = np.zeros(muscles)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
-        self._work: Fitting | None = None
-        self._fit: Fit | None = None  # the best so far
+        self._work: Generator[None, None, tuple[Fit, Moments]] | None = None
+        self._fit: Fit | None = None  # the best so far, and whether joint sensors told it
+        self._sees = False
         self.zeros: Zeros | None = None  # the guess so far, known or not; None before the first
         self.trouble = ''
 
@@ -130,8 +132,7 @@ class Zeroing:
         """Seconds of gentle motion that it takes, or of standing still where the arm is said to."""
         if self.stands:
             return STANDING
-        sees = bool(self._moments) and not np.isnan(self._moments[-1][-1]).any()
-        return ENOUGH_SEEN if sees else ENOUGH
+        return ENOUGH_SEEN if self._sees else ENOUGH
 
     @property
     def progress(self) -> str:
@@ -150,29 +151,33 @@ class Zeroing:
         if self.done or (self.stands and self.trouble):
             return
         known = self._posture if self.stands else theta
-        unknown = np.full(self._robot.joint_count, np.nan)
-        direction = self._direction.step(length, dt)
-        self._window.append((tension, length, direction, unknown if known is None else known))
+        self._window.append((tension, length, self._direction.step(length, dt)))
+        self._angles += [] if known is None else [known]
         self._span += dt
         self._since += dt
         if self._span >= WINDOW:
-            self._take(*(np.mean(part, axis=0) for part in zip(*self._window)))
-            self._window, self._span = [], 0.0
+            unknown = [np.full(self._robot.joint_count, np.nan)]
+            parts = *zip(*self._window), self._angles or unknown
+            self._take(*(np.mean(part, axis=0) for part in parts))
+            self._window, self._angles, self._span = [], [], 0.0
         if self._work is not None:
             try:
                 next(self._work)
             except StopIteration as ended:
                 self._work = None
-                self._judge(ended.value)
+                self._judge(*ended.value)
         elif self._since >= (AGAIN if self._fit and not self.stands else FIRST) and self._moments:
             self._since = 0.0
             seen = Moments(*map(np.array, zip(*self._moments)))
-            if np.isnan(seen.theta).any():
+            told = np.flatnonzero(~np.isnan(seen.theta).any(axis=1))
+            self._sees = 2 * len(told) > len(seen.theta)
+            if not self._sees:
                 self._work = self._search(seen)
             else:  # with the angles known, zeros are what is left
+                seen = seen.some(told)
                 left = seen.length - self._mae.lengths(seen.theta, seen.tension)
                 constants = np.concatenate([left.mean(axis=0), self._mean[len(tension) :]])
-                self._judge(Fit(0.0, constants, seen.theta))
+                self._judge(Fit(0.0, constants, seen.theta), seen)
 
     def _take(self, *moment: Array) -> None:
         length, first = moment[1], not self._moments
@@ -188,11 +193,10 @@ class Zeroing:
             self.moving += 0.0 if first else WINDOW
             self._moments = [*self._moments[1 - MOST :], moment]
 
-    def _judge(self, fit: Fit) -> None:
+    def _judge(self, fit: Fit, seen: Moments) -> None:
         """Take a fit as the guess, or as known when it rests on enough and explains that."""
         count, muscles = len(fit.theta), self._robot.muscle_count
         offset = fit.constants[:muscles]
-        seen = Moments(*map(np.array, zip(*self._moments[:count])))
         left = seen.length - offset - self._mae.lengths(fit.theta, seen.tension)
         typical = np.median(np.abs(left), axis=0)
         cost = fit.cost / (count * (len(self._noise) - self._robot.joint_count))
@@ -209,14 +213,14 @@ class Zeroing:
 
     # -- without joint angles -------------------------------------------------------------------
 
-    def _search(self, seen: Moments) -> Fitting:
+    def _search(self, seen: Moments) -> Generator[None, None, tuple[Fit, Moments]]:
         """Find what explains the moments."""
         few = seen.some(np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(np.int64)))
         guesses = yield from self._guesses(seen, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
         # Few moments may be mistaken: all of them choose between the newest guess and the last.
         last = [] if self._fit is None else [self._fit.constants]
-        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS))
+        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS)), seen
 
     def _best(self, guesses: list[Array], seen: Moments, rounds: int) -> Fitting:
         """Return the best of the fits near each guess of the constants."""
