@@ -36,6 +36,9 @@ MOST = 240  # moments
 LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
 WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best and least
 FRICTION = 0.05  # μ of a wire, give or take as much
+JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest that the weight needs
+TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
+STICKING = 0.003  # [rad] that turn a joint's friction round
 AT_STOP = 0.03  # [rad] from a joint limit, where its stop may bear torque
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
@@ -91,7 +94,8 @@ class Fit(NamedTuple):
     """What explains K moments."""
 
     cost: float
-    constants: Array  # o [m] and μ of the wires, (2M,)
+    #: o [m], μ of the wires, zeros of the tensions [N], Coulomb torques [N·m], (3M + D,)
+    constants: Array
     theta: Array  # postures [rad], (K, D)
 
 
@@ -110,8 +114,11 @@ class Zeroing:
         self._angles: list[Array] = []  # θ in the same time, where measured
         self._moments: list[tuple[Array, ...]] = []
         muscles, joints = robot.muscle_count, robot.joint_count
-        self._mean = np.repeat([0.0, FRICTION], muscles)  # of the constants, beforehand
-        self._spread = np.repeat([OFFSET, FRICTION], muscles)
+        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng))).max()
+        counts = muscles, muscles, muscles, joints
+        self._mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)  # of the constants, beforehand
+        spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight
+        self._spread = np.repeat(spread, counts)
         noise = LENGTH_NOISE * _worse(mae), np.repeat([TORQUE_NOISE, OUTSIDE], joints)
         self._noise = np.concatenate(noise)  # of the residuals, (M + 2D,)
         self._before: Array = np.zeros(muscles)  # l_read of the last moment that moved
@@ -270,16 +277,21 @@ class Zeroing:
         pull = np.einsum('kmd,km->kd', jacobian, tension)
         return self._robot.kinematics.holding_torque(theta) + pull, jacobian
 
-    def _residuals(self, fit: Fit, seen: Moments, slopes: bool = False) -> tuple[Array, ...]:
+    def _residuals(
+        self, fit: Fit, seen: Moments, turning: Array, slopes: bool = False
+    ) -> tuple[Array, ...]:
         """Return lengths, torques and angles outside that are left, in their noise (K, M + 2D).
 
-        With `slopes`, their derivatives by θ and by the constants too.
+        `turning` is which way joints turned last; `slopes`: derivatives by θ and constants too.
         """
         theta, muscles, joints = fit.theta, self._robot.muscle_count, self._robot.joint_count
-        offset, friction = np.split(fit.constants, 2)
-        pull = seen.tension * np.exp(-friction * seen.direction)  # at the elastic unit
-        length, outside = self._mae.lengths(theta, pull), self._outside(theta)
-        torque, jacobian = self._torque(theta, pull)
+        ends = [muscles, 2 * muscles, 3 * muscles]
+        offset, friction, zero, sticking = np.split(fit.constants, ends)
+        passed = np.exp(-friction * seen.direction)  # from the motor to the elastic unit
+        end, pull = seen.tension * passed, (seen.tension - zero) * passed
+        length, outside = self._mae.lengths(theta, end), self._outside(theta)
+        unheld, jacobian = self._torque(theta, pull)
+        torque = unheld + sticking * turning
         # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
         low, high = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
         free = (low < theta) & (theta < high)
@@ -288,15 +300,18 @@ class Zeroing:
         if not slopes:
             return (value,)
         turned = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
-        slope = (np.stack(turned, axis=-1) - torque[..., None]) / STEP * free[..., None]
+        slope = (np.stack(turned, axis=-1) - unheld[..., None]) / STEP * free[..., None]
         beyond = (outside != 0.0)[..., None] * np.eye(joints)
         by_theta = np.concatenate([-jacobian, slope, beyond], axis=1)
-        by_constants, m = np.zeros((*value.shape, 2 * muscles)), np.arange(muscles)
+        by_constants = np.zeros((*value.shape, len(fit.constants)))
+        m, j = np.arange(muscles), np.arange(joints)
         by_constants[:, m, m] = -1.0
-        rubbed = self._mae.lengths(theta, pull * np.exp(-STEP * seen.direction))
+        rubbed = self._mae.lengths(theta, end * np.exp(-STEP * seen.direction))
         by_constants[:, m, muscles + m] = (length - rubbed) / STEP
-        arm = -jacobian * (pull * seen.direction)[..., None] * free[:, None, :]
-        by_constants[:, muscles:-joints, muscles:] = np.swapaxes(arm, 1, 2)
+        arm = -np.swapaxes(jacobian, 1, 2) * free[..., None]
+        by_constants[:, muscles:-joints, m + muscles] = arm * (pull * seen.direction)[:, None]
+        by_constants[:, muscles:-joints, m + 2 * muscles] = arm * passed[:, None]
+        by_constants[:, muscles + j, 3 * muscles + j] = turning * free
         return value, by_theta / self._noise[:, None], by_constants / self._noise[:, None]
 
     def _cost(self, value: Array, constants: Array) -> float:
@@ -308,10 +323,11 @@ class Zeroing:
     def _refine(self, fit: Fit, seen: Moments, rounds: int) -> Fitting:
         """Return the best fit near one, after so many Gauss–Newton steps at most."""
         eye, own_eye, damping = np.eye(self._robot.joint_count), np.eye(len(self._mean)), 1e-3
-        fit = fit._replace(cost=self._cost(self._residuals(fit, seen)[0], fit.constants))
+        turning = _turning(fit.theta)
+        fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning)[0], fit.constants))
         for _ in range(rounds):
             yield
-            value, by_theta, by_constants = self._residuals(fit, seen, slopes=True)
+            value, by_theta, by_constants = self._residuals(fit, seen, turning, slopes=True)
             weight = (FREEDOM + 1.0) / (FREEDOM + value**2)
             weight[:, -len(eye) :] = 1.0
             weighted = weight[..., None] * by_theta
@@ -332,7 +348,7 @@ class Zeroing:
                 turn = gradient + np.einsum('kpd,p->kd', cross, shift)
                 turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)
                 tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
-                cost = self._cost(self._residuals(tried, seen)[0], tried.constants)
+                cost = self._cost(self._residuals(tried, seen, turning)[0], tried.constants)
                 if cost < before:
                     break
                 damping *= 5.0
@@ -343,6 +359,15 @@ class Zeroing:
             if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
+
+
+def _turning(theta: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
+    result, reference = np.zeros_like(theta), theta[0].copy()
+    for k, posture in enumerate(theta):
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
+    return result
 
 
 def _worse(mae: Mae) -> Array:
