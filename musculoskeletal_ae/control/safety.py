@@ -93,6 +93,8 @@ class SafetyFilter:
     def shift(self, less: Array) -> None:
         """Take lengths that are less [m] (M,) from now on: the same muscles, another zero."""
         self._readings = deque((m._replace(length=m.length - less) for m in self._readings), 3)
+        if self.now is not None:
+            self.now = self.now._replace(length=self.now.length - less)
         if self.command is not None and self.command.kind == LENGTH:
             self.command = Command(LENGTH, self.command.value - less)
 
