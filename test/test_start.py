@@ -90,6 +90,33 @@ def test_an_option_that_no_node_has_is_an_error(arguments):
     assert done.stderr.count('\n') == 1
 
 
+@pytest.mark.parametrize(
+    ('command', 'told'),
+    [
+        ('estimator --ros-args -p robto:=arm26', "a parameter 'robto'; nearest: robot"),
+        ('estimator --ros-args -p estimator:robto:=arm26', 'nearest: robot'),
+        ('estimator --ros-args -p explore:=true', 'controller has'),
+        ('replay bag --ros-args -p out:=arm.png', 'options of replay stand before --ros-args'),
+    ],
+)
+def test_a_parameter_that_nothing_reads_is_an_error(command, told):
+    name, *arguments = command.split()
+    done = subprocess.run(
+        [*executable(name), *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode in (1, 2)
+    assert told in done.stderr and done.stderr.count('\n') == 1
+
+
+def test_a_file_of_parameters_for_all_nodes_may_name_no_unknown_one(tmp_path):
+    file = tmp_path / 'nodes.yaml'
+    file.write_text('/**: {ros__parameters: {explore: true, temprature_limit: 50.0}}')
+    command = [*executable('estimator'), '--ros-args', '--params-file', str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "'temprature_limit'; nearest: temperature_limit" in done.stderr
+
+
 def test_the_experiments_are_those_that_the_help_names():
     from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 
