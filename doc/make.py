@@ -68,8 +68,8 @@ def api() -> str:
         '# Python, without ROS',
         '',
         'What a program may build on; `python doc/make.py` writes this page from the code. Arrays',
-        "are numpy's, units SI; θ, T and l have the order of `muscles.yaml`. Docstrings, as `help()`",
-        'shows them, say what each takes and returns.',
+        "are numpy's, units SI; θ, T and l have the order of `muscles.yaml`. Docstrings, which",
+        '`help()` shows, say what each takes and returns.',
         '',
     ]
     for file, names in MODULES.items():
