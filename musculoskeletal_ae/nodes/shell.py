@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -49,6 +50,7 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
+LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
 
 LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
 
@@ -71,6 +73,7 @@ class Shell(Node):
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
+        self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
         self.add_on_set_parameters_callback(self._set_parameters)
@@ -272,12 +275,18 @@ class Shell(Node):
 
     def _several_publishers(self, name: str) -> str:
         """Return which nodes publish a topic, '' if it is one."""
-        topic, names = self.resolve_topic_name(name), set[str]()
+        topic, names = self.resolve_topic_name(name), Counter[str]()
         if self.count_publishers(topic) > 1:
             for publisher in self.get_publishers_info_by_topic(topic):
-                names.add(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
-        # One name twice: a node that was killed stays known for a while beside its successor.
-        return f'{name} come from {" and ".join(sorted(names))}' if len(names) > 1 else ''
+                names[f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'] += 1
+        # One name twice: a node that was killed stays known for a while beside its successor,
+        # but no longer sends.
+        turns = self._reception.turns[name]
+        self._turns.append(turns)
+        if len(names) == 1 and turns - self._turns[0] < TURNS:
+            return ''
+        senders = (f'{count} nodes {node}' if count > 1 else node for node, count in names.items())
+        return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
         """Take zeros that the estimator found; `changed` is told whether they are known now.
