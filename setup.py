@@ -51,7 +51,8 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 from {NAME}.start import main
 
-raise SystemExit(main())
+if __name__ == '__main__':  # and not in the processes that multiprocessing starts
+    raise SystemExit(main())
 """
 
 setup(
