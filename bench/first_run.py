@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
         clone, home = Path(folder) / 'clone', Path(folder) / 'home'
         home.mkdir()
         subprocess.run(['git', 'clone', '-q', ROOT, clone], check=True)
-        script = ["trap 'kill -INT $(jobs -p); wait' EXIT", 'bad=0']
+        script = ["trap 'kill $(jobs -p); wait' EXIT", 'bad=0']
         for line in commands():
             script += [
                 f"printf '\\n[%(%H:%M:%S)T] $ %s\\n' -1 {shlex.quote(line)}",
