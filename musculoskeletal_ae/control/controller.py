@@ -128,7 +128,8 @@ class Controller:
         known = length if self.safety.zeroed else None
         self._plausibility.check_muscles(tension, known, temperature, now)
         self._muscles_at = awake = now - self._asleep
-        self._temperatures.append(temperature)
+        # NaN is not known, and no reason for anything.
+        self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
         self._warm = np.median(np.array(self._temperatures), axis=0)
         over = self.safety.muscles(muscles).tension > self._overloads[:, None]
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)

@@ -38,7 +38,7 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.shield import refuse
@@ -69,6 +69,7 @@ class Shell(Node):
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
         self._take_old_names()
+        check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))

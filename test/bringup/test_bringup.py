@@ -193,7 +193,8 @@ def driver(namespace):
 
 
 def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
-    run = bringup(environment, '--robot', 'arm26', '--hardware', '--namespace', 'own')
+    options = ['--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own']
+    run = bringup(environment, *options)
     lines = iter(run.process.stdout.readline, '')
     told = []
     for line in lines:
