@@ -38,9 +38,8 @@ DISTANCE = 'distance'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-#: the threshold grows by SLOPE of itself for each FAR of distance beyond NEAR, up to WIDEST times;
-#: distances are shares of the joint ranges (`python -m bench unfamiliar`: what healthy arms need)
-NEAR, FAR, SLOPE, WIDEST = 0.25, 0.1, 0.5, 3.0
+#: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
+NEAR, WIDEST = 0.25, 3.0
 
 
 class Verdict(NamedTuple):
@@ -119,20 +118,19 @@ class AnomalyDetector:
         return Verdict(size, distance, suspect, cause)
 
     def unfamiliar(self, theta: Array) -> float:
-        """Return how far θ [rad] (D,) is beyond NEAR from every calibrated posture, in FARs."""
+        """Return how far θ [rad] (D,) is from all calibrated postures, over NEAR; 1: unfamiliar."""
         known = None if self._statistics is None else self._statistics.postures
         if known is None or not len(known):
             return 0.0
         share = (known - theta) / (self._robot.upper - self._robot.lower)
-        nearest = float(np.sqrt(np.square(share).sum(axis=1).min()))
-        return max(0.0, (nearest - NEAR) / FAR)
+        return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def limit(self, theta: Array) -> float:
         """Return the d that no healthy arm reaches at θ [rad] (D,), ∞ while nothing is known."""
         if self._statistics is None or not self._statistics.calibrated:
             return np.inf
         threshold = self._statistics.thresholds.get(DISTANCE, np.inf)
-        return threshold * min(WIDEST, 1.0 + SLOPE * self.unfamiliar(theta))
+        return threshold * float(np.clip(self.unfamiliar(theta), 1.0, WIDEST))
 
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool

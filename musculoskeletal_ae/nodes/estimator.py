@@ -23,7 +23,8 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN
+from musculoskeletal_ae.estimation.zeroing import Zeros
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.frames import Frames
 from musculoskeletal_ae.nodes.markers import Markers
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
@@ -53,21 +54,20 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.needed.append('muscle_states')
-        self.follow_checkpoints(self.core.use)
+        self.posture: tuple[float, ...] = ()
+        self.follow_parameter('zero_posture', self._take_posture)
+        self.unzeroed = self.parameter('zero_at_start')
+        self.zeros = self.core.zeros
+        if self.unzeroed:  # nobody moves on what sensors say before the network is there
+            self.core.zeros = Zeros.unknown(self.robot.muscle_count)
+        self.follow_checkpoints(self._use)
         for name in parameters_of(Slack):
             self.follow_parameter(name, partial(self._take_slack, name))
-        self.zeros = self.core.zeros
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscle_states(self._estimate, as_read=True)
         self.follow_posture('joint_states', self._measured)
-        self.posture: tuple[float, ...] = ()
-        self.follow_parameter('zero_posture', self._take_posture)
-        self.unzeroed = self.parameter('zero_at_start')
-        if self.unzeroed:  # nobody moves on what sensors say before the network is there
-            unknown = np.zeros((2, self.robot.muscle_count))
-            unknown[1] = UNKNOWN
-            self.told.publish(array_message(unknown, 'quantity', 'muscle'))
+        self._tell_zeros()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
@@ -85,6 +85,12 @@ class Estimator(Shell):
         self.core.joints(theta, time.monotonic())
         if self.frames is not None and self.tf_source == 'sensor':
             self.frames.publish(theta)
+
+    def _use(self, mae: Mae) -> None:
+        self.core.use(mae)
+        if self.unzeroed:
+            self.unzeroed = False
+            self.core.zero(self.posture)
 
     def _take_slack(self, name: str, value: float) -> None:
         self.core.detector.slack = replace(self.core.detector.slack, **{name: value})
@@ -117,15 +123,11 @@ class Estimator(Shell):
     def _estimate(self, states: Array) -> None:
         length, tension, temperature = states
         clock, now = self.get_clock().now(), time.monotonic()
-        if self.unzeroed and self.core.mae is not None:
-            self.unzeroed = False
-            self._zero(Trigger.Request())
-        known = self.zeros.known and not self.unzeroed
-        from_zero = length - self.zeros.offset if known else np.zeros_like(length)
+        from_zero = length - self.zeros.offset if self.zeros.known else None
         self.plausibility.check_muscles(tension, from_zero, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         self._tell_zeros()
-        if self.mirror is not None:
+        if self.mirror is not None and from_zero is not None:
             mirrored = joint_message(self.robot.muscles, from_zero, clock.to_msg())
             mirrored.effort = tension.tolist()
             self.mirror.publish(mirrored)
@@ -134,7 +136,7 @@ class Estimator(Shell):
         self.drawn = estimate.state.theta, tension
         if self.frames is not None and self.tf_source == 'estimate':
             self.frames.publish(estimate.state.theta)
-        if known:
+        if from_zero is not None:
             self.gate.message(tension, from_zero, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
