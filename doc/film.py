@@ -61,7 +61,7 @@ def main() -> None:
 
     stream = record(arm, mae, EXPLORATION_STREAM, END, script)
     page = Page(robot, '127.0.0.1', PORT, False, lambda *_: None)
-    page.offer(['controller', 'hardware_emulator', 'sim'])
+    page.offer(['controller', 'hardware_emulator', 'pushed'])
     frames: list[Image.Image] = []
     with tempfile.TemporaryDirectory() as profile:
         browser = Browser(Path(profile), f'http://127.0.0.1:{PORT}', SIZE)
@@ -84,7 +84,6 @@ def main() -> None:
                 values = estimator.report(now).values
                 error = float(np.linalg.norm(estimate.state.theta - theta))
                 distance, limit = (float(values.get(key, 'nan')) for key in ('d', 'd limit'))
-                page.sample(now, error, estimate.anomaly, distance, limit)
                 if now < due:
                     continue
                 due = now + (EVERY if now < CUT - 1.0 else EVERY_LATER)
@@ -98,7 +97,8 @@ def main() -> None:
                 lines = [f'{moment} · error {error:.3f} rad · A {estimate.anomaly:.2f}']
                 lines.append(f'samples {len(learner.samples)} · exploring')
                 alarm = f'ANOMALY: {values["suspect muscle"]}' if estimator.cause else ''
-                page.tell(lines, alarm, tension, temperatures[n])
+                known = error, estimate.anomaly, distance, limit
+                page.tell(lines, alarm, np.stack([tension, temperatures[n]]), now, known)
                 page.follow(0.0, None)
                 browser.wait_for(moment)
                 if not frames:

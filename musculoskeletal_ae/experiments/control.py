@@ -226,16 +226,14 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
     return figure
 
 
+OTHERS = {'geometric': NOTHING, **dict.fromkeys(('first', 'second'), 'far below `geometric`')}
 ROWS = (
-    Row('`geometric`, distance from θ_eval [rad]', NOTHING, '', 'geometric.error_rad'),
-    Row('`first`, distance from θ_eval [rad]', 'far below `geometric`', '', 'first.error_rad'),
-    Row('`second`, distance from θ_eval [rad]', 'far below `geometric`', '', 'second.error_rad'),
+    *(Row(f'`{name}`, distance from θ_eval [rad]', paper, '', f'{name}.error_rad')
+      for name, paper in OTHERS.items()),
     Row('`proposed`, distance from θ_eval [rad]', 'as `second`',
         'proposed_paper.error_rad', 'proposed.error_rad', '', 0.06),
-    Row('`geometric`, ‖T‖ [N]', NOTHING, '', 'geometric.tension_n', 'geometric.bound_reached_n',
-        digits=0),
-    Row('`first`, ‖T‖ [N]', NOTHING, '', 'first.tension_n', 'first.bound_reached_n', digits=0),
-    Row('`second`, ‖T‖ [N]', NOTHING, '', 'second.tension_n', 'second.bound_reached_n', digits=0),
+    *(Row(f'`{name}`, ‖T‖ [N]', NOTHING, '', f'{name}.tension_n', f'{name}.bound_reached_n',
+          digits=0) for name in OTHERS),
     Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`', 'proposed_paper.tension_n',
         'proposed.tension_n', 'proposed.bound_reached_n', digits=0),
     Row('`proposed`, ‖T‖ beside the QP bound at θ_eval [ratio]', NOTHING,

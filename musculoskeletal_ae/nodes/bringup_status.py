@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -77,12 +78,10 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        error, anomaly = (
-            np.mean(values) if values else math.nan for values in (self.errors, self.anomalies)
-        )
-        self.errors, self.anomalies = [], []
-        line = f'{now - self.started:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
         told = self.situation
+        known = figures(_mean(self.errors), _mean(self.anomalies), self.theta is not None)
+        self.errors, self.anomalies = [], []
+        line = f'{now - self.started:6.0f} s  {known}'
         line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
         more = told.trouble() or told.hint()
         if self.screen is None:
@@ -93,14 +92,16 @@ class BringupStatus(Shell):
             raise ExternalShutdownException
 
 
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else math.nan
+
+
 def open_screen() -> Any:
     """Return a rich display that is redrawn in place, None without rich or without a terminal."""
-    if not sys.stdout.isatty():
+    if not sys.stdout.isatty() or find_spec('rich') is None:
         return None
-    try:
-        from rich.live import Live
-    except ImportError:
-        return None
+    from rich.live import Live
+
     screen = Live(auto_refresh=False)
     screen.start()
     return screen

@@ -25,8 +25,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.frames import Frames
-from musculoskeletal_ae.nodes.markers import Markers
+from musculoskeletal_ae.nodes.markers import Frames, Markers
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm for RViz and Foxglove: bones, muscles and their names as markers in the root link's frame.
+"""An arm for RViz and Foxglove: bones, muscles and names as markers, or poses of all links on /tf.
 
-Arms can be told apart by their bones: the hardware's are ivory and solid, those of the estimate
-green, of the simulator violet, both translucent.
+The hardware's bones are ivory and solid; green those of the estimate, violet the simulator's.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
-from itertools import count
 
-from geometry_msgs.msg import Point
+import pinocchio as pin
+from geometry_msgs.msg import Point, TransformStamped
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
@@ -38,19 +38,17 @@ class Markers:
     def _publish(self) -> None:
         if self._publisher.get_subscription_count() == 0 or not (lines := self._lines()):
             return
-        numbers: defaultdict[str, count[int]] = defaultdict(count)
         message, names = MarkerArray(), iter(self._node.robot.muscles)
-        for line in lines:
-            marker = self._add(message, line.kind, next(numbers[line.kind]), Marker.LINE_STRIP)
+        for number, line in enumerate(lines):
+            marker = self._add(message, line.kind, number, Marker.LINE_STRIP)
             marker.scale.x = line.width
-            *rgb, alpha = self._bones if line.kind == 'bones' else (*line.colour, self._bones[3])
-            marker.color = ColorRGBA(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+            look = self._bones if line.kind == 'bones' else (*line.colour, self._bones[3])
+            marker.color = ColorRGBA(**dict(zip('rgba', look)))
             marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
             if line.kind == 'muscles':
-                name = self._add(message, 'names', marker.id, Marker.TEXT_VIEW_FACING)
+                name = self._add(message, 'names', number, Marker.TEXT_VIEW_FACING)
                 name.text, name.scale.z, name.color = next(names), NAME_HEIGHT, marker.color
-                at = line.points.mean(axis=0).tolist()
-                name.pose.position.x, name.pose.position.y, name.pose.position.z = at
+                name.pose.position = Point(**dict(zip('xyz', line.points.mean(axis=0).tolist())))
         self._publisher.publish(message)
 
     def _add(self, message: MarkerArray, kind: str, number: int, shape: int) -> Marker:
@@ -60,3 +58,38 @@ class Markers:
         marker.pose.orientation.w = 1.0
         message.markers.append(marker)
         return marker
+
+
+class Frames:
+    """Publishes where links are, where ROS has tf2_msgs: Jazzy does, the wheels do not."""
+
+    def __init__(self, node: Shell) -> None:
+        """Advertise /tf.
+
+        Raises:
+            MusculoskeletalError: If tf2_msgs is not installed.
+        """
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise MusculoskeletalError(
+                'parameter publish_tf: tf2_msgs is not installed; source ROS 2 Jazzy, or leave it '
+                '"none"'
+            ) from error
+        self._node, self._message = node, TFMessage
+        self._prefix: str = node.parameter('frame_prefix')
+        self._publisher = node.create_publisher(TFMessage, '/tf', RELIABLE)
+
+    def publish(self, theta: Array) -> None:
+        """Publish the poses at θ [rad] (D,)."""
+        robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
+        joints, transforms = robot.kinematics.transforms(theta[None])[0], []
+        for frame in robot.kinematics.model.frames:
+            if frame.type == pin.FrameType.BODY and frame.name != robot.root_link:
+                transform = TransformStamped(child_frame_id=self._prefix + frame.name)
+                transform.header.frame_id, transform.header.stamp = self._node.root_frame, stamp
+                pose = pin.SE3(joints[frame.parentJoint]) * frame.placement
+                p, q = transform.transform.translation, transform.transform.rotation
+                p.x, p.y, p.z, q.x, q.y, q.z, q.w = pin.SE3ToXYZQUAT(pose).tolist()
+                transforms.append(transform)
+        self._publisher.publish(self._message(transforms=transforms))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -86,7 +86,7 @@ class Replay(Node):
             floating_point_range=[number],
         )
         self.declare_parameter('position', 0.0, told)
-        self.add_on_set_parameters_callback(self._seek)
+        self.add_post_set_parameters_callback(self._seek)
         self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
@@ -168,16 +168,15 @@ class Replay(Node):
         if self._recorded_clock:
             self._recorded_clock.tick(self._timeline.recorded(now), now)
 
-    def _seek(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _seek(self, parameters: list[Parameter]) -> None:
         for parameter in parameters:
             if parameter.name == 'position':
                 self._sought = self._start + int(1e9 * parameter.value)
-        return SetParametersResult(successful=True)
 
     def _report(self) -> None:
-        at = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
-        length = (self._stop - self._start) / 1e9
-        self._told.publish(array_message(np.array([max(at, 0.0), length]), 'position'))
+        at = self._timeline.recorded(time.monotonic()) - self._start
+        seconds = np.array([max(at, 0), self._stop - self._start]) / 1e9
+        self._told.publish(array_message(seconds, 'position'))
 
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""

@@ -3,9 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 from diagnostic_msgs.msg import DiagnosticArray
+
+
+def figures(error: float, anomaly: float, measured: bool) -> str:
+    """Return error [rad] and A, or what those that are NaN wait for."""
+    joints = 'estimated_joint_states' if measured else 'joint_states'
+    told = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} rad'
+    return f'error {told}  A {"waits for anomaly" if math.isnan(anomaly) else f"{anomaly:.3f}"}'
 
 
 class Situation:
@@ -28,13 +36,15 @@ class Situation:
                 self.checkpoints = values.get('checkpoints', '')
             elif node == f'{self._here}/estimator':
                 self.suspect = values.get('suspect muscle', '')
-                self.distance = _number(values.get('d', ''))
-                self.limit = _number(values.get('d limit', ''))
+                self.distance = self.limit = math.nan
+                with contextlib.suppress(ValueError):
+                    self.distance = float(values.get('d', 'nan'))
+                    self.limit = float(values.get('d limit', 'nan'))
             elif node == f'{self._here}/controller':
                 self.doing = status.message
-                self.stopped = status.message if status.message.startswith('stopped') else ''
+                self.stopped = self.doing if self.doing.startswith('stopped') else ''
                 if not self.stopped:
-                    self.explored = 'exploring' in (status.message, values.get('doing'))
+                    self.explored = 'exploring' in (self.doing, values.get('doing'))
 
     def trouble(self) -> str:
         """Return what keeps the arm from going on, and every step that is to be taken."""
@@ -49,13 +59,5 @@ class Situation:
 
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""
-        if self.samples != '0':  # '' without a learner
-            return ''
-        return 'nothing learned yet: the error may rise while the arm leaves its first posture'
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+        why = 'nothing learned yet: the error may rise while the arm leaves its first posture'
+        return why if self.samples == '0' else ''  # '' without a learner

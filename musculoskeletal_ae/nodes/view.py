@@ -19,8 +19,7 @@ import numpy as np
 import pinocchio as pin
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import WrenchStamped
-from rcl_interfaces.msg import Parameter as ParameterMessage
+from geometry_msgs.msg import Vector3, WrenchStamped
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -30,13 +29,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -51,7 +50,11 @@ ARM_TOPICS = {
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
-EMULATOR = 'hardware_emulator'
+SET, GET = 'hardware_emulator/set_parameters', 'hardware_emulator/get_parameters'
+DO = 'controller/stop', 'controller/reset', 'estimator/reset', 'replay/pause', 'replay/resume'
+SERVICES = {'controller/explore': SetBool, **dict.fromkeys(DO, Trigger), GET: GetParameters}
+SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
+SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
 
 class View(Node):
@@ -60,109 +63,78 @@ class View(Node):
     def __init__(self, robot: Robot, options: Namespace) -> None:
         """Serve the page."""
         super().__init__('view', start_parameter_services=False)
-        from musculoskeletal_ae.view.page import Page
-
-        self.robot, self.options = robot, options
+        try:
+            from musculoskeletal_ae.view import page
+        except ImportError as error:
+            raise MusculoskeletalError(
+                'the page needs viser: ./bringup.sh --view installs it, or '
+                'pip install -r .ci/requirements-view.txt'
+            ) from error
+        self.robot = robot
         self.asked: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
-        self.page = Page(
-            robot, options.host, options.port, options.read_only, lambda *what: self.asked.put(what)
-        )
+        address, ask = (options.host, options.port), lambda *what: self.asked.put(what)
+        self.page = page.Page(robot, *address, options.read_only, ask)
         for note in self.page.notes:
             self.get_logger().warning(f'mesh left out: {printable(note)}')
         self.situation = Situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text))
-        self.came: dict[str, tuple[float, Any]] = {}  # when, and what, by topic or arm
+        self.came: dict[str, tuple[float, Any]] = {}  # when, and what
         self.taken: list[Any] = []  # subscriptions
         self.ruptured: list[str] = []
-        self.isolated: set[str] = set()
         self.payload = 0.0
-        self.played: tuple[float, float] | None = None  # where in a bag, and how long it is [s]
-        self.pending: list[tuple[Any, Callable[[Any], object]]] = []
+        self.pending: list[Any] = []  # answers that are waited for
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
-        trigger = partial(self.create_client, Trigger)
-        self.asks = {
-            name: trigger(name)
-            for name in ('controller/stop', 'controller/reset', 'estimator/reset')
-        }
-        self.asks |= {f'replay/{do}': trigger(f'replay/{do}') for do in ('pause', 'resume')}
-        self.asks['controller/explore'] = self.create_client(SetBool, 'controller/explore')
-        for node in (EMULATOR, 'replay'):
-            name = f'{node}/set_parameters'
-            self.asks[name] = self.create_client(SetParameters, name)
-        self.told_by_emulator = self.create_client(GetParameters, f'{EMULATOR}/get_parameters')
+        self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
+        self.pushes: list[Any] = []
         if not options.read_only:
             self.targets = self.create_publisher(JointState, 'target_joint_states', RELIABLE)
             self.pushes = [
                 self.create_publisher(WrenchStamped, f'{arm}/external_wrench', RELIABLE)
-                for arm in (EMULATOR, 'sim')
+                for arm in ('hardware_emulator', 'sim')
             ]
 
     # -- what comes -----------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
-        muscles = self.robot.muscle_count
+        muscles, joints = self.robot.muscle_count, self.robot.joints
+        table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
+            (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
+            for arm, topic in ARM_TOPICS.items()
+        ]
+        table += [
+            ('muscles', Float64MultiArray, 'muscle_states', NEWEST,
+             lambda m: read_array(m, len(QUANTITIES), muscles)),
+            ('played', Float64MultiArray, 'replay/position', NEWEST,
+             lambda m: read_array(m, 1, 2).tolist()),
+            ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
+            ('detected', Bool, 'anomaly_detected', LATCHED, lambda m: m.data),
+            ('isolated', String, 'isolated_muscles', LATCHED,
+             lambda m: m.data.replace(',', ' ').split()),
+            ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
+        ]  # fmt: skip
 
-        def take(kind: type, topic: str, qos: QoSProfile, callback: Callable[[Any], Any]) -> None:
+        def note(what: str, read: Callable[[Any], Any], message: Any) -> None:
+            self.came[what] = time.monotonic(), read(message)
+
+        for what, kind, topic, qos, read in table:
             publishers = partial(self.count_publishers, self.resolve_topic_name(topic))
-            receive = self.reception.of(topic, callback, publishers)
-            self.taken.append(self.create_subscription(kind, topic, receive, qos))  # type: ignore[arg-type]
+            receive: Any = self.reception.of(topic, partial(note, what, read), publishers)
+            self.taken.append(self.create_subscription(kind, topic, receive, qos))
 
-        for arm, topic in ARM_TOPICS.items():
-
-            def posture(message: Any, arm: str = arm) -> None:
-                self._note(arm, read_posture(message, self.robot.joints))
-
-            take(JointState, topic, NEWEST, posture)
-        take(
-            Float64MultiArray,
-            'muscle_states',
-            NEWEST,
-            lambda m: self._note('muscles', read_array(m, len(QUANTITIES), muscles)),
-        )
-        take(Float64, 'anomaly', NEWEST, lambda m: self._note('anomaly', float(m.data)))
-        take(Float64MultiArray, 'replay/position', NEWEST, self._played)
-        take(Bool, 'anomaly_detected', LATCHED, self._detected)
-        take(String, 'isolated_muscles', LATCHED, self._isolated)
-        take(DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed)
-
-    def _played(self, message: Float64MultiArray) -> None:
-        at, length = read_array(message, 1, 2).tolist()
-        self.played = at, length
-
-    def _detected(self, message: Bool) -> None:
-        self.situation.detected = message.data
-
-    def _isolated(self, message: String) -> None:
-        self.isolated = {name.strip() for name in message.data.split(',')}
-
-    def _note(self, what: str, value: Any) -> None:
-        self.came[what] = time.monotonic(), value
-
-    def _newest(self, what: str) -> Any:
+    def _newest(self, what: str, old: float = OLD) -> Any:
         """Return what came last, None if that is too long ago."""
         when, value = self.came.get(what, (-math.inf, None))
-        return value if time.monotonic() - when < OLD else None
+        return value if time.monotonic() - when < old else None
 
     def _take(self) -> None:
-        for subscription in self.taken:
-            while True:
-                with subscription.handle:
-                    message = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                if message is None:
-                    break
-                subscription.callback(*message)
-        if self.pending:
-            for _ in range(len(self.pending) + 1):
-                self.spinner.spin_once(timeout_sec=0.0)
-        waiting, self.pending = self.pending, []
-        for future, answered in waiting:
-            if future.done():
-                answered(future.result())
-            else:
-                self.pending.append((future, answered))
+        for each in self.taken:
+            with each.handle:
+                while message := each.handle.take_message(each.msg_type, each.raw):
+                    each.callback(*message)
+        for _ in range(len(self.pending) + 1 if self.pending else 0):
+            self.spinner.spin_once(timeout_sec=0.0)
+        self.pending = [future for future in self.pending if not future.done()]
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -181,132 +153,100 @@ class View(Node):
             self._take()
             while not self.asked.empty():
                 self._do(*self.asked.get())
-            self._draw()
+            self.situation.detected = bool(self._newest('detected', math.inf))
+            posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
+            states = self._newest('muscles')
+            self.page.draw(posture, None if states is None else states[1], self._kinds())
             if begun >= tell:
                 tell = begun + TELL_PERIOD
-                self._tell()
+                self._tell(posture, states)
             if begun >= look:
                 look = begun + LOOK_PERIOD
                 self._look()
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 
-    def _draw(self) -> None:
-        posture = {arm: theta for arm in ARM_TOPICS if (theta := self._newest(arm)) is not None}
-        states, told = self._newest('muscles'), self.situation
-        self.page.draw(posture, None if states is None else states[1], self._kinds())
-        error = math.nan
-        if {'measured', 'estimated'} <= posture.keys():
-            error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
-        anomaly = self._newest('anomaly')
-        self.error, self.anomaly = error, math.nan if anomaly is None else anomaly
-        self.page.sample(time.monotonic(), error, self.anomaly, told.distance, told.limit)
-
-    def _kinds(self) -> Any:
-        from musculoskeletal_ae.view.body import Kind
-
-        suspects = {self.situation.suspect} if self.situation.detected else set()
+    def _kinds(self) -> Ints:
+        suspects = [self.situation.suspect] * self.situation.detected
+        isolated = self._newest('isolated', math.inf) or []
         kinds = np.zeros(self.robot.muscle_count, dtype=int)
-        named = (Kind.SUSPECT, suspects), (Kind.ISOLATED, self.isolated), (Kind.CUT, self.ruptured)
-        for kind, names in named:
-            for name in names:
-                if name in self.robot.muscles:
-                    kinds[self.robot.muscles.index(name)] = kind
+        for kind, names in enumerate((suspects, isolated, self.ruptured), 1):  # as in body.Kind
+            kinds[np.isin(self.robot.muscles, names)] = kind
         return kinds
 
-    def _tell(self) -> None:
-        told = self.situation
+    def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
+        told, error, anomaly = self.situation, math.nan, self._newest('anomaly')
+        if {'measured', 'estimated'} <= posture.keys():
+            error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
+        anomaly = math.nan if anomaly is None else anomaly
+        distance = '' if math.isnan(told.distance) else f'  d {told.distance:.0f}'
         lines = [
-            f'error {self.error:.3f} rad · A {self.anomaly:.3f} · d {told.distance:.0f}',
+            figures(error, anomaly, 'measured' in posture) + distance,
             f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
+            'waiting for muscle_states' if states is None else told.hint(),
         ]
-        if hint := told.hint():
-            lines.append(hint)
-        states = self._newest('muscles')
-        blank = np.zeros(self.robot.muscle_count), np.full(self.robot.muscle_count, np.nan)
-        tension, temperature = blank if states is None else states[1:]
-        if states is None:
-            lines = ['waiting for muscle_states', *lines[1:]]
-        self.page.tell(lines, told.trouble(), tension, temperature)
-        self.page.follow(self.payload, self.played)
+        shown = np.zeros((2, self.robot.muscle_count)) if states is None else states[1:]
+        values = error, anomaly, told.distance, told.limit
+        self.page.tell([*filter(None, lines)], told.trouble(), shown, time.monotonic(), values)
+        self.page.follow(self.payload, self._newest('played', math.inf))
 
     def _look(self) -> None:
         """Offer what the nodes that are there can do, and ask the emulator how it is."""
-        ready = {'controller': 'controller/stop', 'replay': 'replay/pause'}
-        there = {node for node, name in ready.items() if self.asks[name].service_is_ready()}
-        if self.told_by_emulator.service_is_ready():
-            there.add(EMULATOR)
-            asked = GetParameters.Request(names=['ruptured_muscles', 'payload'])
-            self._call(self.told_by_emulator, asked, self._emulated)
-        if there & {EMULATOR} or self.count_subscribers(self._full('sim/external_wrench')):
-            there.add('sim')
+        there = {node for node, name in SIGNS.items() if self.ways[name].service_is_ready()}
+        if any(push.get_subscription_count() for push in self.pushes):
+            there.add('pushed')
         self.page.offer(there)
-
-    def _full(self, topic: str) -> str:
-        return self.resolve_topic_name(topic)
+        self._ask(GET, self._emulated, names=['ruptured_muscles', 'payload'])
 
     def _emulated(self, answer: Any) -> None:
         values = [parameter_value_to_python(value) for value in answer.values]
         if len(values) == 2:
             self.ruptured, self.payload = [name for name in values[0] or [] if name], values[1]
 
-    # -- what is asked for ----------------------------------------------------------------------
+    def _ask(self, name: str, then: Callable[[Any], object] | None = None, **fields: Any) -> None:
+        """Call a service, tell the page what it said, and go on with the answer."""
 
-    def _call(self, client: Any, request: Any, answered: Callable[[Any], object]) -> None:
-        if client.service_is_ready():
-            self.pending.append((client.call_async(request), answered))
-
-    def _ask(self, name: str, request: Any = None, then: Callable[[], None] | None = None) -> None:
-        """Call a service, tell the page what it said, and go on where it did."""
-
-        def answered(answer: Any) -> None:
-            results = getattr(answer, 'results', [answer])
-            good = all(getattr(r, 'success', getattr(r, 'successful', False)) for r in results)
-            said = ' '.join(getattr(r, 'message', '') or getattr(r, 'reason', '') for r in results)
-            self.page.notify(printable(f'{name}: {said.strip() or "done"}'), good)
+        def answered(future: Any) -> None:
+            answer = future.result()
+            if name != GET:
+                said = [*getattr(answer, 'results', ()), answer][0]
+                good = getattr(said, 'success', getattr(said, 'successful', False))
+                why = getattr(said, 'message', getattr(said, 'reason', '')) or 'done'
+                self.page.notify(printable(f'{name}: {why}'), good)
             if then is not None:
-                then()
+                then(answer)
 
-        self._call(self.asks[name], request or Trigger.Request(), answered)
+        if self.ways[name].service_is_ready():
+            self.pending.append(self.ways[name].call_async(SERVICES[name].Request(**fields)))
+            self.pending[-1].add_done_callback(answered)
 
-    def _set(self, node: str, name: str, value: Any) -> None:
-        message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
-        self._ask(f'{node}/set_parameters', SetParameters.Request(parameters=[message]))
-
-    def _do(self, what: str, *values: Any) -> None:
+    def _do(self, what: str, value: Any = None) -> None:
         """Do what a visitor asked for."""
-        if what == 'explore':
-            self._ask('controller/explore', SetBool.Request(data=True))
-        elif what == 'stop':
-            self._ask('controller/stop')
-        elif what == 'reset':
-            self._ask('estimator/reset', then=lambda: self._ask('controller/reset'))
-        elif what == 'targets':
-            self._publish_targets(list(values[0]), np.array(list(values[0].values())))
-        elif what == 'hand':
-            theta = self._newest('estimated')
-            if theta is not None:
-                pose = pin.SE3(np.eye(3), values[0])
-                target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta
-                self._publish_targets(list(self.robot.joints), target)
-        elif what in ('cut', 'mend'):
-            names = [name for name in self.ruptured if name != values[0]]
-            self.ruptured = [*names, values[0]] if what == 'cut' else names
-            self._set(EMULATOR, 'ruptured_muscles', self.ruptured or [''])
-        elif what == 'payload':
-            self._set(EMULATOR, 'payload', float(values[0]))
-        elif what == 'push':
-            wrench = WrenchStamped()
-            force = wrench.wrench.force
-            force.x, force.y, force.z = values[0].tolist()
-            for publisher in self.pushes:
-                publisher.publish(wrench)
-        elif what == 'seek':
-            self._set('replay', 'position', float(values[0]))
-        else:  # pause, resume
-            self._ask(f'replay/{what}')
-
-    def _publish_targets(self, joints: list[str], theta: Array) -> None:
-        self.targets.publish(joint_message(joints, theta, self.get_clock().now().to_msg()))
+        match what:
+            case 'targets':
+                stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
+                self.targets.publish(joint_message([*value], theta, stamp))
+            case 'hand':
+                if (theta := self._newest('estimated')) is not None:
+                    pose = pin.SE3(np.eye(3), value)
+                    target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta
+                    self._do('targets', dict(zip(self.robot.joints, target)))
+            case 'push':
+                wrench = WrenchStamped()
+                wrench.wrench.force = Vector3(**dict(zip('xyz', value.tolist())))
+                for publisher in self.pushes:
+                    publisher.publish(wrench)
+            case 'cut' | 'mend':
+                others = [name for name in self.ruptured if name != value]
+                self.ruptured = [*others, value] if what == 'cut' else others
+                self._do('ruptured_muscles', self.ruptured or [''])
+            case 'ruptured_muscles' | 'payload' | 'position':
+                parameter = Parameter(what, value=value).to_parameter_msg()
+                service = 'replay/set_parameters' if what == 'position' else SET
+                self._ask(service, parameters=[parameter])
+            case 'reset':
+                self._ask('estimator/reset', lambda _: self._ask('controller/reset'))
+            case _:
+                self._ask(what, None, **({'data': True} if SERVICES[what] is SetBool else {}))
 
 
 def _parse(arguments: list[str]) -> Namespace:
@@ -322,13 +262,6 @@ def _parse(arguments: list[str]) -> Namespace:
 
 def _view(options: Namespace, arguments: list[str]) -> int:
     robot = Robot.load(options.robot)
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise MusculoskeletalError(
-            'the page needs viser: ./bringup.sh --view installs it, or '
-            'pip install -r .ci/requirements-view.txt'
-        ) from error
     start_ros(arguments)
     view = View(robot, options)
     name = 'localhost' if options.host == '127.0.0.1' else options.host

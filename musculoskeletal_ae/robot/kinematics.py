@@ -80,8 +80,8 @@ class Kinematics:
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
         return frame.parentJoint, frame.placement.act(xyz)
 
-    def transforms(self, theta: Array) -> Array:
-        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
+    def in_parents(self, theta: Array) -> Array:
+        """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
         angle = theta[:, self.theta_index[1:], None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
@@ -90,6 +90,11 @@ class Kinematics:
         poses = np.empty((len(theta), *self._placement.shape))
         poses[:, 0] = self._placement[0]
         poses[:, 1:] = self._placement[1:] + first * self._first[1:] + second * self._second[1:]
+        return poses
+
+    def transforms(self, theta: Array) -> Array:
+        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
+        poses = self.in_parents(theta)
         for i in range(2, len(self.parent)):
             if self.parent[i] > 0:
                 poses[:, i] = poses[:, self.parent[i]] @ poses[:, i]
@@ -136,12 +141,3 @@ class Kinematics:
         """Return the pose of the end effector in the root link's frame."""
         pin.forwardKinematics(self.model, self.data, self._q(theta))
         return pin.updateFramePlacement(self.model, self.data, self.end_effector_frame).copy()
-
-    def link_poses(self, theta: Array) -> dict[str, pin.SE3]:
-        """Return the poses of all links in the root link's frame, by name."""
-        pin.framesForwardKinematics(self.model, self.data, self._q(theta))
-        return {
-            frame.name: pose
-            for frame, pose in zip(self.model.frames, self.data.oMf)
-            if frame.type == pin.FrameType.BODY
-        }

@@ -18,8 +18,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.frames import Frames
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.markers import Frames
 from musculoskeletal_ae.nodes.shell import Shell
 
 CONFIG = Path(__file__).parents[2] / 'config'

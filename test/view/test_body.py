@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from musculoskeletal_ae.robot.robot import Robot  # noqa: E402
 from musculoskeletal_ae.view.body import (  # noqa: E402
     DASHES,
-    JointChain,
     Kind,
     link_solids,
     muscle_tubes,
@@ -33,31 +32,18 @@ def theta(robot):
     return robot.lower + 0.3 * (robot.upper - robot.lower)
 
 
-def test_chained_joint_poses_are_those_of_the_kinematics(robot, theta):
-    kin = robot.kinematics
-    positions, turns = JointChain(kin).poses(theta)
-    poses = [np.eye(4)]
-    for i in range(1, len(kin.parent)):
-        local = np.eye(4)
-        local[:3, :3] = Rotation.from_quat(turns[i], scalar_first=True).as_matrix()
-        local[:3, 3] = positions[i]
-        poses.append(poses[kin.parent[i]] @ local)
-    np.testing.assert_allclose(poses, kin.transforms(theta[None])[0], atol=1e-12)
-
-
 def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot, theta):
     tension = np.linspace(robot.tension.bias, robot.tension.limit, robot.muscle_count)
     tubes = muscle_tubes(robot, theta, tension, np.zeros(robot.muscle_count, dtype=int))
     points = robot.routes.points(theta[None])[0]
-    along = Rotation.from_quat(tubes.turns, scalar_first=True).apply([0.0, 0.0, 1.0])
+    along = Rotation.from_quat(tubes.batched_wxyzs, scalar_first=True).apply([0.0, 0.0, 1.0])
     line = points[robot.routes.second] - points[robot.routes.first]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     np.testing.assert_allclose(along, np.repeat(line, DASHES, axis=0), atol=1e-9)
     middle = 0.5 * (points[robot.routes.first] + points[robot.routes.second])
-    np.testing.assert_allclose(tubes.positions[DASHES // 2 :: DASHES], middle, atol=1e-12)
-    radius = [
-        tubes.scales[robot.routes.muscle.repeat(DASHES) == m, 0] for m in (0, -1 % len(tension))
-    ]
+    np.testing.assert_allclose(tubes.batched_positions[DASHES // 2 :: DASHES], middle, atol=1e-12)
+    owner = robot.routes.muscle.repeat(DASHES)
+    radius = [tubes.batched_scales[owner == m, 0] for m in (0, len(tension) - 1)]
     assert radius[1][0] > 2.0 * radius[0][0]
 
 
@@ -69,11 +55,11 @@ def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):
     length = np.linalg.norm(
         np.diff(robot.routes.points(theta[None])[0], axis=0)[robot.routes.first], axis=1
     ).repeat(DASHES)
-    filled = tubes.scales[:, 2] * DASHES / length
+    filled = tubes.batched_scales[:, 2] * DASHES / length
     assert (filled[kind >= Kind.ISOLATED] < 0.7).all() and (
         filled[kind < Kind.ISOLATED] > 1.0
     ).all()
-    looks = {tuple(colour) for colour in tubes.colours}
+    looks = {tuple(colour) for colour in tubes.batched_colors}
     assert len(looks) == 4
     # Nobody tells colours apart by hue alone: their luminance differs too.
     light = sorted(np.dot(look, [0.2126, 0.7152, 0.0722]) for look in looks)
@@ -86,22 +72,22 @@ def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path)
     solids, notes = link_solids(Robot.load(folder))
     assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down from the joints
     elbow = Robot.load('arm26').kinematics.placement_translation[2, 2]
-    low, high = solids[0].mesh.bounds[:, 2]
+    low, high = solids[0][1].bounds[:, 2]
     assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     (folder / 'box.stl').write_bytes(box.export(file_type='stl'))
     os.mkfifo(folder / 'fifo.stl')
     urdf = (folder / 'robot.urdf').read_text()
-    mesh = (
+    visual = (
         '<visual><origin xyz="0 0 -0.1" rpy="0 0 0"/><geometry>'
         '<mesh filename="{}" scale="0.1 0.1 0.2"/></geometry></visual>'
     )
-    added = ''.join(mesh.format(name) for name in ('box.stl', 'fifo.stl', 'none.stl', 'arm.dae'))
+    added = ''.join(visual.format(name) for name in ('box.stl', 'fifo.stl', 'none.stl', 'arm.dae'))
     name = '<link name="upper_arm">'
     (folder / 'robot.urdf').write_text(urdf.replace(name, name + added))
     robot = Robot.load(folder)
-    (solid,), notes = link_solids(robot)
-    assert robot.kinematics.model.names[solid.joint] == 'shoulder'
-    np.testing.assert_allclose(solid.mesh.bounds, [[-0.05, -0.05, -0.2], [0.05, 0.05, 0.0]])
+    ((joint, mesh),), notes = link_solids(robot)
+    assert robot.kinematics.model.names[joint] == 'shoulder'
+    np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.05, -0.2], [0.05, 0.05, 0.0]])
     assert [any(word in note for note in notes) for word in ('no regular', 'No such', '.stl, .obj')]
     assert len(notes) == 3
