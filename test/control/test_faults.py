@@ -101,6 +101,8 @@ PROMISES = {
     f'dead_sensor tension {MUSCLE}': None,
     f'stuck_motor {MUSCLE}': None,
     f'slack_wire {MUSCLE}': None,
+    f'winch_speed {MUSCLE} 0.009': None,
+    f'unzeroed {MUSCLE} 0.1': 'length',  # beyond what joints allow, or a jump
 }
 
 
