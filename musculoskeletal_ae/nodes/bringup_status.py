@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -78,8 +79,8 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        told = self.situation
-        known = figures(_mean(self.errors), _mean(self.anomalies), self.theta is not None)
+        means = (fmean(values or [math.nan]) for values in (self.errors, self.anomalies))
+        told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  {known}'
         line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
@@ -90,10 +91,6 @@ class BringupStatus(Shell):
             self.screen.update(muscle_table(self.robot, self.states, [line, more]), refresh=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException
-
-
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values)) if values else math.nan
 
 
 def open_screen() -> Any:

@@ -80,11 +80,9 @@ class Replay(Node):
         self._recorded_clock = RecordedClock(self, options.rate) if options.clock else None
         self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # where to go on [ns]
+        told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
         number = FloatingPointRange(from_value=0.0, to_value=(self._stop - self._start) / 1e9)
-        told = ParameterDescriptor(
-            description='go on from here, counted from where the replay began [s]',
-            floating_point_range=[number],
-        )
+        told.floating_point_range = [number]
         self.declare_parameter('position', 0.0, told)
         self.add_post_set_parameters_callback(self._seek)
         self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
@@ -109,25 +107,18 @@ class Replay(Node):
 
     def play(self, progress: tqdm) -> None:
         """Publish everything once, from start to stop."""
-        # Just before the first message, so that it is not due when the lap begins paused.
-        self._timeline.jump(self._start - 1, time.monotonic())
         progress.reset()
-        start: int | None = self._start
-        while start is not None:
-            start = self._play_from(start, progress)
-
-    def _play_from(self, start: int, progress: tqdm) -> int | None:
-        """Publish everything from here; return where to go on if somebody seeks [ns]."""
-        for message in lap(self._bag, self._names, start, self._stop):
-            self._wait(message.log_time, progress)
-            if self._sought is not None:
-                sought, self._sought = self._sought, None
-                self._timeline.jump(sought - 1, time.monotonic())
-                return sought
-            self._timeline.catch_up(message.log_time, time.monotonic())
-            self._tick()
-            self._publisher[message.topic].publish(message.data)
-        return None
+        self._sought = self._start if self._sought is None else self._sought
+        while self._sought is not None:
+            start, self._sought = self._sought, None
+            # Just before the first message, so that it is not due when the lap begins paused.
+            self._timeline.jump(start - 1, time.monotonic())
+            for message in lap(self._bag, self._names, start, self._stop):
+                if not self._wait(message.log_time, progress):
+                    break
+                self._timeline.catch_up(message.log_time, time.monotonic())
+                self._tick()
+                self._publisher[message.topic].publish(message.data)
 
     def play_again_and_again(self, progress: tqdm) -> None:
         """Publish everything until the process is ended."""
@@ -142,12 +133,12 @@ class Replay(Node):
             left = max(0.0, end - time.monotonic())
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
 
-    def _wait(self, recorded: int, progress: tqdm) -> None:
-        """Answer services and publish the clock until a recorded time [ns] is due."""
+    def _wait(self, recorded: int, progress: tqdm) -> bool:
+        """Answer services and publish the clock until a recorded time [ns] is due; False: seek."""
         self._next_time = recorded
         while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
             if self._sought is not None:
-                return
+                break
             self._tick()
             wait = min(due, SERVICE_PERIOD)
             if self._recorded_clock:
@@ -162,6 +153,7 @@ class Replay(Node):
                 progress.update(max(0.0, done - progress.n))
             else:
                 time.sleep(wait)
+        return self._sought is None
 
     def _tick(self) -> None:
         now = time.monotonic()

@@ -9,8 +9,8 @@ import math
 from diagnostic_msgs.msg import DiagnosticArray
 
 
-def figures(error: float, anomaly: float, measured: bool) -> str:
-    """Return error [rad] and A, or what those that are NaN wait for."""
+def figures(measured: bool, error: float, anomaly: float) -> str:
+    """Return error [rad] and A, or what those that are NaN wait for; `measured`: θ is."""
     joints = 'estimated_joint_states' if measured else 'joint_states'
     told = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} rad'
     return f'error {told}  A {"waits for anomaly" if math.isnan(anomaly) else f"{anomaly:.3f}"}'

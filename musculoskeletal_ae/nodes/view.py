@@ -180,7 +180,7 @@ class View(Node):
         anomaly = math.nan if anomaly is None else anomaly
         distance = '' if math.isnan(told.distance) else f'  d {told.distance:.0f}'
         lines = [
-            figures(error, anomaly, 'measured' in posture) + distance,
+            figures('measured' in posture, error, anomaly) + distance,
             f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
             'waiting for muscle_states' if states is None else told.hint(),
         ]
@@ -252,11 +252,10 @@ class View(Node):
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('view', 'Shows a running arm on a page in the browser.', ROS_HELP)
     parser.add_robot()
-    port = 'port of the page'
-    parser.add_argument('--port', type=whole(1, 65535), default=8080, metavar='N', help=port)
-    host = 'address to listen on; 0.0.0.0 lets everybody on the network see and move the arm'
-    parser.add_argument('--host', default='127.0.0.1', help=host)
-    parser.add_argument('--read-only', action='store_true', help='no controls')
+    add, host = parser.add_argument, 'address to listen on; 0.0.0.0: the whole network may move it'
+    add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')
+    add('--host', default='127.0.0.1', help=host)
+    add('--read-only', action='store_true', help='no controls')
     return parser.parse_args(arguments)
 
 

@@ -12,7 +12,6 @@ import io
 import os
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -118,17 +117,11 @@ def _capsules(robot: Robot) -> list[Solid]:
     return solids
 
 
-class Tubes(NamedTuple):
-    """Muscles as N instances of a tube of radius 1 from −½ to ½ along z, DASHES a segment."""
+def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
+    """Return muscles at θ [rad] (D,) and T [N] (M,) as tubes of radius 1 from −½ to ½ along z.
 
-    batched_positions: Array  # [m], (N, 3)
-    batched_wxyzs: Array  # quaternions, (N, 4)
-    batched_scales: Array  # (N, 3)
-    batched_colors: Array  # bytes, (N, 3)
-
-
-def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> Tubes:
-    """Return the muscles at θ [rad] (D,) and T [N] (M,)."""
+    Positions [m], quaternions wxyz, scales and colours are those of DASHES tubes for each segment.
+    """
     routes, owner = robot.routes, robot.routes.muscle
     points = routes.points(theta[None])[0]
     first, line = points[routes.first], points[routes.second] - points[routes.first]
@@ -144,5 +137,10 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> Tub
     radius = np.where(kinds == Kind.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
     # A whole muscle's dashes overlap a little, so that none of its joints can be seen.
     dash = np.where(kinds >= Kind.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
-    each = turn, np.stack([radius, radius, dash], axis=1), colours(robot, tension, kinds)[owner]
-    return Tubes(position.reshape(-1, 3), *(np.repeat(rows, DASHES, axis=0) for rows in each))
+    each = {
+        'batched_wxyzs': turn,
+        'batched_scales': np.stack([radius, radius, dash], axis=1),
+        'batched_colors': colours(robot, tension, kinds)[owner],
+    }
+    repeated = {name: np.repeat(rows, DASHES, axis=0) for name, rows in each.items()}
+    return {'batched_positions': position.reshape(-1, 3), **repeated}

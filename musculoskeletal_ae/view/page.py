@@ -141,10 +141,10 @@ class Page:
                 scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
         tube = trimesh.creation.cylinder(1.0, 1.0, sections=12)
         tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)  # open ends leave no seams
-        tubes = body.muscle_tubes(robot, middle, np.zeros(robot.muscle_count), self._kinds)
+        tubes: Any = body.muscle_tubes(robot, middle, np.zeros(robot.muscle_count), self._kinds)
         look = {'lod': 'off', 'side': 'double', 'cast_shadow': False, 'visible': False}
-        self._tubes = scene.add_batched_meshes_simple(
-            '/muscles', tube.vertices, tube.faces, **tubes._asdict(), **look
+        self._tubes: Any = scene.add_batched_meshes_simple(
+            '/muscles', tube.vertices, tube.faces, **tubes, **look
         )
         self._labels = [
             scene.add_label(f'/names/{name}', name, visible=False, anchor='center-left')
@@ -208,14 +208,14 @@ class Page:
             if theta is None or tension is None:
                 return
             tubes = body.muscle_tubes(self._robot, theta, tension, kinds)
-            for name, value in tubes._asdict().items():
+            for name, value in tubes.items():
                 setattr(self._tubes, name, value)
             if (kinds != self._kinds).any():
                 self._kinds = kinds.copy()
                 self._mark()
             for m, label in enumerate(self._labels):
                 if label.visible:
-                    label.position = tubes.batched_positions[self._middles[m]]
+                    label.position = tubes['batched_positions'][self._middles[m]]
         if self._controls and not self._pushing:
             self._ball.position = kin.end_effector_pose(theta).translation
 

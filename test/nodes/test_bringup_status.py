@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import io
+import math
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from musculoskeletal_ae.nodes.bringup_status import muscle_table, open_screen
-from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.nodes.situation import Situation, figures
 
 
 def said(node: str, message: str = '', **values: str) -> DiagnosticArray:
@@ -27,6 +28,13 @@ def test_before_the_first_sample_it_says_why_the_error_may_rise():
     assert 'error may rise' in told.hint()
     told.diagnosed(said('/left/learner', samples='3', checkpoints='2'))
     assert told.hint() == '' and (told.samples, told.checkpoints) == ('3', '2')
+
+
+def test_what_is_not_known_is_said_to_be_waited_for():
+    assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
+    assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
+    none = figures(True, math.nan, math.nan)
+    assert none == 'error waits for estimated_joint_states  A waits for anomaly'
 
 
 def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():

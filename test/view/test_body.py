@@ -36,14 +36,16 @@ def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot
     tension = np.linspace(robot.tension.bias, robot.tension.limit, robot.muscle_count)
     tubes = muscle_tubes(robot, theta, tension, np.zeros(robot.muscle_count, dtype=int))
     points = robot.routes.points(theta[None])[0]
-    along = Rotation.from_quat(tubes.batched_wxyzs, scalar_first=True).apply([0.0, 0.0, 1.0])
+    along = Rotation.from_quat(tubes['batched_wxyzs'], scalar_first=True).apply([0.0, 0.0, 1.0])
     line = points[robot.routes.second] - points[robot.routes.first]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     np.testing.assert_allclose(along, np.repeat(line, DASHES, axis=0), atol=1e-9)
     middle = 0.5 * (points[robot.routes.first] + points[robot.routes.second])
-    np.testing.assert_allclose(tubes.batched_positions[DASHES // 2 :: DASHES], middle, atol=1e-12)
+    np.testing.assert_allclose(
+        tubes['batched_positions'][DASHES // 2 :: DASHES], middle, atol=1e-12
+    )
     owner = robot.routes.muscle.repeat(DASHES)
-    radius = [tubes.batched_scales[owner == m, 0] for m in (0, len(tension) - 1)]
+    radius = [tubes['batched_scales'][owner == m, 0] for m in (0, len(tension) - 1)]
     assert radius[1][0] > 2.0 * radius[0][0]
 
 
@@ -55,11 +57,11 @@ def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):
     length = np.linalg.norm(
         np.diff(robot.routes.points(theta[None])[0], axis=0)[robot.routes.first], axis=1
     ).repeat(DASHES)
-    filled = tubes.batched_scales[:, 2] * DASHES / length
+    filled = tubes['batched_scales'][:, 2] * DASHES / length
     assert (filled[kind >= Kind.ISOLATED] < 0.7).all() and (
         filled[kind < Kind.ISOLATED] > 1.0
     ).all()
-    looks = {tuple(colour) for colour in tubes.batched_colors}
+    looks = {tuple(colour) for colour in tubes['batched_colors']}
     assert len(looks) == 4
     # Nobody tells colours apart by hue alone: their luminance differs too.
     light = sorted(np.dot(look, [0.2126, 0.7152, 0.0722]) for look in looks)
