@@ -82,7 +82,7 @@ class View(Node):
         self.taken: list[Any] = []  # subscriptions
         self.ruptured: list[str] = []
         self.payload = 0.0
-        self.pending: list[Any] = []  # answers that are waited for
+        self.pending: list[tuple[Any, Callable[[Any], None]]] = []  # answers that are waited for
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
         self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
@@ -134,7 +134,12 @@ class View(Node):
                     each.callback(*message)
         for _ in range(len(self.pending) + 1 if self.pending else 0):
             self.spinner.spin_once(timeout_sec=0.0)
-        self.pending = [future for future in self.pending if not future.done()]
+        waiting, self.pending = self.pending, []
+        for future, answered in waiting:  # an executor would call back one request later
+            if future.done():
+                answered(future.result())
+            else:
+                self.pending.append((future, answered))
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -205,8 +210,7 @@ class View(Node):
     def _ask(self, name: str, then: Callable[[Any], object] | None = None, **fields: Any) -> None:
         """Call a service, tell the page what it said, and go on with the answer."""
 
-        def answered(future: Any) -> None:
-            answer = future.result()
+        def answered(answer: Any) -> None:
             if name != GET:
                 said = [*getattr(answer, 'results', ()), answer][0]
                 good = getattr(said, 'success', getattr(said, 'successful', False))
@@ -216,8 +220,8 @@ class View(Node):
                 then(answer)
 
         if self.ways[name].service_is_ready():
-            self.pending.append(self.ways[name].call_async(SERVICES[name].Request(**fields)))
-            self.pending[-1].add_done_callback(answered)
+            future = self.ways[name].call_async(SERVICES[name].Request(**fields))
+            self.pending.append((future, answered))
 
     def _do(self, what: str, value: Any = None) -> None:
         """Do what a visitor asked for."""
