@@ -93,7 +93,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'faults': Parameter(
             ('',),
-            'what is wrong, each KIND [QUANTITY] [MUSCLE] [SIZE], such as "bias tension 40" '
+            'what is wrong, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
             '([""] mends; doc/interface.md lists the kinds)',
             settable=True,
         ),
