@@ -122,18 +122,18 @@ def test_nodes_say_what_they_wait_for(graph):
 
 
 def test_the_status_line_names_every_step_to_go_on(graph):
-    status = graph.host(BringupStatus, robot='arm26')
+    status = graph.host(BringupStatus, robot='arm26').situation
 
     def controller_says(message):
         name = f'{graph.namespace}/controller: state'
-        status._diagnosed(DiagnosticArray(status=[DiagnosticStatus(name=name, message=message)]))
-        return status._trouble()
+        status.diagnosed(DiagnosticArray(status=[DiagnosticStatus(name=name, message=message)]))
+        return status.trouble()
 
     assert controller_says('exploring') == ''
     status.detected, status.suspect = True, 'brachialis'
     steps = 'mend it, estimator/reset, controller/reset, controller/explore'
     told = controller_says('stopped: anomaly_detected')
-    assert told == f'  ANOMALY: brachialis, STOPPED: anomaly_detected (to go on: {steps})'
+    assert told == f'ANOMALY: brachialis, STOPPED: anomaly_detected (to go on: {steps})'
     status.detected = False
     assert controller_says('holding') == ''
-    assert controller_says('stopped: a cause') == '  STOPPED: a cause (to go on: controller/reset)'
+    assert controller_says('stopped: a cause') == 'STOPPED: a cause (to go on: controller/reset)'

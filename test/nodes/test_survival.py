@@ -139,7 +139,7 @@ def test_no_escape_from_a_message_reaches_the_terminal(graph, capsys):
     ]
     publisher = graph.publisher(DiagnosticArray, '/diagnostics')
     publisher.publish(DiagnosticArray(status=shouting))
-    graph.wait(lambda: status.samples, 'the message')
+    graph.wait(lambda: status.situation.samples, 'the message')
     status.anomalies.append(0.0)
     status._print()
     printed = capsys.readouterr().out
