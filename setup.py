@@ -11,7 +11,7 @@ from setuptools import find_packages, setup
 NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay']
-TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
+TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
 
 
 def config_files() -> list[tuple[str, list[str]]]:

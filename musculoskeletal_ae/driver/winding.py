@@ -60,13 +60,15 @@ class Winding:
         self._robot = robot
         self._muscles = tuple(muscles) or tuple(range(robot.muscle_count))
         bias = robot.tension.bias
-        self._highest = bias + ABOVE_BIAS if highest is None else max(highest, bias + CLIP[0])
+        self._highest: Array = np.maximum(
+            bias + CLIP[0], bias + ABOVE_BIAS if highest is None else highest
+        )
         self.verdict = Verdict(robot)
         self.trying = ''  # what is going on, for people
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # none before l is known
-        self._stiffness: Array = np.broadcast_to(robot.stiffness, robot.muscle_count)
+        self._stiffness: Array = robot.stiffness
         self._tame_at: Array = np.zeros(robot.muscle_count)  # when each last pulled as asked [s]
         self._run = self._sequence()
         self.done = False
@@ -149,7 +151,7 @@ class Winding:
         levels = [home]
         for share in (0.5, 1.0):
             # The weight of the arm may ask for more than T_bias already.
-            level = home.demand[m] + share * (self._highest - robot.tension.bias)
+            level = home.demand[m] + share * (self._highest - robot.tension.bias)[m]
             levels.append((yield from self._wind(m, level, home.length[m], latency)))
         if not self._responds(m, home, levels[-1]):
             yield from self._ask_outwards(m, home, levels[-1])
@@ -161,8 +163,8 @@ class Winding:
             verdict.failed('sign', (m,), told, 'l must fall when the motor winds in')
         else:
             verdict.passed('sign', m)
-        clip = robot.tension.max
-        if clip <= self._highest:
+        clip = robot.tension.max[m]
+        if clip <= self._highest[m]:
             past = yield from self._wind(m, clip + CLIP[0], home.length[m], [])
             if past.tension[m] > (1.0 + CLIP[1]) * clip:
                 told = f'T is {past.tension[m]:.0f} N, tension.max {clip:g} N'
@@ -198,7 +200,7 @@ class Winding:
     ) -> Generator[None, None, _Reading]:
         """Ask for a level [N], follow the arm as it gives way, and return what is then read."""
         before = self._mean()
-        further = (level - self._robot.tension.bias) / self._stiffness[m]
+        further = (level - self._robot.tension.bias[m]) / self._stiffness[m]
         noise = np.std([states[1, m] for _, states in self._recent])
         self._target[m] = before.length[m] - further
         start = last = self._now
@@ -236,7 +238,7 @@ class Winding:
             told = f'{robot.muscles[other]} winds in instead'
             verdict.failed('order', (m,), told, 'take commands in the order of muscles.yaml')
             return
-        away = (self._highest - robot.tension.bias) / self._stiffness[m]
+        away = (self._highest - robot.tension.bias)[m] / self._stiffness[m]
         self._target[m] = home.length[m] + away
         yield from self._wait(HOLD)
         outwards = self._mean()
@@ -250,16 +252,16 @@ class Winding:
         verdict.failed('law', (m,), told, how)
 
     def _law(self, m: int) -> str:
-        bias, stiffness = self._robot.tension.bias, self._stiffness[m]
+        bias, stiffness = self._robot.tension.bias[m], self._stiffness[m]
         return f'T = T_bias + max(0, K (l − l_target)), T_bias {bias:g} N, K {stiffness:g} N/m'
 
     def _judge(self, m: int, levels: Sequence[_Reading], out: _Reading) -> None:
         """Judge the law by levels that were asked for, and by l_target beyond l."""
         robot, verdict = self._robot, self.verdict
         home, last = levels[0], levels[-1]
-        bias = robot.tension.bias
+        bias = robot.tension.bias[m]
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
-        if asked < 0.25 * (self._highest - bias):
+        if asked < 0.25 * (self._highest[m] - bias):
             verdict.notes.append(f'{robot.muscles[m]}: the arm gave way, the law is not judged')
         elif abs(last.third[m] - home.third[m]) > 0.7 * asked and abs(got) < 0.3 * asked:
             told = 'row 3 does what tension must'

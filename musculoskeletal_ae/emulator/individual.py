@@ -16,6 +16,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.robot.wrapping import WrapObjects
 
 THICKEST_BONE = 0.04  # [m] radius of a bone's head
 
@@ -75,7 +76,7 @@ class Individual:
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles = robot.muscle_count
         kin = robot.kinematics
-        self._order = kin.order
+        self._kinematics = kin
         self.tree = Tree(
             kin.parent.astype(np.int64),
             kin.placement_rotation,
@@ -94,6 +95,7 @@ class Individual:
             nominal.muscle.astype(np.int64),
             sphere_joint,
             radius,
+            _objects(robot, nominal.point + shift, spread.wrap > 0.0, seed),
         )
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         nominal_elastic = robot.series_elastic
@@ -113,8 +115,7 @@ class Individual:
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
-        q = np.empty((len(theta), self.tree.parent.shape[0] - 1))
-        q[:, self._order] = theta
+        q = self._kinematics.tree_angles(theta)
         return wrapped_lengths(self.tree, self.routes, len(self.cable_friction), q)
 
     def absolute_lengths(self, theta: Array) -> Array:
@@ -123,12 +124,42 @@ class Individual:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return the true G [m/rad], θ (N, D) gives (N, M, D)."""
-        return self._evaluate(theta)[1][:, :, self._order]
+        return self._kinematics.of_theta(self._evaluate(theta)[1])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
         absolute = self.absolute_lengths(theta)
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
+
+
+def _objects(robot: Robot, point: Array, differs: bool, seed: int) -> WrapObjects:
+    """Return what the description wraps each segment round, a little thicker or thinner.
+
+    Never so thick that the true route's points come to lie inside it.
+    """
+    kin, routes = robot.kinematics, robot.routes
+    count = len(routes.first)
+    centre, axis, side = np.zeros((3, count, 3))
+    objects = WrapObjects(np.zeros(count, np.int64), centre, axis, side, np.zeros(count))
+    if routes.objects is None:
+        return objects
+    for whole, part in zip(objects, routes.objects, strict=True):
+        whole[routes.wrapping] = part
+    if differs:
+        poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
+        thickness = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
+        for s in routes.wrapping:
+            turn = poses.rotation[:, objects.joint[s]]
+            centre = poses.translation[:, objects.joint[s]] + turn @ objects.centre[s]
+            least = np.inf
+            for end in (routes.first[s], routes.second[s]):
+                joint = routes.joint[end]
+                at = poses.translation[:, joint] + poses.rotation[:, joint] @ point[end]
+                away, axis = at - centre, turn @ objects.axis[s]
+                away = away - (away * axis).sum(axis=1, keepdims=True) * axis
+                least = min(least, float(np.linalg.norm(away, axis=1).min()))
+            objects.radius[s] = min(objects.radius[s] * thickness[s], 0.95 * least)
+    return objects
 
 
 def _bone_heads(robot: Robot, quantile: float, rng: np.random.Generator) -> tuple[Ints, Array]:
@@ -145,13 +176,15 @@ def _bone_heads(robot: Robot, quantile: float, rng: np.random.Generator) -> tupl
         return sphere_joint, radius
     postures = robot.random_postures(300, np.random.default_rng(0))
     poses, points = kin.joint_poses(postures), routes.points(postures)
+    # The description says of some segments what they wrap round.
+    described = set(routes.wrapping.tolist())
     thickness = rng.uniform(0.8, 1.2, len(routes.first))
     for s, (first, second) in enumerate(zip(routes.first, routes.second, strict=True)):
         moved = kin.moved_by[routes.joint[first]] ^ kin.moved_by[routes.joint[second]]
         crossed = [i for i in range(1, len(kin.parent)) if moved[kin.theta_index[i]]]
         crossed = [i for i in crossed if not kin.prismatic[i]]
         best = np.inf
-        for joint in crossed:
+        for joint in crossed if s not in described else ():
             centre = poses.translation[:, joint]
             start, end = points[:, first] - centre, points[:, second] - centre
             line = end - start

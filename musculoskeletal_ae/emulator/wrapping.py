@@ -7,8 +7,9 @@ and arrives along the other tangent:
 
     length = √(a² − r²) + √(b² − r²) + r (φ − acos(r/a) − acos(r/b))
 
-with a, b the distances of the end points from c and φ the angle between them. Nothing here is
-shared with the geometric model of `robot/routes.py`, which the estimators know.
+with a, b the distances of the end points from c and φ the angle between them. Nothing of these
+bones is known to the geometric model of `robot/routes.py`. Where the description itself wraps a
+segment (`robot/wrapping.py`), it wraps here too, round an object of its own size.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segment
 
 
 class Tree(NamedTuple):
@@ -51,6 +53,7 @@ class WrappedRoutes(NamedTuple):
         muscle: Muscle it belongs to, shape (S,).
         sphere_joint: Tree joint at whose origin the sphere sits, shape (S,).
         radius: Radius of the sphere, 0 for none [m], shape (S,).
+        objects: What the description wraps each segment round, radius 0 for nothing.
     """
 
     point_joint: Ints
@@ -60,6 +63,7 @@ class WrappedRoutes(NamedTuple):
     muscle: Ints
     sphere_joint: Ints
     radius: Array
+    objects: WrapObjects
 
 
 @njit(cache=True)
@@ -175,19 +179,43 @@ def wrapped_lengths(
         tree_poses(tree, q[n], rotation, translation, axis)
         place_points(routes, rotation, translation, world)
         for s in range(routes.first.shape[0]):
-            m, i, k = routes.muscle[s], routes.first[s], routes.second[s]
-            centre = translation[routes.sphere_joint[s]]
-            lengths[n, m] += segment_length(
-                world[i], world[k], centre, routes.radius[s], leave, arrive
-            )
-            row = jacobian[n, m]
-            push = -(leave + arrive)
-            add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, -1.0, row)
-            add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, -1.0, row)
-            if routes.radius[s] > 0.0:
-                joint = routes.sphere_joint[s]
-                add_torque(tree, translation, axis, joint, centre, push, -1.0, row)
+            m = routes.muscle[s]
+            lengths[n, m] += route_segment(routes, s, rotation, translation, world, leave, arrive)
+            add_pull(tree, routes, s, translation, axis, world, leave, arrive, -1.0, jacobian[n, m])
     return lengths, jacobian
+
+
+@njit(cache=True)
+def route_segment(
+    routes: WrappedRoutes, s: int, rotation: Array, translation: Array, world: Array,
+    leave: Array, arrive: Array,
+) -> float:  # fmt: skip
+    """Return the length of segment s, placed by `place_points`, and fill the unit pulls."""
+    start, end = world[routes.first[s]], world[routes.second[s]]
+    if routes.objects.radius[s] > 0.0:
+        return wrapped_segment(routes.objects, s, rotation, translation, start, end, leave, arrive)
+    centre = translation[routes.sphere_joint[s]]
+    return segment_length(start, end, centre, routes.radius[s], leave, arrive)
+
+
+@njit(cache=True)
+def add_pull(
+    tree: Tree, routes: WrappedRoutes, s: int, translation: Array, axis: Array, world: Array,
+    leave: Array, arrive: Array, pull: float, torque: Array,
+) -> None:  # fmt: skip
+    """Add what a tension `pull` in segment s does to the joints to torque (J−1,)."""
+    i, k = routes.first[s], routes.second[s]
+    add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, pull, torque)
+    add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, pull, torque)
+    if routes.objects.radius[s] > 0.0:
+        # The wire presses on the object in the lines of its straight parts.
+        joint = routes.objects.joint[s]
+        add_torque(tree, translation, axis, joint, world[i], leave, -pull, torque)
+        add_torque(tree, translation, axis, joint, world[k], arrive, -pull, torque)
+    elif routes.radius[s] > 0.0:
+        joint = routes.sphere_joint[s]
+        push = leave + arrive
+        add_torque(tree, translation, axis, joint, translation[joint], push, -pull, torque)
 
 
 @njit(cache=True)

@@ -25,7 +25,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
-COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias, ROBOT.tension.max
+COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias[0], ROBOT.tension.max[0]
 COLD = np.full(COUNT, 25.0)
 LIMIT = np.full(COUNT, MAX)
 DT = 0.01

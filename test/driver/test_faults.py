@@ -16,7 +16,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ROBOT = Robot.load('arm26')
 LOW = replace(ROBOT.description, tension=TensionRange(30.0, 55.0, 60.0))
 M, BICEPS = ROBOT.muscle_count, 4
-BIAS, K = ROBOT.tension.bias, ROBOT.stiffness
+BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
 
 
 def rows_in(order):
@@ -131,7 +131,7 @@ def test_modules_without_thermometers_are_no_fault():
     assert 'nothing protects the motors from heat' in str(verdict)
 
 
-def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max, clip=True, gain=1.0):
+def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max[0], clip=True, gain=1.0):
     def follow(target, rows):
         tension = bias + np.maximum(0.0, stiffness * (rows[0] - target))
         return gain * (np.minimum(tension, most) if clip else tension)
