@@ -251,10 +251,9 @@ def touched(
 
     if objects.side[s] @ objects.side[s] < objects.radius[s] ** 2:
         # A ring: the straight parts meet where the wire touches it.
-        ahead = np.stack([leave, -arrive], axis=1)
-        first = float(np.linalg.lstsq(ahead, end - start, rcond=None)[0][0])
-        point: Array = start + first * leave
-        return point[None]
+        both = np.stack([leave, -arrive], axis=1)
+        first = float(np.linalg.lstsq(both, end - start, rcond=None)[0][0])
+        return (start + first * leave)[None]
 
     def foot(point: Array, pull: Array) -> float:
         flat = across(pull)
@@ -262,66 +261,10 @@ def touched(
 
     first, last = foot(start, leave), foot(end, arrive)
     arc = max(length - first - last, 0.0)
-    out, ahead = across(start + first * leave - centre), across(leave)
+    ahead = across(leave)
     speed = np.linalg.norm(ahead)
     turn = np.linspace(0.0, speed * arc / objects.radius[s], 9)[:, None]
-    rise = _dot(line, axis)
-    length = math.sqrt(flat * flat + rise * rise)
-    for k in range(3):
-        leave[k] = (flat * (lx * u[k] + ly * v[k]) + rise * axis[k]) / length
-        arrive[k] = (flat * (rx * u[k] + ry * v[k]) - rise * axis[k]) / length
-    return length
-
-
-@njit(cache=True)
-def wrapped_segments(
-    objects: WrapObjects, rotation: Array, translation: Array, start: Array, end: Array
-) -> tuple[Array, Array, Array]:
-    """Return lengths (N, S) and pulls at start and end (N, S, 3) of segments, ends (N, S, 3)."""
-    lengths = np.zeros((start.shape[0], start.shape[1]))
-    leave, arrive = np.zeros(start.shape), np.zeros(start.shape)
-    for n in range(start.shape[0]):
-        for s in range(start.shape[1]):
-            lengths[n, s] = wrapped_segment(
-                objects, s, rotation[n], translation[n], start[n, s], end[n, s],
-                leave[n, s], arrive[n, s],
-            )  # fmt: skip
-    return lengths, leave, arrive
-
-
-def touched(
-    objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array
-) -> Array:
-    """Return points along the arc of one wrapped segment for drawing, (K, 3); none if straight."""
-    leave, arrive = np.zeros(3), np.zeros(3)
-    length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
-    if np.linalg.norm(leave + arrive) < 1e-9:
-        return np.zeros((0, 3))
-    j = objects.joint[s]
-    axis = rotation[j] @ objects.axis[s]
-    centre = translation[j] + rotation[j] @ objects.centre[s]
-
-    def across(vector: Array) -> Array:
-        return vector - (vector @ axis) * axis
-
-    if objects.side[s] @ objects.side[s] < objects.radius[s] ** 2:
-        # A ring: the straight parts meet where the wire touches it.
-        ahead = np.stack([leave, -arrive], axis=1)
-        first = float(np.linalg.lstsq(ahead, end - start, rcond=None)[0][0])
-        point: Array = start + first * leave
-        return point[None]
-
-    def foot(point: Array, pull: Array) -> float:
-        flat = across(pull)
-        return float(-(across(point - centre) @ flat) / (flat @ flat))
-
-    first, last = foot(start, leave), foot(end, arrive)
-    arc = max(length - first - last, 0.0)
-    out, ahead = across(start + first * leave - centre), across(leave)
-    speed = np.linalg.norm(ahead)
-    turn = np.linspace(0.0, speed * arc / objects.radius[s], 9)[:, None]
-    if speed * arc < 1e-9:  # a ring is touched in one point
-        turn = turn[:1]
-    rise = ((start + first * leave - centre) @ axis + turn * objects.radius[s] / speed * (leave @ axis)) * axis  # noqa: E501  # fmt: skip
-    points: Array = centre + rise + np.cos(turn) * out
+    begin = start + first * leave - centre
+    along = begin @ axis + turn * objects.radius[s] / speed * (leave @ axis)
+    points: Array = centre + along * axis + np.cos(turn) * across(begin)
     return points + np.sin(turn) * objects.radius[s] * ahead / speed

@@ -157,7 +157,7 @@ def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
     guard.stop('asked')
     sent = [step(guard, None).value[0] for _ in range(60)]
     assert sent[8] == 120.0
-    assert -np.diff(sent).min() <= ROBOT.stiffness * 0.1 * DT + 1e-9
+    assert -np.diff(sent).min() <= ROBOT.stiffness[0] * 0.1 * DT + 1e-9
     assert sent[-1] == BIAS
 
 
