@@ -63,6 +63,7 @@ def _pose(position: Array, quaternion: Array) -> pin.SE3:
 class _Reader:
     def __init__(self, mujoco: Any, model: Any, name: str) -> None:
         self.mj, self.model, self.source = mujoco, model, Source(name)
+        self.source.gravity = model.opt.gravity.copy()
         self.body_frame: list[pin.SE3] = []  # of each body in the frame of its link
         self.balls: dict[int, list[str]] = {}
         for i in range(model.nbody):

@@ -105,6 +105,10 @@ class _Reader:
     def __init__(self, file: Path, model: ET.Element) -> None:
         self.file, self.model = file, model
         self.source = Source(safe_name(model.get('name', ''), 'robot'))
+        if model.find('gravity') is not None:
+            self.source.gravity = self._vector(model, 'gravity')
+        else:
+            self.source.gravity = np.array([0.0, -1.0, 0.0])
         self.coordinates: dict[str, Coordinate] = {}
         #: for each body: parent, pose before, axes, pose after; as OpenSim has it
         self.tree: dict[str, tuple[str, pin.SE3, list[Axis], pin.SE3]] = {}

@@ -74,6 +74,9 @@ class Source:
     strength: dict[str, float] = field(default_factory=dict)  # highest tension [N], where known
     notes: list[str] = field(default_factory=list)  # chosen, dropped, approximated
     lengths: Lengths | None = None
+    gravity: Array = field(
+        default_factory=lambda: np.array([0.0, 0.0, -1.0])
+    )  # in the root's frame
 
     def note(self, kind: str, told: str) -> None:
         """Remember what was 'chosen', 'dropped' or 'approximated'."""
@@ -135,6 +138,7 @@ def cut(
     for option, name in (('--base', base), ('--end', end)):
         if name and name not in names:
             raise SourceError(f'{option} {name}: no such link; links: {", ".join(names)}')
+    upright = _rest_rotation(source, base)
     if base:
         kept = {base}
         for link in source.links:
@@ -144,6 +148,12 @@ def cut(
             raise SourceError(f'--end {end}: it does not hang on --base {base}')
         source.links = [link for link in source.links if link.name in kept]
         source.links[0] = Link(base, '', inertia=source.links[0].inertia)
+    if not np.allclose(upright, np.eye(3), atol=1e-9):
+        # A root link's z axis points upwards.
+        root = source.links[0]
+        root.parent, root.placement = f'{root.name}_upright', pin.SE3(upright, np.zeros(3))
+        source.links.insert(0, Link(root.parent, ''))
+        source.note('chosen', f'link {root.parent}: the root, upright; {root.name} as it rests')
     there = {link.name: link for link in source.links}
     movable = [link.joint for link in source.links if link.kind != FIXED]
     free = [name for name in movable if name not in source.couplings]
@@ -195,6 +205,20 @@ def cut(
         raise SourceError('no joint is left that moves')
     tips = [link.name for link in source.links]
     return end or max(reversed(tips), key=lambda name: len(moved[name]))
+
+
+def _rest_rotation(source: Source, link: str) -> Array:
+    """Return how a link (the root for '') is turned at rest in a frame whose z axis is up."""
+    there = {each.name: each for each in source.links}
+    at, pose = there.get(link, source.links[0]), pin.SE3.Identity()
+    while at.parent:
+        pose, at = at.motion_at_rest * pose, there[at.parent]
+    down = np.array([0.0, 0.0, -1.0])
+    if (size := float(np.linalg.norm(source.gravity))) < 1e-6:
+        source.note('chosen', 'gravity: along −z, the source has none')
+        return np.array(pose.rotation)
+    turn = pin.Quaternion.FromTwoVectors(source.gravity / size, down).matrix()
+    return np.array(turn @ pose.rotation)
 
 
 # -- writing ---------------------------------------------------------------------------------------

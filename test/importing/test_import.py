@@ -121,6 +121,9 @@ def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
     ):
         assert expected in told
     assert {c.master for c in result.robot.description.couplings.values()} == {'raise'}
+    assert result.robot.root_link == 'ground_upright'  # OpenSim's y axis is up
+    pose = result.robot.kinematics.link_pose(np.zeros(2), 'humerus')
+    assert pose.translation[2] > 0.9
 
 
 def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
@@ -128,12 +131,21 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     options = ['--base', 'upper', '--end', 'lower', '--out', str(out)]
     assert main([str(mjcf), *options]) == 0
     robot, told = Robot.load(out), capsys.readouterr().out
-    assert (robot.root_link, robot.description.end_effector) == ('upper', 'lower')
+    assert (robot.root_link, robot.description.end_effector) == ('upper_upright', 'lower')
     assert robot.joints == ('elbow',)
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
     assert 'dropped: muscle front: fastened to base, which was cut off' in told
     assert 'largest length error over 1000 postures: 0.000 mm' in told
     assert 'check_robot: not sound' in told  # nothing holds it open against its weight
+
+
+def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
+    whole = import_robot(mjcf, tmp_path / 'whole').robot
+    part = import_robot(mjcf, tmp_path / 'part', base='upper').robot
+    rest = np.array([0.2, 0.0])  # where MuJoCo's file puts the joints above
+    for elbow in (-1.0, 0.1):
+        torque = whole.kinematics.holding_torque(np.append(rest, elbow))[2]
+        np.testing.assert_allclose(part.kinematics.holding_torque(np.array([elbow])), torque)
 
 
 def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_path):
