@@ -4,7 +4,7 @@
 A joint becomes a chain of massless links, one for each axis that moves, translations before
 rotations as OpenSim applies them. An axis whose value is the coordinate itself carries it; others
 are coupled to it, by the line nearest to their function. Moving path points stand at the mean of
-where they move, conditional ones are kept if they are active over more than half of the range.
+where they move; of the conditional ones those are kept that let the length change most as it does.
 The source's own lengths are computed with all these as OpenSim has them, so that the error shows
 what the approximation costs; wrap objects are those of the result on both sides.
 """
@@ -411,10 +411,12 @@ class _Reader:
                 continue
             points = [self._point(name, p) for p in path.findall('PathPointSet/objects/*')]
             self.points[name] = points
+            always = self._always_active(name)
             route: list[RoutePoint | Wrap] = []
             kept: list[int] = []
             for i, point in enumerate(points):
-                if (at := self._standing(name, point)) is not None:
+                at = self._standing(name, point, always[i])
+                if always[i]:
                     kept.append(i)
                     route.append(RoutePoint(point.body, self.body_frame[point.body].act(at)))
             if len(route) < 2:
@@ -458,16 +460,39 @@ class _Reader:
             return float(values.min()), float(values.max()) + 1e-6
         return (c.low, c.high) if c.high - c.low < 100.0 else (-np.pi, np.pi)
 
-    def _standing(self, muscle: str, point: Point) -> Array | None:
-        """Return where a point is taken to be, in its body; None where it is left out."""
+    def _always_active(self, name: str) -> list[bool]:
+        """Return which points the route keeps: of conditional ones those that err least.
+
+        Begins with all and changes one at a time, as long as that lowers the squared error of how
+        the length changes.
+        """
+        points = self.points[name]
+        places, active = self._positions(name, self._random(200))
+        true, kept = _path(places, active), [True] * len(points)
+
+        def error(tried: list[bool]) -> float:
+            off = _path(places, np.broadcast_to(tried, active.shape)) - true
+            return float(np.square(off - off.mean()).mean())
+
+        least = error(kept)
+        conditional = [i for i, point in enumerate(points) if point.condition]
+        for _ in conditional:
+            flips = [[k != (j == i) for j, k in enumerate(kept)] for i in conditional]
+            best = min(flips, key=error)
+            if error(best) >= least:
+                break
+            kept, least = best, error(best)
+        return kept
+
+    def _standing(self, muscle: str, point: Point, kept: bool) -> Array:
+        """Return where a point is taken to be, in its body."""
         note = self.source.note
         if point.condition:
             name, low, high = point.condition
             least, most = self._span(name)
             share = (min(high, most) - max(low, least)) / (most - least)
             told = f'muscle {muscle}: a point active in {100 * max(share, 0.0):.0f} % of {name}'
-            note('approximated', f'{told} is {"always there" if share > 0.5 else "left out"}')
-            return np.asarray(point.at) if share > 0.5 else None
+            note('approximated', f'{told} is {"always there" if kept else "left out"}')
         if isinstance(point.at, list):
             ways = [f(np.linspace(*self._span(name), 201)) if name else f(np.zeros(1)) for name, f in point.at]  # noqa: E501  # fmt: skip
             off = 1e3 * max(float(np.abs(way - way.mean()).max()) for way in ways)
@@ -586,6 +611,18 @@ class _Reader:
                         total[now] += np.linalg.norm(ends[1] - ends[0], axis=-1)
             result[name] = total
         return result
+
+
+def _path(places: Array, active: Array) -> Array:
+    """Return lengths (N,) of straight paths over those of the points (N, P, 3) that are active."""
+    total, last = np.zeros(len(places)), places[:, 0].copy()
+    begun = np.zeros(len(places), dtype=bool)
+    for place, now in zip(places.swapaxes(0, 1), active.T):
+        step = np.linalg.norm(place - last, axis=1)
+        total += np.where(np.logical_and(now, begun), step, 0.0)
+        last[now] = place[now]
+        begun = np.logical_or(begun, now)
+    return total
 
 
 def _constant(value: float) -> Function:
