@@ -371,12 +371,10 @@ class _Reader:
                 if radius <= 0.0:
                     self.source.note('dropped', f'{kind} {name}')
                     continue
-                side, quadrant = None, (item.findtext('quadrant') or 'all').strip().lower()
-                if kind == 'WrapTorus':
-                    side = centre
-                elif quadrant.lstrip('+-') in ('x', 'y', 'z'):
-                    out = turn[:, 'xyz'.index(quadrant[-1])]
-                    side = centre + 2.0 * radius * (-out if quadrant[0] == '-' else out)
+                # Whether a quadrant forces a wire round depends on where a finite object ends.
+                if (item.findtext('quadrant') or 'all').strip().lower() != 'all':
+                    self.source.note('approximated', f'{kind} {name}: it is passed on any side')
+                side = centre if kind == 'WrapTorus' else None
                 objects[name] = Wrap(body, centre, radius, axis, side)
         return objects
 
