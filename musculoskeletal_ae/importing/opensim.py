@@ -425,6 +425,8 @@ class _Reader:
             force = item.findtext('max_isometric_force') or item.findtext('optimal_force') or '0'
             if float(force) > 0.0:
                 source.strength[name] = float(force)
+        if any(self.wraps.values()):
+            source.note('approximated', 'lengths are compared round the wrap objects of the result')
         if source.strength:
             source.note('chosen', STRENGTH)
 
