@@ -21,7 +21,8 @@ doc/your_robot.md leads from a robot of your own to one that learns.
                              says what is wrong with them, and starts once nothing is
   --no-controller            nothing may move the arm
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
-  --explore | --no-explore   random exploration, so that learning has data (default: on)
+  --explore | --no-explore   random exploration, so that learning has data (default: on; with
+                             --hardware off: a real arm moves when it is told to)
   --no-learner               no online learning
   --preset default|paper     the best we can measure, or as printed in the paper (default: default)
   --seed N                   which individual arm the emulator is (default: 0)
@@ -44,7 +45,7 @@ refuse() {
 
 robot=musashi_left_arm
 checkpoint=
-explore=true
+explore= # on, but for hardware
 preset=default
 seed=0
 namespace=
@@ -107,6 +108,7 @@ if [ -n "$bag" ]; then
   bag=$(cd "$(dirname "$bag")" && pwd -P)/$(basename "$bag")
   [ $hardware = false ] || refuse '--bag and --hardware exclude each other: which of them is it?'
 fi
+[ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
 if [ -n "$recording" ]; then
   [ ! -e "$recording" ] || refuse "--record '$recording' is there already; name a new directory"
   recording=$(realpath -m "$recording")
@@ -278,8 +280,9 @@ fi
 if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
   rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
-  "${with_us[@]}" "$python" "$executables/check_driver" --robot "$robot" --rate "$rate" --wait --seconds 3 \
-    "${remap[@]}" </dev/null &
+  check=(--robot "$robot" --rate "$rate" --wait --seconds 3)
+  ! grep -q '^    zero_at_start: *true' "$repository/config/nodes.yaml" || check+=(--unzeroed)
+  "${with_us[@]}" "$python" "$executables/check_driver" "${check[@]}" "${remap[@]}" </dev/null &
   pid_of[check_driver]=$!
   status=0
   watch_until_ended check_driver || status=$?
@@ -298,10 +301,10 @@ kept=(-p "state_directory:=$(quoted "$logs/learner")")
 if [ -n "$bag" ]; then
   start replay replay "$bag" --clock "${remap[@]}"
 elif [ $controller = true ]; then
-  common+=(-p "explore:=$explore")
+  moving=(-p "explore:=$explore")
   # A pause of a busy desktop is no fault of an emulated arm.
-  [ $hardware = true ] || common+=(-p max_age:=1.0)
-  start controller controller "${common[@]}"
+  [ $hardware = true ] || moving+=(-p max_age:=1.0)
+  start controller controller "${common[@]}" "${moving[@]}"
 fi
 
 # The status line. It counts --duration from when estimates arrive, however late that is on a slow

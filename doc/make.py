@@ -54,14 +54,12 @@ def _class(node: ast.ClassDef) -> list[str]:
     methods = [member for member in node.body if isinstance(member, ast.FunctionDef)]
     made = next((member for member in methods if member.name == '__init__'), None)
     lines = [f'**{_signature(made, node.name) if made else f"`{node.name}`"}** {_first(node)}', '']
-    fields = [member for member in node.body if isinstance(member, ast.AnnAssign)]
-    lines += [f'- `{ast.unparse(f.target)}: {ast.unparse(f.annotation)}`' for f in fields]
+    fields = [ast.unparse(m.target) for m in node.body if isinstance(m, ast.AnnAssign)]
     for member in methods:
+        plain = any(ast.unparse(mark) == 'property' for mark in member.decorator_list)
         if not member.name.startswith('_'):
-            plain = any(ast.unparse(mark) == 'property' for mark in member.decorator_list)
-            told = f'`{member.name}`' if plain else _signature(member, member.name)
-            lines.append(f'- {told} {_first(member)}')
-    return [*lines, '']
+            fields.append(member.name + '()' * (not plain))
+    return [*lines[:1], ' '.join(f'`{name}`' for name in fields), ''] if fields else lines
 
 
 def api() -> str:
@@ -70,7 +68,8 @@ def api() -> str:
         '# Python, without ROS',
         '',
         'What a program may build on; `python doc/make.py` writes this page from the code. Arrays',
-        "are numpy's, units SI; θ, T and l have the order of `muscles.yaml`. Docstrings say more.",
+        "are numpy's, units SI; θ, T and l have the order of `muscles.yaml`. Docstrings, which",
+        '`help()` shows, say what each takes and returns.',
         '',
     ]
     for file, names in MODULES.items():

@@ -81,14 +81,18 @@ class Plausibility:
         self._came: Array = np.zeros(robot.muscle_count)  # the last ones, whatever they were
         self._came_at, self._settled_since = -math.inf, math.inf
 
-    def check_muscles(self, tension: Array, length: Array, temperature: Array, now: float) -> None:
-        """Take T [N], l [m] and temperatures [°C] (M,) as they came.
+    def check_muscles(
+        self, tension: Array, length: Array | None, temperature: Array, now: float
+    ) -> None:
+        """Take T [N], l [m] and temperatures [°C] (M,) as they came; no l while zeros are unknown.
 
         Raises:
             MessageError: If no muscle of this arm can say that.
         """
         wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
-        error = self.levels(tension, length, temperature, wound) or self._step(length, now)
+        error = self.levels(tension, length, temperature, wound)
+        if error is None and length is not None:
+            error = self._step(length, now)
         self.muscles.note(error, now)
         if error:
             raise error
@@ -117,7 +121,7 @@ class Plausibility:
     def levels(
         self,
         tension: Array,
-        length: Array,
+        length: Array | None,
         temperature: Array | None = None,
         wound: Array | float = 0.0,
     ) -> MessageError | None:

@@ -26,6 +26,9 @@ def main() -> int | None:
     """Run the node or tool that this process is named after; return its exit status."""
     name = Path(sys.argv[0]).stem
     try:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # setup.py says why
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         if name in load('musculoskeletal_ae.nodes.parameters').PARAMETERS:
             return load('musculoskeletal_ae.nodes.running').run(name)
         is_tool = Path(__file__).with_name('tools').joinpath(f'{name}.py').exists()

@@ -47,9 +47,11 @@ class SourceOrder:
         last_time, last_number = self._last
         return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
 
-    def take(self, time: int, number: int = 0) -> None:
-        """Compare with this message from now on."""
+    def take(self, time: int, number: int = 0) -> bool:
+        """Compare with this message from now on; say whether it is numbered lower than the last."""
+        lower = number < self._last[1]
         self._last = time, number
+        return lower
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:

@@ -125,9 +125,12 @@ class Controller:
             MessageError: If no muscles of this arm can be so.
         """
         length, tension, temperature = muscles
-        self._plausibility.check_muscles(tension, length, temperature, now)
+        # While zeros are unknown a guess may make any length of them, and any posture.
+        known = length if self.safety.zeroed else None
+        self._plausibility.check_muscles(tension, known, temperature, now)
         self._muscles_at = awake = now - self._asleep
-        self._temperatures.append(temperature)
+        # NaN is not known, and no reason for anything.
+        self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
         self._warm = np.median(np.array(self._temperatures), axis=0)
         over = self.safety.muscles(muscles).tension > self._overloads
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
@@ -138,6 +141,8 @@ class Controller:
         Raises:
             MessageError: If no joints of this arm can be there.
         """
+        if not self.safety.zeroed:
+            theta = np.clip(theta, self._robot.lower, self._robot.upper)
         self._plausibility.check_estimate(theta, now)
         self._estimate, self._estimate_at = theta, now - self._asleep
 

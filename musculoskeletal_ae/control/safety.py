@@ -54,10 +54,10 @@ class Muscles(NamedTuple):
 def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
     """Return each muscle's tension limit [N] (M,) for module temperatures [°C] (M,).
 
-    A smooth step from tension.max, at COOLING_BAND below `highest`, to T_bias at `highest`. NaN is
+    A smooth step from tension.max, at COOLING_BAND below `highest`, to T_bias at `highest`. −inf is
     not known, and limits nothing.
     """
-    share = np.nan_to_num(np.clip((highest - temperature) / COOLING_BAND, 0.0, 1.0), nan=1.0)
+    share = np.clip((highest - temperature) / COOLING_BAND, 0.0, 1.0)
     smooth = share * share * (3.0 - 2.0 * share)
     return robot.tension.bias + smooth * (robot.tension.max - robot.tension.bias)
 
@@ -93,6 +93,8 @@ class SafetyFilter:
     def shift(self, less: Array) -> None:
         """Take lengths that are less [m] (M,) from now on: the same muscles, another zero."""
         self._readings = deque((m._replace(length=m.length - less) for m in self._readings), 3)
+        if self.now is not None:
+            self.now = self.now._replace(length=self.now.length - less)
         if self.command is not None and self.command.kind == LENGTH:
             self.command = Command(LENGTH, self.command.value - less)
 

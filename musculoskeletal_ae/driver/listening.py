@@ -9,15 +9,14 @@ its sign, unit, zero and place in the array show, best while the arm is moved by
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections.abc import Iterator, Sequence
 from itertools import permutations
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.bags.check import misplaced_muscles
-from musculoskeletal_ae.bags.streams import Pairs
-from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
@@ -26,33 +25,45 @@ RATE_TOLERANCE = 0.2
 LONGEST_GAP = 0.2  # [s], the controller's `max_age`
 MOST_REPEATED = 0.2  # share of messages that say what the one before said, to the last digit
 TEMPERATURES = -20.0, 130.0  # [°C]
+BEYOND = 0.1, 1.0  # [m] that l may lie beyond what the routes allow, with and without known zeros
+BEYOND_JOINT = 0.3  # [rad]
 # How far the lengths of healthy arms are from the model's, as these see it, individuals 0–9 of both
 # shipped arms (`python -m bench driver_margins`): offset at most 42 mm, changes by 0.31 to 1.55 of
 # the model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
 ZERO_TOLERANCE = 0.045  # [m]
 SLOPES = 0.2, 2.2
-MISPLACED = 0.012  # [m]
+MISPLACED = 0.012  # [m] by which l follows the model worse than another muscle's, and this …
+BETTER = 2.5  # … many times worse
 MOVED = 0.04  # [m] of l from which its slope can be told
 MOST_SAMPLES = 400
-UNITS = {1000.0: 'mm', 100.0: 'cm'}
 
 
 class Listening:
     """Collects messages of a driver and judges them. Times are of one steady clock [s]."""
 
-    def __init__(self, robot: Robot, rate: float, posture: Array | None = None) -> None:
-        """Expect messages at a rate [Hz]; the arm is held at a posture [rad] (D,), if stated."""
-        self._robot, self._rate = robot, rate
-        self._theta, self._stated = posture, posture is not None
-        self._times: list[float] = []
-        self._states: list[Array] = []  # (3, M)
-        self._postures: list[Array] = []  # θ at each, NaN where it is not known, (D,)
-        self._rejected: Counter[str] = Counter()
-        self._examples: dict[str, str] = {}
-        postures = robot.random_postures(500, np.random.default_rng(0))
-        slack = np.zeros((500, robot.muscle_count))
-        spans = [robot.muscle_lengths(postures, slack + pull) for pull in (0.0, robot.tension.max)]
-        self._low, self._high = np.min(spans, axis=(0, 1)), np.max(spans, axis=(0, 1))
+    def __init__(
+        self, robot: Robot, rate: float, posture: Sequence[float] | None = None, zeroed: bool = True
+    ) -> None:
+        """Expect messages at a rate [Hz].
+
+        The arm is held at a posture [rad] (D,), if stated. If not `zeroed`, every l may be off by a
+        constant.
+        """
+        self._robot, self._rate, self._zeroed = robot, rate, zeroed
+        self._stated = posture is not None
+        self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
+        self._times: list[float] = []  # of all messages
+        self._read: list[tuple[Array, Array]] = []  # (3, M), and θ then or NaN (D,)
+        self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
+        theta = robot.random_postures(500, np.random.default_rng(0))
+        ones, most = np.ones(robot.muscle_count), robot.tension.max
+        pulls = np.zeros((500, 1)) * ones, np.tile(most, (500, 1))
+        spans = [robot.muscle_lengths(theta, pull) for pull in pulls]
+        low, high = np.min(spans, axis=(0, 1)), np.max(spans, axis=(0, 1))
+        beyond, (coldest, hottest) = BEYOND[not zeroed], TEMPERATURES
+        #: what values are possible, (3, M)
+        self._low = np.stack([low - beyond, -0.02 * most, coldest * ones])
+        self._high = np.stack([high + beyond, 1.1 * most, hottest * ones])
 
     @property
     def count(self) -> int:
@@ -65,11 +76,9 @@ class Listening:
         try:
             states = read_array(message, len(QUANTITIES), self._robot.muscle_count)
         except MessageError as error:
-            self._reject('muscle_states', error)
+            self._rejected.setdefault(('muscle_states', error.reason), []).append(error)
             return None
-        theta = np.full(self._robot.joint_count, math.nan) if self._theta is None else self._theta
-        self._states.append(states)
-        self._postures.append(theta)
+        self._read.append((states, self._theta))
         return states
 
     def joints(self, message: object) -> None:
@@ -77,209 +86,137 @@ class Listening:
         try:
             theta = read_posture(message, self._robot.joints)
         except MessageError as error:
-            self._reject('joint_states', error)
+            self._rejected.setdefault(('joint_states', error.reason), []).append(error)
         else:
-            if not self._stated:
-                self._theta = theta
-
-    def _reject(self, topic: str, error: MessageError) -> None:
-        self._rejected[f'{topic}: {error.reason}'] += 1
-        self._examples[f'{topic}: {error.reason}'] = str(error)
+            self._theta = self._theta if self._stated else theta
 
     def verdict(self) -> Verdict:
         """Judge what came."""
         verdict = Verdict(self._robot)
-        for reason, count in self._rejected.items():
-            topic, _, why = reason.partition(': ')
-            told = f'{topic}: {count} messages refused, {self._examples[reason]}'
-            check = 'rate' if why in ('not finite', 'empty') else 'order'
-            verdict.failed(check, (), told, _REMEDIES.get(why, 'doc/your_robot.md, the contract'))
+        for (topic, reason), errors in self._rejected.items():
+            told = f'{topic}: {len(errors)} messages refused, {errors[-1]}'
+            verdict.failed(reason if reason in FAULTS else 'refused', told=told)
         if not self.count:
-            verdict.failed(
-                'rate', (), 'no muscle_states came', 'publish them; see namespace and ROS_DOMAIN_ID'
-            )
-        else:
-            self._judge_rate(verdict)
-        if self._states:
-            states = np.array(self._states)
-            if self._judge_rows(verdict, np.median(states, axis=0)):
-                self._judge_lengths(verdict, states)
+            verdict.failed('silent')
+            return verdict
+        states, theta = map(np.array, zip(*self._read)) if self._read else (np.zeros(0),) * 2
+        self._judge_rate(verdict, states)
+        if len(states) and self._judge_values(verdict, np.median(states, axis=0)):
+            known = np.flatnonzero(np.isfinite(theta).all(axis=1))
+            if len(known):
+                few = np.linspace(0, len(known) - 1, min(len(known), MOST_SAMPLES)).astype(int)
+                self._judge_lengths(
+                    verdict, theta[known[few]], *states[known[few], :2].swapaxes(0, 1)
+                )
+            else:
+                verdict.notes.append(
+                    'sign, zero and order of l are not judged without θ: publish joint_states, or '
+                    'hold the arm still and state --posture'
+                )
         return verdict
 
-    def _judge_rate(self, verdict: Verdict) -> None:
+    def _judge_rate(self, verdict: Verdict, states: Array) -> None:
         gaps = np.diff(self._times)
         rate = len(gaps) / gaps.sum() if gaps.sum() > 0.0 else 0.0
-        seen = f'muscle_states came at {rate:.0f} Hz'
         if abs(rate / self._rate - 1.0) > RATE_TOLERANCE:
-            how = f'publish at {self._rate:g} Hz, or say the rate: --rate here, `rate` of the nodes'
-            verdict.failed('rate', (), seen, how)
+            verdict.failed('rate', rate=rate, wanted=self._rate)
         elif gaps.max(initial=0.0) > LONGEST_GAP:
-            how = 'read and publish in a loop of its own; nothing in it may wait'
-            verdict.failed('rate', (), f'{seen}, but nothing for {gaps.max():.2f} s', how)
-        if len(self._states) > 10:
-            # The rate at which messages come is not the rate at which modules are read.
-            states = np.array(self._states)[:, :2]  # a temperature may stand
-            same = states[1:] == states[:-1]
-            repeated = same.all(axis=(1, 2)).mean()
-            stuck: Bools = same.all(axis=(0, 1))
+            verdict.failed('gap', gap=gaps.max())
+        if len(states) > 10:
+            # The rate at which messages come is not the rate at which modules are read. (A
+            # temperature may stand.)
+            same: Bools = states[1:, :2] == states[:-1, :2]
+            repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
             if repeated > MOST_REPEATED:
-                how = 'publish each reading once, when it has been read'
-                told = f'{100 * repeated:.0f} % of the messages repeat the one before'
-                verdict.failed('rate', (), told, how)
+                verdict.failed('repeated', share=100.0 * repeated)
             elif stuck.any():
-                who = tuple(np.flatnonzero(stuck).tolist())
-                how = 'is this module read at all?'
-                verdict.failed('rate', who, 'the same reading in every message', how)
+                verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
         verdict.passed('rate')
 
-    def _plausible(self, states: Array) -> Bools:
-        length, tension, temperature = states
-        most = self._robot.tension.max
-        slack = 0.02 * most
-        return np.array(
-            [
-                (length >= self._low - 0.1) & (length <= self._high + 0.1),
-                (tension >= -slack) & (tension <= 1.1 * most),
-                np.isnan(temperature)
-                | (temperature > TEMPERATURES[0]) & (temperature < TEMPERATURES[1]),
-            ]
-        )
-
-    def _judge_rows(self, verdict: Verdict, states: Array) -> bool:
-        """Judge rows and units by what values are possible; say whether they are."""
-        plausible = self._plausible(states)
-        if plausible.all():
-            verdict.passed('unit')
-            if np.isnan(states[2]).any():
-                verdict.notes.append('no temperatures (NaN): nothing protects the motors from heat')
-            return True
-        rows = list(QUANTITIES)
-        kelvin = self._plausible(states - np.array([[0.0], [0.0], [273.15]]))
-        if kelvin.all():
-            verdict.failed('unit', (), 'temperatures look like K', 'publish °C')
-            return False
-        by_muscle = states.reshape(-1, 3).T  # as if muscle by muscle, read as row by row
-        if self._plausible(by_muscle).all():
-            told = 'the values of each muscle stand together'
-            verdict.failed('order', (), told, f'publish 3 rows: {", ".join(rows)}')
-            return False
-        for order in permutations(range(3)):
-            if order != (0, 1, 2) and self._plausible(states[list(order)]).all():
-                told = ', '.join(rows[order.index(i)] for i in range(3))
-                verdict.failed(
-                    'order', (), f'the rows look like {told}', f'publish {", ".join(rows)}'
-                )
-                return False
-        length, tension, temperature = states
-        for factor, unit in UNITS.items():
-            if (
-                not plausible[0].all()
-                and self._plausible(states / np.array([[factor], [1.0], [1.0]]))[0].all()
-            ):
-                verdict.failed('unit', (), f'lengths look like {unit}', 'publish m')
-                plausible[0] = True
-        for row, value, (low, high), unit, change in (
-            (0, length, (self._low, self._high), 'm', 'is it m, and zero at θ = 0?'),
-            (1, tension, (0.0, self._robot.tension.max), 'N', 'is it N, and does pull count as +?'),
-            (2, temperature, TEMPERATURES, '°C', 'is it °C? NaN where there is none'),
-        ):
-            for m in np.flatnonzero(~plausible[row]).tolist():
-                least, most = (np.broadcast_to(end, value.shape)[m] for end in (low, high))
-                told = f'{rows[row]} {value[m]:.4g} {unit}, possible {least:.3g} to {most:.3g}'
-                verdict.failed('unit', (m,), told, change)
+    def _judge_values(self, verdict: Verdict, states: Array) -> bool:
+        """Judge rows and units by what values are possible; say whether they are right."""
+        for what, seen, meant in _readings(states):
+            possible = (meant >= self._low) & (meant <= self._high)
+            possible[2] |= np.isnan(meant[2])
+            if possible.all():
+                if what:
+                    verdict.failed(what, **seen)
+                    return False
+                verdict.passed('unit')
+                if np.isnan(states[2]).any():
+                    told = 'no temperatures (NaN): nothing protects the motors from heat'
+                    verdict.notes.append(told)
+                return True
+        for row, m in np.argwhere(~possible).tolist():
+            span = f'{self._low[row, m]:.3g} to {self._high[row, m]:.3g}'
+            verdict.failed(QUANTITIES[row], m, seen=f'{states[row, m]:.4g}, possible {span},')
         return False
 
-    def _judge_lengths(self, verdict: Verdict, states: Array) -> None:
-        robot, theta = self._robot, np.array(self._postures)
-        known = np.isfinite(theta).all(axis=1)
-        if not known.any():
-            verdict.notes.append(
-                'sign, zero and order of l are not judged without θ: publish joint_states, or hold '
-                'the arm still and state --posture'
-            )
-            return
-        chosen = np.flatnonzero(known)
-        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_SAMPLES)).astype(int)]
-        theta, (length, tension) = theta[chosen], np.moveaxis(states[chosen, :2], 1, 0)
+    def _judge_lengths(self, verdict: Verdict, theta: Array, length: Array, tension: Array) -> None:
+        """Judge l beside the model at θ (N, D), l and T (N, M)."""
+        robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
-        if beyond.max() > 0.3:
+        if beyond.max() > BEYOND_JOINT:
             j = int(beyond.argmax())
-            told = f'joint {robot.joints[j]} reads {theta[0, j]:.3g} rad, {beyond[j]:.2g} beyond'
-            verdict.failed(
-                'unit', (), f'{told} its limits', 'is it rad, with the zero of the URDF?'
-            )
+            verdict.failed('joint', name=robot.joints[j], theta=theta[0, j], beyond=beyond[j])
             return
         model = robot.muscle_lengths(theta, tension)
-        moved = np.ptp(model, axis=0) > MOVED
+        moved: Bools = np.ptp(model, axis=0) > MOVED
+
+        def misfit(error: Array) -> Array:
+            # A zero that is wrong says nothing of a moved arm's order, all there is of one at rest.
+            spread: Array = error.std(axis=0) if moved.any() else np.abs(np.median(error, axis=0))
+            return spread
+
+        fit = np.array([misfit(column[:, None] - model) for column in length.T])
         if not moved.any():
             verdict.notes.append('sign and order show better while the arm is moved by hand')
-        if moved.any():
-            pairs = Pairs(np.array(self._times)[chosen], theta, length, tension)
-            others = dict(misplaced_muscles(pairs, robot))
-        else:
-            others = _exchanged(robot, length, model)
-        for m, name in enumerate(robot.muscles):
-            other = others.get(name, '')
-            if moved.any() and not (moved[m] and (length - model)[:, m].std() > MISPLACED):
-                other = ''
-            if other:  # or is it this one, with the wrong sign?
-                like = length[:, m] - model[:, robot.muscles.index(other)]
-                if _spread(length[:, m] + model[:, m], moved[m]) < _spread(like, moved[m]):
-                    other = ''
-            self._judge_length(verdict, m, length[:, m], model[:, m], other)
-
-    def _judge_length(
-        self, verdict: Verdict, m: int, length: Array, model: Array, other: str
-    ) -> None:
-        """Judge l of one muscle beside what the model says, (N,), and whom it behaves like."""
-        off = float(np.median(length - model))
-        slope = math.nan
-        if np.ptp(model) > MOVED:
-            slope = float(np.cov(length, model)[0, 1] / model.var(ddof=1))
-            told = f'l changes by {slope:.2f} of what the routes say'
-        elif abs(off) > ZERO_TOLERANCE and abs(np.median(length + model)) < 0.3 * abs(off):
-            slope, told = -1.0, f'l is {np.median(length):+.3f} m, the routes say {model[0]:+.3f}'
-        if other:
-            told = f'it behaves like {other}'
-            verdict.failed('order', (m,), told, 'publish muscles in the order of muscles.yaml')
-            return
-        if -SLOPES[1] < slope < -SLOPES[0]:  # (a slope that is not known is NaN)
-            verdict.failed('sign', (m,), told, 'l must fall when the motor winds in')
-            return
-        if slope == slope and not SLOPES[0] < slope < SLOPES[1]:
-            how = 'check the radius of the spool, the counts of its encoder, and the route'
-            verdict.failed('unit', (m,), told, how)
-            return
-        for check in ('order', 'sign') if slope == slope else ():
-            verdict.passed(check, m)
-        if abs(off) > ZERO_TOLERANCE:
-            told = f'l is {1e3 * off:+.0f} mm from what the routes say at this posture and tension'
-            how = 'l must be 0 at θ = 0 without tension: subtract this, or call estimator/zero'
-            verdict.failed('zero', (m,), told, how)
-        else:
-            verdict.passed('zero', m)
+            fit = np.maximum(fit, fit.T)  # of an arm at rest only exchanges are told
+        _, best = linear_sum_assignment(fit)
+        inverse = misfit(length + model)
+        for m, other in enumerate(best.tolist()):
+            off = float(np.median((length - model)[:, m]))
+            follows = (
+                other == m or fit[m, m] <= BETTER * fit[m, other] or inverse[m] < fit[m, other]
+            )
+            if moved.any():
+                follows |= not moved[m] or fit[m, m] <= MISPLACED
+            else:
+                follows |= not self._zeroed or fit[m, m] <= ZERO_TOLERANCE
+            if not follows:
+                verdict.failed('place', m, other=robot.muscles[other])
+                continue
+            if moved[m]:
+                slope = np.cov(length[:, m], model[:, m])[0, 1] / model[:, m].var(ddof=1)
+                told = f'l changes by {slope:.2f} of what the routes say'
+                if not SLOPES[0] < slope < SLOPES[1]:
+                    inverted = SLOPES[0] < -slope < SLOPES[1]
+                    verdict.failed('sign' if inverted else 'slope', m, told=told)
+                    continue
+                verdict.passed('order', m)
+                verdict.passed('sign', m)
+            if not self._zeroed:
+                continue
+            if abs(off) <= ZERO_TOLERANCE:
+                verdict.passed('zero', m)
+            elif not moved.any() and inverse[m] < 0.3 * abs(off):
+                at = f'l is {np.median(length[:, m]):+.3f} m, the routes say {model[0, m]:+.3f}'
+                verdict.failed('sign', m, told=at)
+            else:
+                verdict.failed('zero', m, off=1e3 * off)
 
 
-def _spread(error: Array, moved: bool) -> float:
-    return float(error.std() if moved else abs(np.median(error)))
+def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
+    """Yield what may have been meant by l, T, temperature (3, M): first what they say.
 
-
-def _exchanged(robot: Robot, length: Array, model: Array) -> dict[str, str]:
-    """Return muscles of a resting arm whose l fit where they are exchanged, and not as they are."""
-    at, routes = np.median(length, axis=0), np.median(model, axis=0)
-    off = np.abs(at[:, None] - routes)
-    swapped = np.maximum(off, off.T)
-    return {
-        robot.muscles[i]: robot.muscles[j]
-        for i in range(len(at))
-        for j in [int(swapped[i].argmin())]
-        if min(off[i, i], off[j, j]) > ZERO_TOLERANCE and swapped[i, j] < 0.4 * off[i, i]
-    }
-
-
-_REMEDIES = {
-    'not finite': 'publish no NaN or infinity (but for temperatures that are not measured: NaN)',
-    'missing joint': 'name the joints as muscles.yaml does; those are all wanted',
-    'wrong length': 'publish 3×M values: row length, row tension, row temperature',
-    'wrong layout': "layout.dim is ('quantity', 3, 3M), ('muscle', M, M), or empty",
-}
+    With the fault that it would be, and what that names.
+    """
+    yield '', {}, states
+    yield 'kelvin', {}, states - np.array([[0.0], [0.0], [273.15]])
+    yield 'by muscle', {}, states.reshape(-1, 3).T
+    for order in map(list, permutations(range(3))):
+        rows = ', '.join(QUANTITIES[order.index(i)] for i in range(3))
+        yield 'rows', {'rows': rows}, states[order]
+    for unit, factor in (('mm', 1e-3), ('cm', 1e-2)):
+        yield 'length unit', {'unit': unit}, states * np.array([[factor], [1.0], [1.0]])
+    yield '', {}, states

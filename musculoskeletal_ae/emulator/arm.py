@@ -80,6 +80,7 @@ class EmulatedArm:
             self.individual.length_bias.copy(),
             self.faults.stuck,
             self.faults.slack,
+            self.faults.zero,
             self.faults.hot,
         )
         tree_joints = self.individual.tree.parent.shape[0]
@@ -269,7 +270,7 @@ class EmulatedArm:
         # A cut wire pulls on no sensor, and a tension unit does not read below zero.
         tension = np.where(muscle.ruptured > 0.0, 0.0, tension)
         noisy = self._noisy(tension, TENSION_NOISE, TENSION_RESOLUTION)
-        length = muscle.length + self._command.length_error
+        length = muscle.length + self._command.length_error + self._command.zero
         readings = Readings(
             self._noisy(self.theta, ANGLE_NOISE, ANGLE_RESOLUTION),
             self._noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION),

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.emulator.mechanics import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES
@@ -43,6 +44,8 @@ KINDS = {
     'spike': Kind('sensors are off now and then', *SIZES['length'], of_quantity=True),
     'bias': Kind('sensors are off', *SIZES['length'], of_quantity=True),
     'stuck_motor': Kind('motors stand'),
+    'winch_speed': Kind('motors are slower', 0.009, SPEED_LIMIT, 'm/s'),
+    'unzeroed': Kind('lengths are off by 0.4 to 1 times this', 0.13, 1.0, 'm'),
     'slack_wire': Kind('wires are longer', 0.05, 1.0, 'm'),
     'overheating': Kind('modules are hot', 90.0, 1e3, '°C'),
 }
@@ -109,9 +112,11 @@ class Faults:
         self._frozen: dict[tuple[str, int], float] = {}
         self._held: Readings | None = None  # to come after the next one
         self._queue: list[tuple[float, Readings]] = []
-        # What the mechanics follows, each (M,): 1 where the motor stands, wire too long [m],
-        # and the least temperature of the housing [°C].
-        self.stuck, self.slack, self.hot = np.zeros((3, robot.muscle_count))
+        # What the mechanics follows, each (M,): share of its speed that a motor lacks, wire too
+        # long [m], length read too long [m], and the least temperature of the housing [°C].
+        self.stuck, self.slack, self.zero, self.hot = np.zeros((4, robot.muscle_count))
+        self._forgotten = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
+        self._forgotten = np.where(self._forgotten[1] < 0.7, -1.0, 1.0) * self._forgotten[0]
         self.set([])
 
     def set(self, lines: Iterable[str]) -> None:
@@ -122,11 +127,16 @@ class Faults:
         """
         self._faults = tuple(read_fault(line, self._robot) for line in lines)
         self._frozen.clear()
-        for state, name in ((self.stuck, 'stuck_motor'), (self.slack, 'slack_wire')):
-            state[:] = 0.0
-            for fault in self._of(name):
-                state[fault.muscles] = fault.size or 1.0
+        self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:] = -np.inf
+        for fault in self._of('winch_speed'):
+            self.stuck[fault.muscles] = 1.0 - fault.size / SPEED_LIMIT
+        for fault in self._of('stuck_motor'):
+            self.stuck[fault.muscles] = 1.0
+        for fault in self._of('slack_wire'):
+            self.slack[fault.muscles] = fault.size
+        for fault in self._of('unzeroed'):
+            self.zero[fault.muscles] = fault.size * self._forgotten[fault.muscles]
         for fault in self._of('overheating'):
             self.hot[fault.muscles] = fault.size
 

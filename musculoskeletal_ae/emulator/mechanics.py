@@ -76,8 +76,9 @@ class Command(NamedTuple):
 
     value: Array  # target lengths [m] or tensions [N]
     length_error: Array  # reading of the length sensor minus the true l [m]
-    stuck: Array  # 1 where the motor stands
+    stuck: Array  # share of its speed that the motor lacks
     slack: Array  # by how much the wire is too long [m]
+    zero: Array  # by how much more the length sensor is off [m]
     hot: Array  # least temperature of the housing [°C]
 
 
@@ -225,7 +226,7 @@ def _wires_and_modules(
     for m in range(absolute.shape[0]):
         route = absolute[m] - body.length_at_zero[m]
         before = muscle.length[m]
-        reading = before + command.length_error[m]
+        reading = before + command.length_error[m] + command.zero[m]
         muscle.reference[m] = module_reference(
             kind, command.value[m], reading, muscle.reference[m], body, m
         )
@@ -234,8 +235,8 @@ def _wires_and_modules(
         else:
             pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
             speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
-            speed = min(SPEED_LIMIT, max(-SPEED_LIMIT, speed))
-        speed *= 1.0 - command.stuck[m]
+        most = SPEED_LIMIT * (1.0 - command.stuck[m])
+        speed = min(most, max(-most, speed))
         after = min(body.length_high[m], max(body.length_low[m], before + STEP * speed))
         muscle.length[m] = after
         slid = before - after

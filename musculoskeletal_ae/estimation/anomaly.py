@@ -38,9 +38,8 @@ DISTANCE = 'distance'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-#: the threshold grows by SLOPE of itself for each FAR of distance beyond NEAR, up to WIDEST times;
-#: distances are shares of the joint ranges (`python -m bench unfamiliar`: what healthy arms need)
-NEAR, FAR, SLOPE, WIDEST = 0.25, 0.1, 0.5, 3.0
+#: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
+NEAR, WIDEST = 0.25, 3.0
 
 
 class Verdict(NamedTuple):
@@ -119,13 +118,12 @@ class AnomalyDetector:
         return Verdict(size, distance, suspect, cause)
 
     def unfamiliar(self, theta: Array) -> float:
-        """Return how far θ [rad] (D,) is beyond NEAR from every calibrated posture, in FARs."""
+        """Return how far θ [rad] (D,) is from all calibrated postures, over NEAR; 1: unfamiliar."""
         known = None if self._statistics is None else self._statistics.postures
         if known is None or not len(known):
             return 0.0
         share = (known - theta) / (self._robot.upper - self._robot.lower)
-        nearest = float(np.sqrt(np.square(share).sum(axis=1).min()))
-        return max(0.0, (nearest - NEAR) / FAR)
+        return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
@@ -136,8 +134,8 @@ class AnomalyDetector:
                 return ''
             limit = self._statistics.thresholds.get(DISTANCE, np.inf)
             value, what = distance, 'd'
-            if value > limit and not slack.any() and (far := self.unfamiliar(theta)) > 0.0:
-                limit, where = limit * min(WIDEST, 1.0 + SLOPE * far), ' in an unfamiliar posture'
+            if value > limit and not slack.any() and (far := self.unfamiliar(theta)) > 1.0:
+                limit, where = limit * min(WIDEST, far), ' in an unfamiliar posture'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''

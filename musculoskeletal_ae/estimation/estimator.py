@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros, no_offset
+from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -101,7 +101,7 @@ class Estimator:
         self.check_posture(posture)
         robot = self._robot
         self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
-        self.zeros = Zeros(np.zeros(robot.muscle_count), np.full(robot.muscle_count, UNKNOWN))
+        self.zeros = Zeros.unknown(robot.muscle_count)
         self.detector.judges, self._verdict = False, None
         self.reset()
 
@@ -191,7 +191,7 @@ class Estimator:
             zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
             values['length zeros'] = ', '.join(f'{n} {o:.1f} ± {d:.1f} mm' for n, o, d in zeros)
         far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
-        values['posture'] = f'unfamiliar ({far:.1f})' if far > 0.0 else 'familiar'
+        values['posture'] = f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'
         if self.cause:
             return Report('error', f'anomaly detected: {self.cause}', values)
         if now - self._stepped_at > SILENCE:

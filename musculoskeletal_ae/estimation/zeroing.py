@@ -29,17 +29,17 @@ WINDOW = 0.25  # [s] that one moment averages
 MOVED = 0.002  # [m] of some muscle since the last moment that counts
 FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small beside the weight
 #: [s] of gentle motion that are enough with joint angles and without, and of a stated posture
-ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 43.0, 1.0
+ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 38.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
 MOST = 240  # moments
 
 LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
 WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best and least
-#: μ of a wire, with its mean; Coulomb torque of a joint over the largest that the weight needs
-FRICTION_MEAN, FRICTION, JOINT_FRICTION = 0.05, 0.05, 0.03
+FRICTION = 0.05  # μ of a wire, give or take as much
+JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest that the weight needs
 TENSION_ZERO = 1.5  # [N] of a tension sensor, in which its gain's error hides
-AT_STOP = 0.03  # [rad] from a joint limit, where its stop may bear torque
 STICKING = 0.003  # [rad] that turn a joint's friction round
+AT_STOP = 0.03  # [rad] from a joint limit, where its stop may bear torque
 OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] beyond the joint limits
 FREEDOM = 4.0  # of the Student distribution
 #: postures drawn and tried as the first one, moments that tell how good they are, and those pursued
@@ -47,7 +47,7 @@ DRAWN, POSTURES, TOLD_BY, SHORTLIST, PURSUED = 3200, 400, 24, 30, 6
 COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or much in that choice
 FARTHEST = 0.3  # [m] of a zero; [rad] of a step
 ROUNDS, FIRST_ROUNDS = 20, 6
-STEP = 1e-3  # [rad] of differences
+STEP = 1e-3  # of differences
 #: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which zeros are
 #: not found but guessed wrong: right ones leave 0.3 mm and cost 0.2–0.5, of a wrong posture 1.1
 LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
@@ -65,6 +65,11 @@ class Zeros(NamedTuple):
     def known(self) -> bool:
         """Whether lengths can be relied on."""
         return bool(self.deviation.max() < KNOWN)
+
+    @staticmethod
+    def unknown(muscles: int) -> Zeros:
+        """Return the zeros of sensors of which nothing is known."""
+        return Zeros(np.zeros(muscles), np.full(muscles, UNKNOWN))
 
 
 def no_offset(muscles: int) -> Zeros:
@@ -94,13 +99,7 @@ class Fit(NamedTuple):
     theta: Array  # postures [rad], (K, D)
 
 
-class Linear(NamedTuple):
-    """Residuals of K moments, lengths and then torques, each in its noise; and their slopes."""
-
-    value: Array  # (K, M + D)
-    outside: Array  # beyond the joint limits, (K, D)
-    by_theta: Array  # (K, M + D, D)
-    by_constants: Array  # (K, M + D, 3M + D)
+Fitting = Generator[None, None, Fit]  # yields between short pieces of work
 
 
 class Zeroing:
@@ -111,19 +110,22 @@ class Zeroing:
         self._robot, self._mae, self._posture = robot, mae, posture
         self._rng = np.random.default_rng([seed, 0x2E])
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, ...]] = []  # rows of Moments
+        self._window: list[tuple[Array, Array, Array]] = []  # T, l, s
+        self._angles: list[Array] = []  # θ in the same time, where measured
         self._moments: list[tuple[Array, ...]] = []
-        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng)))
-        counts = *(3 * [robot.muscle_count]), robot.joint_count
-        self._mean = np.repeat([0.0, FRICTION_MEAN, 0.0, 0.0], counts)
-        spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight.max()
+        muscles, joints = robot.muscle_count, robot.joint_count
+        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng))).max()
+        counts = muscles, muscles, muscles, joints
+        self._mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)  # of the constants, beforehand
+        spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight
         self._spread = np.repeat(spread, counts)
-        noise = LENGTH_NOISE * _worse(mae), np.full(robot.joint_count, TORQUE_NOISE)
-        self._noise = np.concatenate(noise)  # of the residuals, (M + D,)
-        self._before: Array = np.zeros(robot.muscle_count)  # l_read of the last moment that moved
+        noise = LENGTH_NOISE * _worse(mae), np.repeat([TORQUE_NOISE, OUTSIDE], joints)
+        self._noise = np.concatenate(noise)  # of the residuals, (M + 2D,)
+        self._before: Array = np.zeros(muscles)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
-        self._work: Generator[None, None, Fit] | None = None
-        self._fit: Fit | None = None  # the best so far
+        self._work: Generator[None, None, tuple[Fit, Moments]] | None = None
+        self._fit: Fit | None = None  # the best so far, and whether joint sensors told it
+        self._sees = False
         self.zeros: Zeros | None = None  # the guess so far, known or not; None before the first
         self.trouble = ''
 
@@ -135,15 +137,14 @@ class Zeroing:
     @property
     def enough(self) -> float:
         """Seconds of gentle motion that it takes, or of standing still where the arm is said to."""
-        if self._posture is not None:
+        if self.stands:
             return STANDING
-        sees = bool(self._moments) and not np.isnan(self._moments[-1][-1]).any()
-        return ENOUGH_SEEN if sees else ENOUGH
+        return ENOUGH_SEEN if self._sees else ENOUGH
 
     @property
     def progress(self) -> str:
         """How far it is, and what is in its way."""
-        how = 'of standing still' if self._posture is not None else 'of gentle motion'
+        how = 'of standing still' if self.stands else 'of gentle motion'
         told = f'{self.moving:.0f} of {self.enough:.0f} s {how}'
         return f'{told}; {self.trouble}' if self.trouble else told
 
@@ -156,132 +157,119 @@ class Zeroing:
         """Take T [N] and readings of l [m] (M,), dt [s] after the last, and θ (D,) if measured."""
         if self.done or (self.stands and self.trouble):
             return
-        known = self._posture if self._posture is not None else theta
-        unknown = np.full(self._robot.joint_count, np.nan)
-        direction = self._direction.step(length, dt)
-        self._window.append((tension, length, direction, unknown if known is None else known))
+        known = self._posture if self.stands else theta
+        self._window.append((tension, length, self._direction.step(length, dt)))
+        self._angles += [] if known is None else [known]
         self._span += dt
         self._since += dt
         if self._span >= WINDOW:
-            self._take(*(np.mean(part, axis=0) for part in zip(*self._window)))
-            self._window, self._span = [], 0.0
+            unknown = [np.full(self._robot.joint_count, np.nan)]
+            parts = *zip(*self._window), self._angles or unknown
+            self._take(*(np.mean(part, axis=0) for part in parts))
+            self._window, self._angles, self._span = [], [], 0.0
         if self._work is not None:
             try:
                 next(self._work)
             except StopIteration as ended:
                 self._work = None
-                self._judge(ended.value)
+                self._judge(*ended.value)
         elif self._since >= (AGAIN if self._fit and not self.stands else FIRST) and self._moments:
             self._since = 0.0
-            seen = self._seen()
-            if np.isnan(seen.theta).any():
+            seen = Moments(*map(np.array, zip(*self._moments)))
+            told = np.flatnonzero(~np.isnan(seen.theta).any(axis=1))
+            self._sees = 2 * len(told) > len(seen.theta)
+            if not self._sees:
                 self._work = self._search(seen)
             else:  # with the angles known, zeros are what is left
+                seen = seen.some(told)
                 left = seen.length - self._mae.lengths(seen.theta, seen.tension)
-                offset = left.mean(axis=0)
-                constants = np.concatenate([offset, self._mean[len(offset) :]])
-                self._judge(Fit(0.0, constants, seen.theta))
-
-    def _seen(self, count: int | None = None) -> Moments:
-        return Moments(*map(np.array, zip(*self._moments[:count])))
+                constants = np.concatenate([left.mean(axis=0), self._mean[len(tension) :]])
+                self._judge(Fit(0.0, constants, seen.theta), seen)
 
     def _take(self, *moment: Array) -> None:
-        length = moment[1]
-        if self._moments:
-            before = self._moments[0][1] if self.stands else self._before
-            gone = np.abs(length - before).max()
-            if self.stands and gone > MOVED:
-                self.trouble = (
-                    'it moved away from there; let it stand and call estimator/zero again'
-                )
-                return
-            if not self.stands and gone < MOVED:
-                return
+        length, first = moment[1], not self._moments
+        gone = 0.0 if first else float(np.abs(length - self._before).max())
+        if self.stands and gone > MOVED:
+            self.trouble = 'it moved away from there; let it stand and call estimator/zero again'
+            return
+        if not (self.stands or first) and gone < MOVED:
+            return
+        if first or not self.stands:
             self._before = length
-            if not self.stands and gone > FASTEST * WINDOW:
-                return
-            self.moving += WINDOW
-        self._before = length
-        if len(self._moments) >= MOST:
-            del self._moments[0]
-        self._moments.append(moment)
+        if self.stands or gone <= FASTEST * WINDOW:
+            self.moving += 0.0 if first else WINDOW
+            self._moments = [*self._moments[1 - MOST :], moment]
 
-    def _judge(self, fit: Fit) -> None:
+    def _judge(self, fit: Fit, seen: Moments) -> None:
         """Take a fit as the guess, or as known when it rests on enough and explains that."""
-        seen, offset = self._seen(len(fit.theta)), fit.constants[: self._robot.muscle_count]
-        left = np.abs(seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
-        self._fit, self.trouble = fit, ''
-        enough = self.moving >= self.enough
-        if enough and (bad := float(np.median(left, axis=0).max())) > LARGEST_LEFT:
-            name = self._robot.muscles[int(np.median(left, axis=0).argmax())]
-            self.trouble = f'{1e3 * bad:.1f} mm of {name} are left unexplained'
-        elif enough and (cost := fit.cost / len(left) / len(self._noise)) > LARGEST_COST:
-            # Found without angles: another posture may look alike.
-            self.trouble = f'lengths and tensions do not agree yet: {cost:.2f} of {LARGEST_COST:g}'
-        deviation = np.full(len(offset), UNKNOWN)
-        if enough and not self.trouble:
-            deviation = 1.48 * np.median(left, axis=0) / np.sqrt(max(1.0, len(left) / 10.0))
+        count, muscles = len(fit.theta), self._robot.muscle_count
+        offset = fit.constants[:muscles]
+        left = seen.length - offset - self._mae.lengths(fit.theta, seen.tension)
+        typical = np.median(np.abs(left), axis=0)
+        cost = fit.cost / (count * (len(self._noise) - self._robot.joint_count))
+        self._fit, self.trouble, deviation = fit, '', np.full(muscles, UNKNOWN)
+        if self.moving >= self.enough:
+            if typical.max() > LARGEST_LEFT:
+                name = self._robot.muscles[int(typical.argmax())]
+                self.trouble = f'{1e3 * typical.max():.1f} mm of {name} are left unexplained'
+            elif cost > LARGEST_COST:  # found without angles: another posture may look alike
+                self.trouble = f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
+            else:
+                deviation = 1.48 * typical / np.sqrt(max(1.0, count / 10.0))
         self.zeros = Zeros(offset, deviation)
 
     # -- without joint angles -------------------------------------------------------------------
 
-    def _search(self, seen: Moments) -> Generator[None, None, Fit]:
-        """Find what explains the moments; yields between its parts."""
-        guesses = yield from self._guesses(seen)
-        likeliest = yield from self._best(guesses, seen.some(_spaced(seen)), FIRST_ROUNDS)
+    def _search(self, seen: Moments) -> Generator[None, None, tuple[Fit, Moments]]:
+        """Find what explains the moments."""
+        few = seen.some(np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(np.int64)))
+        guesses = yield from self._guesses(seen, few)
+        likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
         # Few moments may be mistaken: all of them choose between the newest guess and the last.
         last = [] if self._fit is None else [self._fit.constants]
-        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS))
+        return (yield from self._best([likeliest.constants, *last], seen, ROUNDS)), seen
 
-    def _best(self, guesses: list[Array], seen: Moments, rounds: int) -> Generator[None, None, Fit]:
-        """Return the best of the fits near each guess."""
-        best = yield from self._refine(self._start(guesses[0], seen), seen, rounds)
-        for constants in guesses[1:]:
-            fit = yield from self._refine(self._start(constants, seen), seen, rounds)
-            best = min(best, fit, key=lambda one: one.cost)
-        return best
+    def _best(self, guesses: list[Array], seen: Moments, rounds: int) -> Fitting:
+        """Return the best of the fits near each guess of the constants."""
+        fits, (low, high) = [], (self._robot.lower, self._robot.upper)
+        for constants in guesses:
+            length = seen.length - constants[: self._robot.muscle_count]
+            theta = np.clip(self._mae.estimate(seen.tension, length).theta, low, high)
+            fits.append((yield from self._refine(Fit(np.inf, constants, theta), seen, rounds)))
+        return min(fits, key=lambda fit: fit.cost)
 
-    def _start(self, constants: Array, seen: Moments) -> Fit:
-        length = seen.length - constants[: seen.length.shape[1]]
-        theta = self._mae.estimate(seen.tension, length).theta
-        return Fit(np.inf, constants, np.clip(theta, self._robot.lower, self._robot.upper))
-
-    def _guesses(self, seen: Moments) -> Generator[None, None, list[Array]]:
+    def _guesses(self, seen: Moments, few: Moments) -> Generator[None, None, list[Array]]:
         """Return constants with the zeros of the likeliest of many random first postures."""
-        robot, mae, muscles = self._robot, self._mae, self._robot.muscle_count
+        mae, pull = self._mae, np.tile(seen.tension[0], (POSTURES, 1))
         # The weight tells most postures from the first one before lengths say anything.
         drawn, size = [], []
         for _ in range(DRAWN // POSTURES):
-            drawn.append(robot.random_postures(POSTURES, self._rng))
-            pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
+            drawn.append(self._robot.random_postures(POSTURES, self._rng))
             size.append(np.linalg.norm(self._torque(drawn[-1], pull)[0], axis=1))
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(size))[:POSTURES]]
-        pull = np.broadcast_to(seen.tension[0], (POSTURES, muscles))
         offset = seen.length[0] - mae.lengths(first, pull)
         largest = np.abs(offset).max(axis=1)
         offset = offset[np.argsort(largest)[: max(PURSUED, int((largest < FARTHEST).sum()))]]
-        part = seen.some(_spaced(seen))
         cost, postures = np.empty(len(offset)), []
         for n, zero in enumerate(offset):
-            theta = mae.estimate(part.tension, part.length - zero).theta
-            postures.append(theta)
-            left = part.length - zero - mae.lengths(theta, part.tension)
+            theta = mae.estimate(few.tension, few.length - zero).theta
+            left = few.length - zero - mae.lengths(theta, few.tension)
             parts = left / COARSE[0], self._outside(theta) / COARSE[2]
             cost[n] = sum(np.log1p(each**2).sum() for each in parts)
-            if n % 40 == 39:
+            postures.append(theta)
+            if n % 20 == 19:
                 yield
         order = np.argsort(cost)[:SHORTLIST]
         for n in order:
-            torque = self._torque(postures[n], part.tension)[0] / COARSE[1]
+            torque = self._torque(postures[n], few.tension)[0] / COARSE[1]
             cost[n] += np.log1p(torque**2).sum()
             yield
         best = order[np.argsort(cost[order])][:PURSUED]
-        return [np.concatenate([offset[n], self._mean[muscles:]]) for n in best]
+        return [np.concatenate([offset[n], self._mean[len(offset[n]) :]]) for n in best]
 
     def _outside(self, theta: Array) -> Array:
-        robot = self._robot
-        return np.maximum(theta - robot.upper, 0.0) + np.minimum(theta - robot.lower, 0.0)
+        return theta - np.clip(theta, self._robot.lower, self._robot.upper)
 
     def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return what torque is not balanced [N·m] (K, D), and G (K, M, D)."""
@@ -289,64 +277,66 @@ class Zeroing:
         pull = np.einsum('kmd,km->kd', jacobian, tension)
         return self._robot.kinematics.holding_torque(theta) + pull, jacobian
 
-    def _residuals(self, fit: Fit, seen: Moments, turning: Array, slopes: bool = False) -> Linear:
-        """Return residuals, with slopes only if asked; `turning` is which way joints turned."""
-        muscles, joints = self._robot.muscle_count, self._robot.joint_count
+    def _residuals(
+        self, fit: Fit, seen: Moments, turning: Array, slopes: bool = False
+    ) -> tuple[Array, ...]:
+        """Return lengths, torques and angles outside that are left, in their noise (K, M + 2D).
+
+        `turning` is which way joints turned last; `slopes`: derivatives by θ and constants too.
+        """
+        theta, muscles, joints = fit.theta, self._robot.muscle_count, self._robot.joint_count
         ends = [muscles, 2 * muscles, 3 * muscles]
         offset, friction, zero, sticking = np.split(fit.constants, ends)
         passed = np.exp(-friction * seen.direction)  # from the motor to the elastic unit
         end, pull = seen.tension * passed, (seen.tension - zero) * passed
-        length = self._mae.lengths(fit.theta, end)
-        torque, jacobian = self._torque(fit.theta, pull)
-        left = np.concatenate([seen.length - offset - length, torque + sticking * turning], axis=1)
+        length, outside = self._mae.lengths(theta, end), self._outside(theta)
+        unheld, jacobian = self._torque(theta, pull)
+        torque = unheld + sticking * turning
         # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
         low, high = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
-        free = ((low < fit.theta) & (fit.theta < high)).astype(float)
-        left[:, muscles:] = np.where(free > 0.0, left[:, muscles:], TORQUE_NOISE)
-        noise = self._noise
-        outside = self._outside(fit.theta) / OUTSIDE
+        free = (low < theta) & (theta < high)
+        left = [seen.length - offset - length, np.where(free, torque, TORQUE_NOISE), outside]
+        value = np.concatenate(left, axis=1) / self._noise
         if not slopes:
-            return Linear(left / noise, outside, left, left)
-        turned = [self._torque(fit.theta + STEP * row, pull)[0] for row in np.eye(joints)]
-        slope = (np.stack(turned, axis=-1) - torque[..., None]) / STEP
-        by_theta = np.concatenate([-jacobian, slope * free[..., None]], axis=1)
-        by = np.zeros((len(left), muscles + joints, len(fit.constants)))
+            return (value,)
+        turned = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
+        slope = (np.stack(turned, axis=-1) - unheld[..., None]) / STEP * free[..., None]
+        beyond = (outside != 0.0)[..., None] * np.eye(joints)
+        by_theta = np.concatenate([-jacobian, slope, beyond], axis=1)
+        by_constants = np.zeros((*value.shape, len(fit.constants)))
         m, j = np.arange(muscles), np.arange(joints)
-        by[:, m, m] = -1.0
-        rubbed = self._mae.lengths(fit.theta, end * np.exp(-STEP * seen.direction))
-        by[:, m, muscles + m] = (length - rubbed) / STEP
-        by[:, muscles:, muscles : 2 * muscles] = -np.swapaxes(
-            jacobian * (pull * seen.direction)[..., None], 1, 2
-        )
-        by[:, muscles:, 2 * muscles : 3 * muscles] = -np.swapaxes(
-            jacobian * passed[..., None], 1, 2
-        )
-        by[:, muscles + j, 3 * muscles + j] = turning
-        by[:, muscles:] *= free[..., None]
-        return Linear(left / noise, outside, by_theta / noise[:, None], by / noise[:, None])
+        by_constants[:, m, m] = -1.0
+        rubbed = self._mae.lengths(theta, end * np.exp(-STEP * seen.direction))
+        by_constants[:, m, muscles + m] = (length - rubbed) / STEP
+        arm = -np.swapaxes(jacobian, 1, 2) * free[..., None]
+        by_constants[:, muscles:-joints, m + muscles] = arm * (pull * seen.direction)[:, None]
+        by_constants[:, muscles:-joints, m + 2 * muscles] = arm * passed[:, None]
+        by_constants[:, muscles + j, 3 * muscles + j] = turning * free
+        return value, by_theta / self._noise[:, None], by_constants / self._noise[:, None]
 
-    def _cost(self, left: Linear, constants: Array) -> float:
-        student = (FREEDOM + 1.0) * np.log1p(left.value**2 / FREEDOM).sum()
+    def _cost(self, value: Array, constants: Array) -> float:
+        noisy, outside = np.split(value, [-self._robot.joint_count], axis=1)
+        student = (FREEDOM + 1.0) * np.log1p(noisy**2 / FREEDOM).sum()
         prior = np.square((constants - self._mean) / self._spread).sum()
-        return float(student + np.square(left.outside).sum() + prior)
+        return float(student + np.square(outside).sum() + prior)
 
-    def _refine(self, fit: Fit, seen: Moments, rounds: int = ROUNDS) -> Generator[None, None, Fit]:
+    def _refine(self, fit: Fit, seen: Moments, rounds: int) -> Fitting:
         """Return the best fit near one, after so many Gauss–Newton steps at most."""
-        eye, own_eye = np.eye(self._robot.joint_count), np.eye(len(fit.constants))
-        damping, turning = 1e-3, _turning(fit.theta)
-        fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning), fit.constants))
+        eye, own_eye, damping = np.eye(self._robot.joint_count), np.eye(len(self._mean)), 1e-3
+        turning = _turning(fit.theta)
+        fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning)[0], fit.constants))
         for _ in range(rounds):
             yield
-            left = self._residuals(fit, seen, turning, slopes=True)
-            weight = (FREEDOM + 1.0) / (FREEDOM + left.value**2)
-            weighted = weight[..., None] * left.by_theta
-            normal = np.swapaxes(left.by_theta, 1, 2) @ weighted
-            normal += (left.outside != 0.0)[:, :, None] * eye / OUTSIDE**2
-            gradient = np.einsum('krd,kr->kd', weighted, left.value) + left.outside / OUTSIDE
-            cross = np.swapaxes(left.by_constants, 1, 2) @ weighted
-            own = np.einsum('krp,kr,krq->pq', left.by_constants, weight, left.by_constants)
+            value, by_theta, by_constants = self._residuals(fit, seen, turning, slopes=True)
+            weight = (FREEDOM + 1.0) / (FREEDOM + value**2)
+            weight[:, -len(eye) :] = 1.0
+            weighted = weight[..., None] * by_theta
+            normal = np.swapaxes(by_theta, 1, 2) @ weighted
+            gradient = np.einsum('krd,kr->kd', weighted, value)
+            cross = np.swapaxes(by_constants, 1, 2) @ weighted
+            own = np.einsum('krp,kr,krq->pq', by_constants, weight, by_constants, optimize=True)
             own += np.diag(self._spread**-2)
-            down = np.einsum('krp,kr->p', left.by_constants, weight * left.value)
+            down = np.einsum('krp,kr->p', by_constants, weight * value)
             down += (fit.constants - self._mean) / self._spread**2
             before = fit.cost
             while damping < 1e4:
@@ -358,8 +348,8 @@ class Zeroing:
                 turn = gradient + np.einsum('kpd,p->kd', cross, shift)
                 turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)
                 tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
-                cost = self._cost(self._residuals(tried, seen, turning), tried.constants)
-                if cost < fit.cost:
+                cost = self._cost(self._residuals(tried, seen, turning)[0], tried.constants)
+                if cost < before:
                     break
                 damping *= 5.0
                 yield
@@ -369,6 +359,15 @@ class Zeroing:
             if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
+
+
+def _turning(theta: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
+    result, reference = np.zeros_like(theta), theta[0].copy()
+    for k, posture in enumerate(theta):
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
+    return result
 
 
 def _worse(mae: Mae) -> Array:
@@ -381,17 +380,3 @@ def _worse(mae: Mae) -> Array:
         return np.ones(len(mae.muscles))
     variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
     return np.clip(variance / np.median(variance), *WORST)
-
-
-def _turning(theta: Array) -> Array:
-    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
-    result, reference = np.zeros_like(theta), theta[0].copy()
-    for k, posture in enumerate(theta):
-        reference = np.clip(reference, posture - STICKING, posture + STICKING)
-        result[k] = (posture - reference) / STICKING
-    return result
-
-
-def _spaced(seen: Moments) -> Ints:
-    """Return which few of the moments stand for all."""
-    return np.unique(np.linspace(0, len(seen.length) - 1, TOLD_BY).astype(np.int64))

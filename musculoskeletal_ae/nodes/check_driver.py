@@ -1,18 +1,153 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `check_driver`: does the driver of a real arm keep its contract?"""
+"""The tool `check_driver`: does the driver of a real arm keep its contract?
+
+muscle_states, joint_states → stdout; with --move also muscle_length_command.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from argparse import Namespace
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.nodes.qos import RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.start import load
 
+if TYPE_CHECKING:  # what --help does not load
+    from musculoskeletal_ae.driver.verdict import Verdict
+    from musculoskeletal_ae.robot.robot import Robot
+
+STATES, JOINTS, COMMAND = 'muscle_states', 'joint_states', 'muscle_length_command'
+TYPE = 'std_msgs/msg/Float64MultiArray'
+DISCOVERY = 1.0  # [s] in which the others on the graph are found
+SILENCE = 1.0  # [s] without messages that end the winding
+
+
+def _say(text: object) -> None:
+    print(text, flush=True)
+
+
+class CheckDriver:
+    """Listens to one driver, and winds its muscles in."""
+
+    def __init__(self, robot: Robot, options: Namespace) -> None:
+        """Join the graph."""
+        self.node: Node = rclpy.create_node('check_driver')
+        self.robot, self.options = robot, options
+        self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
+        self.muscles: Callable[[Float64MultiArray], object] = lambda _: None
+        self.joints: Callable[[JointState], object] = lambda _: None
+        subscribe: Any = self.node.create_subscription
+        subscribe(Float64MultiArray, STATES, lambda message: self.muscles(message), SENSOR)
+        subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
+        self._spin(DISCOVERY)
+
+    def _spin(self, longest: float, until: Callable[[], bool] = lambda: False) -> None:
+        end = time.monotonic() + longest
+        while not until() and (left := end - time.monotonic()) > 0.0:
+            rclpy.spin_once(self.node, timeout_sec=min(0.1, left))
+
+    def _mistyped(self) -> str:
+        kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(STATES)}
+        return ', '.join(sorted(kinds - {TYPE}))
+
+    def listen(self) -> Verdict:
+        """Wait for a driver and listen to it."""
+        chosen, node = self.options, self.node
+        kind: Any = load('musculoskeletal_ae.driver.listening').Listening
+        listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
+        self.muscles = lambda message: listening.muscles(message, time.monotonic())
+        self.joints = listening.joints
+        self._spin(2.0, lambda: listening.count > 0)
+        if not listening.count:
+            _say(f'waiting for {self.topic} (ROS_DOMAIN_ID {node.context.get_domain_id()})')
+            wait = math.inf if chosen.wait else chosen.seconds
+            self._spin(wait, lambda: listening.count > 0 or self._mistyped() != '')
+        if listening.count:
+            self._spin(chosen.seconds)
+        verdict: Verdict = listening.verdict()
+        if wrong := self._mistyped():
+            verdict.failed('type', topic=self.topic, type=wrong)
+        elif (publishers := node.count_publishers(STATES)) > 1:
+            verdict.failed('several', n=publishers, topic=self.topic)
+        if not node.count_publishers(JOINTS):
+            verdict.notes.append('nobody publishes joint_states, from which the learner learns')
+        return verdict
+
+    def wind(self) -> Verdict:
+        """Wind each muscle in a little."""
+        if self.node.count_publishers(COMMAND):
+            raise MusculoskeletalError(
+                f'{self.command} is published by another node: stop the controller before anything '
+                'else moves the arm'
+            )
+        muscles = self.robot.muscle_indices(self.options.muscles or [])
+        winding = load('musculoskeletal_ae.driver.winding').Winding(
+            self.robot, muscles, self.options.tension
+        )
+        read = load('musculoskeletal_ae.validity').read_array
+        verdict: Verdict = winding.verdict
+        publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
+        self._spin(3.0, lambda: publisher.get_subscription_count() > 0)
+        if not publisher.get_subscription_count():
+            verdict.failed('deaf', topic=self.command)
+            return verdict
+        last, trying = time.monotonic(), ''
+
+        def follow(message: Float64MultiArray) -> None:
+            nonlocal last, trying
+            now = time.monotonic()
+            try:
+                states = read(message, 3, self.robot.muscle_count)
+            except MusculoskeletalError:
+                return
+            last, target = now, winding.step(states, now)
+            if target is not None:
+                publisher.publish(array_message(target, 'muscle'))
+            if winding.trying != trying:
+                trying = winding.trying
+                _say(f'moving: {trying}')
+
+        self.muscles = follow
+        self._spin(math.inf, lambda: winding.done or time.monotonic() - last > SILENCE)
+        if not winding.done:
+            verdict.failed('silence', gap=SILENCE)
+        return verdict
+
 
 def _check(options: Namespace, arguments: list[str]) -> int:
-    status: int = load('musculoskeletal_ae.nodes.driver_check').check(options, arguments)
-    return status
+    robot = load('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
+    if options.posture and len(options.posture) != robot.joint_count:
+        raise MusculoskeletalError(f'--posture: {robot.joint_count} values are wanted, one a joint')
+    start_ros(arguments)
+    driver, told = CheckDriver(robot, options), None
+    while True:
+        verdict = driver.listen()
+        faults = {fault[:2] for fault in verdict.faults}
+        if faults != told:  # else it is as it was
+            _say(verdict)
+        told = faults
+        if not (options.wait and faults):
+            break
+        _say('nothing may move before the driver is changed; listening on')
+    if options.move and verdict.wrong - {'zero'}:
+        _say('not moved: what is wrong already comes first')
+    elif options.move:
+        verdict.add(driver.wind())
+        _say(verdict)
+    _say('the driver keeps its contract' if not verdict.faults else 'the driver is to be changed')
+    return 1 if verdict.faults else 0
 
 
 def _parse(arguments: list[str]) -> Namespace:
@@ -27,12 +162,10 @@ def _parse(arguments: list[str]) -> Namespace:
     add = parser.add_argument
     add('--seconds', type=positive, default=30.0, metavar='S', help='how long to listen [s]')
     add('--rate', type=number(1.0, 1000.0), default=100.0, metavar='HZ', help='of muscle_states')
-    add(
-        '--posture',
-        type=numbers,
-        metavar='θ,…',
-        help='where the arm is held, without sensors [rad]',
-    )
+    text = 'where the arm is held, without joint sensors [rad]'
+    add('--posture', type=numbers, metavar='θ,…', help=text)
+    text = 'winches without absolute encoders: the zeros of l are not judged'
+    add('--unzeroed', action='store_true', help=text)
     add('--move', action='store_true', help='then wind each muscle in a little, one at a time')
     add('--muscles', type=names, metavar='NAME,…', help='with --move: only these')
     text = 'with --move: the highest tension asked for [N] (default: 40 above T_bias)'

@@ -22,7 +22,8 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN
+from musculoskeletal_ae.estimation.zeroing import Zeros
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
@@ -49,26 +50,31 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.needed.append('muscle_states')
-        self.follow_checkpoints(self.core.use)
+        self.posture: tuple[float, ...] = ()
+        self.follow_parameter('zero_posture', self._take_posture)
+        self.unzeroed = self.parameter('zero_at_start')
+        self.zeros = self.core.zeros
+        if self.unzeroed:  # nobody moves on what sensors say before the network is there
+            self.core.zeros = Zeros.unknown(self.robot.muscle_count)
+        self.follow_checkpoints(self._use)
         for name in parameters_of(Slack):
             self.follow_parameter(name, partial(self._take_slack, name))
-        self.zeros = self.core.zeros
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscle_states(self._estimate, as_read=True)
         self.follow_posture('joint_states', lambda theta: self.core.joints(theta, time.monotonic()))
-        self.posture: tuple[float, ...] = ()
-        self.follow_parameter('zero_posture', self._take_posture)
-        self.unzeroed = self.parameter('zero_at_start')
-        if self.unzeroed:  # nobody moves on what sensors say before the network is there
-            unknown = np.zeros((2, self.robot.muscle_count))
-            unknown[1] = UNKNOWN
-            self.told.publish(array_message(unknown, 'quantity', 'muscle'))
+        self._tell_zeros()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
         serve(self, Trigger, 'estimator/reset', self._reset)
         serve(self, Trigger, 'estimator/zero', self._zero)
+
+    def _use(self, mae: Mae) -> None:
+        self.core.use(mae)
+        if self.unzeroed:
+            self.unzeroed = False
+            self.core.zero(self.posture)
 
     def _take_slack(self, name: str, value: float) -> None:
         self.core.detector.slack = replace(self.core.detector.slack, **{name: value})
@@ -101,17 +107,13 @@ class Estimator(Shell):
     def _estimate(self, states: Array) -> None:
         length, tension, temperature = states
         clock, now = self.get_clock().now(), time.monotonic()
-        if self.unzeroed and self.core.mae is not None:
-            self.unzeroed = False
-            self._zero(Trigger.Request())
-        known = self.zeros.known and not self.unzeroed
-        from_zero = length - self.zeros.offset if known else np.zeros_like(length)
+        from_zero = length - self.zeros.offset if self.zeros.known else None
         self.plausibility.check_muscles(tension, from_zero, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         self._tell_zeros()
         if estimate is None:
             return
-        if known:
+        if from_zero is not None:
             self.gate.message(tension, from_zero, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))

@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
+from difflib import get_close_matches
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
 from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
@@ -134,6 +137,30 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 
 #: old names of parameters, read for one version: by 0.3 they are gone
 RENAMED = {'marker_rate': 'marker_pose_rate'}
+
+#: what every node of rclpy has
+OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+
+
+def check_names(given: Iterable[str], node: str = '') -> None:
+    """Refuse a parameter that nothing would read.
+
+    That is one that no node has or, where it is given to one `node`, that only another has: a file
+    is for all nodes.
+    """
+    every = [*RENAMED, *OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
+    for name in given:
+        users = [user for user, table in PARAMETERS.items() if name in table]
+        told = ''
+        if name.split('.')[0] not in every:
+            legal = [*PARAMETERS[node]] if node else every
+            near = get_close_matches(name, legal, 1) or ['none, see --help']
+            told = f'no node has a parameter {name!r}; nearest: {near[0]}'
+        elif node and users and node not in users and len(users) == 1:
+            told = f'{node} has no parameter {name!r}; {users[0]} has'
+        if told:
+            raise MusculoskeletalError(printable(told))
+
 
 HELP_TAIL = """\
 Give them as  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be

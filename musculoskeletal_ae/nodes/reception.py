@@ -22,6 +22,9 @@ class Reception:
         self.last_rejected = ''  # what was wrong with the last one of them
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         self._received: Counter[str] = Counter()
+        #: how often a message was numbered lower than the one before, by topic: once where a
+        #: publisher starts anew, all the time where two take turns
+        self.turns: Counter[str] = Counter()
 
     def of(
         self, topic: str, callback: Callable[[Any], object], publishers: Callable[[], int]
@@ -38,7 +41,7 @@ class Reception:
             if order.is_late(*sent) and publishers() == 1:
                 self.rejected[f'{topic}: {LATE}'] += 1
                 return
-            order.take(*sent)
+            self.turns[topic] += order.take(*sent)
             try:
                 callback(message)
             except MusculoskeletalError as error:

@@ -11,6 +11,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.parameters import help_text
+from musculoskeletal_ae.nodes.parameters import OF_RCLPY, check_names, help_text
 from musculoskeletal_ae.nodes.shield import ShieldedExecutor
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.start import load
@@ -46,6 +47,12 @@ PARAMETER_ERRORS = (
 def reason(error: Exception) -> str:
     """Return what rcl says is wrong, without where in its sources it says so."""
     return ' '.join(str(error).split(', at /')[0].split())
+
+
+def parameters_given(arguments: list[str]) -> list[str]:
+    """Return the names that `-p NAME:=VALUE` or `-p NODE:NAME:=VALUE` give values."""
+    values = [value for flag, value in pairwise(arguments) if flag in ('-p', '--param')]
+    return [value.partition(':=')[0].rpartition(':')[2] for value in values]
 
 
 def run(name: str) -> None:
@@ -69,6 +76,7 @@ def run(name: str) -> None:
             told = f'parameters are given as  {name} --ros-args -p NAME:=VALUE'
             print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
             sys.exit(2)
+        check_names(parameters_given(given), name)
         module = load(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
@@ -131,6 +139,11 @@ def run_tool(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])
+    for given in parameters_given(arguments):
+        if given not in OF_RCLPY:
+            told = f'{given!r} is no parameter: options of {name} stand before --ros-args'
+            print(printable(f'{name}: error: {told}'), file=sys.stderr)
+            sys.exit(2)
     try:
         refused = (InvalidTopicNameException, *PARAMETER_ERRORS)
         return exit_status(lambda: work(options, arguments), *refused)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -37,7 +38,7 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.shield import refuse
@@ -49,6 +50,7 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
+LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
 
 LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
 
@@ -67,9 +69,11 @@ class Shell(Node):
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
         self._take_old_names()
+        check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         self._reception = Reception(lambda text: self.get_logger().warning(text))
+        self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
         self.add_on_set_parameters_callback(self._set_parameters)
@@ -271,12 +275,18 @@ class Shell(Node):
 
     def _several_publishers(self, name: str) -> str:
         """Return which nodes publish a topic, '' if it is one."""
-        topic, names = self.resolve_topic_name(name), set[str]()
+        topic, names = self.resolve_topic_name(name), Counter[str]()
         if self.count_publishers(topic) > 1:
             for publisher in self.get_publishers_info_by_topic(topic):
-                names.add(f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}')
-        # One name twice: a node that was killed stays known for a while beside its successor.
-        return f'{name} come from {" and ".join(sorted(names))}' if len(names) > 1 else ''
+                names[f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'] += 1
+        # One name twice: a node that was killed stays known for a while beside its successor,
+        # but no longer sends.
+        turns = self._reception.turns[name]
+        self._turns.append(turns)
+        if len(names) == 1 and turns - self._turns[0] < TURNS:
+            return ''
+        senders = (f'{count} nodes {node}' if count > 1 else node for node, count in names.items())
+        return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
         """Take zeros that the estimator found; `changed` is told whether they are known now.

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -178,9 +176,3 @@ def test_heat_lowers_the_limit_smoothly_from_max_to_bias_and_never_below():
     assert (limit[temperature[:, 0] <= 85.0 - COOLING_BAND] == MAX).all()
     assert (np.diff(limit) <= 0.0).all()
     assert np.abs(np.diff(limit)).max() <= 1.5 * (MAX - BIAS) / COOLING_BAND * 0.05 + 1e-9
-
-
-def test_a_temperature_that_is_not_known_limits_nothing():
-    temperature = np.array([math.nan, 85.0, 25.0] * (COUNT // 3))
-    limit = thermal_limit(ROBOT, temperature, 85.0)
-    assert limit.tolist() == [MAX, BIAS, MAX] * (COUNT // 3)

@@ -99,6 +99,18 @@ def test_what_lasts_stops_the_arm_with_its_own_cause_and_never_by_a_jump(row, li
     assert bench.report().message == 'holding'
 
 
+@pytest.mark.parametrize('known', [[], [2]])
+def test_modules_without_thermometers_are_no_reason_and_hide_no_hot_one(known):
+    bench = Lied()
+    bench.temperature = np.full(ROBOT.muscle_count, np.nan)
+    bench.temperature[known] = 110.0
+    bench.step(200)
+    assert bench.core.safety.cause[:10] == ('overheated' if known else '')
+    warm = np.isin(np.arange(ROBOT.muscle_count), known)
+    tension = ROBOT.tension
+    np.testing.assert_array_equal(bench.core.limit, np.where(warm, tension.bias, tension.max))
+
+
 def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
     bench = Lied()
     before = bench.core.safety.command

@@ -59,9 +59,11 @@ class Driver:
         rows = np.stack(self.arm.sense()[1:])
         self._commands.append((self.now + self.late, self.take(target.copy(), rows)))
 
-    def listen(self, seconds: float = 5.0, moved: bool = False, joints: bool = True) -> Verdict:
+    def listen(
+        self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
+    ) -> Verdict:
         """Return what `Listening` says, of the resting arm or while its hand is pushed about."""
-        listening = Listening(self.robot, 1.0 / PERIOD)
+        listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed)
         for k in range(round(seconds / PERIOD)):
             if moved:
                 self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))

@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
-LOW = replace(ROBOT.description, tension=TensionRange(30.0, 55.0, 60.0))
+LOW = replace(ROBOT.description, tension=TensionRange(*np.outer([30.0, 55.0, 60.0], np.ones(6))))
 M, BICEPS = ROBOT.muscle_count, 4
 BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
 
@@ -67,31 +67,47 @@ def test_a_sound_driver_is_found_sound(seed):
         assert line.count('ok') == 5 and 'WRONG' not in line  # all but rate, zero, clip
 
 
-@pytest.mark.parametrize(
-    ('publish', 'moved', 'check', 'told'),
-    [
-        (rows_in([1, 0, 2]), False, 'order', 'rows look like tension, length, temperature'),
-        (lambda rows: rows.T.reshape(3, M), False, 'order', 'each muscle stand together'),
-        (scaled(1000, 1, 1), False, 'unit', 'lengths look like mm'),
-        (scaled(1000, 1, 1), True, 'unit', 'lengths look like mm'),
-        (scaled(1, 1000, 1), False, 'unit', 'does pull count as +'),
-        (scaled(1, -1, 1), False, 'unit', 'does pull count as +'),
-        (lambda rows: rows + [[0], [0], [273.15]], False, 'unit', 'look like K'),
-        (flipped, True, 'sign', 'must fall when the motor winds in'),
-        (lambda rows: flipped(rows, [BICEPS]), True, 'sign', 'biceps_long'),
-        (exchanged, True, 'order', 'behaves like deltoid_posterior'),
-        (shifted, False, 'zero', 'subtract this'),
-        (shifted, True, 'zero', 'biceps_long'),
-        (with_nan, False, 'rate', 'not finite'),
-        (lambda rows: rows[:2], False, 'order', '3×M values'),
-    ],
-)
-def test_what_is_wrong_is_heard(publish, moved, check, told):
+HEARD = {
+    'rows T, l, °C': (rows_in([1, 0, 2]), 'at rest', 'order', 'look like tension, length, temp'),
+    'by muscle': (
+        lambda rows: rows.T.reshape(3, M),
+        'at rest',
+        'order',
+        'each muscle stand together',
+    ),
+    'l in mm': (scaled(1000, 1, 1), 'at rest', 'unit', 'lengths look like mm'),
+    'l in mm, moved': (scaled(1000, 1, 1), 'moved', 'unit', 'lengths look like mm'),
+    'T in mN': (scaled(1, 1000, 1), 'at rest', 'unit', 'does pull count as +'),
+    'sign of every T': (scaled(1, -1, 1), 'at rest', 'unit', 'does pull count as +'),
+    'temperatures in K': (lambda rows: rows + [[0], [0], [273.15]], 'at rest', 'unit', 'like K'),
+    'sign of every l': (flipped, 'moved', 'sign', 'must fall when the motor winds in'),
+    'sign of one l': (lambda rows: flipped(rows, [BICEPS]), 'moved', 'sign', 'biceps_long'),
+    'two muscles exchanged': (exchanged, 'moved', 'order', 'behaves like deltoid_posterior'),
+    'zero of one l off by 80 mm': (shifted, 'at rest', 'zero', 'subtract this'),
+    'the same, moved': (shifted, 'moved', 'zero', 'biceps_long'),
+    'NaN tension': (with_nan, 'at rest', 'rate', 'not finite'),
+    'two rows': (lambda rows: rows[:2], 'at rest', 'order', '3×M values'),
+}
+
+
+@pytest.mark.parametrize('name', HEARD)
+def test_what_is_wrong_is_heard(name):
+    publish, how, check, told = HEARD[name]
     driver = Driver(ROBOT)
     driver.publish = publish
-    verdict = driver.listen(8.0 if moved else 5.0, moved=moved)
+    verdict = driver.listen(8.0 if how == 'moved' else 5.0, moved=how == 'moved')
     assert verdict.wrong == {check}, str(verdict)
     assert told in str(verdict)
+
+
+def test_winches_that_forget_their_zeros_are_no_fault_where_that_is_said():
+    driver = Driver(ROBOT)
+    driver.publish = lambda rows: rows + [np.linspace(-0.13, 0.13, M), np.zeros(M), np.zeros(M)]
+    assert driver.listen(2.0).wrong & {'zero', 'unit'}
+    for moved in (False, True):
+        assert not driver.listen(8.0, moved=moved, zeroed=False).faults
+    driver.publish = lambda rows: flipped(rows) + [[0.1], [0], [0]]
+    assert driver.listen(8.0, moved=True, zeroed=False).wrong == {'sign'}
 
 
 def test_a_slow_a_halting_and_a_repeating_driver_are_heard():
@@ -157,7 +173,7 @@ WOUND = {
     'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
     'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
-    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'read as m'),
+    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'command in m'),
     'dead motor': ({'take': only_first}, 'law', 'does not respond'),
     'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
     'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'is T in N'),
@@ -183,7 +199,7 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
     driver = Driver(robot)
     driver.listen(2.0)
     # The module of the emulator clips by itself.
-    driver.arm._body = driver.arm._body._replace(tension_max=500.0)
+    driver.arm._body = driver.arm._body._replace(tension_max=np.full(M, 500.0))
     driver.in_tension = law(most=60.0, clip=clip)
     verdict = driver.wind((0, BICEPS))
     assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)

@@ -110,6 +110,20 @@ def test_a_slack_wire_is_wound_in(robot):
     assert after[MUSCLE] - before[MUSCLE] < -0.02
 
 
+def test_a_slow_winch_takes_its_time(robot):
+    arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
+    lines = [f'slack_wire {name}', f'winch_speed {name} 0.009']
+    wound = hold(arm, robot, lines, 0.5).length - hold(arm, robot, lines, 2.5).length
+    assert wound[MUSCLE] == pytest.approx(0.0225, abs=0.002)
+
+
+def test_winches_forget_their_zeros(arm):
+    before = arm.sense().length
+    arm.faults.set(['unzeroed 0.1'])
+    off = arm.sense().length - before
+    assert (np.abs(off) > 0.038).all() and (np.abs(off) < 0.102).all() and np.ptp(off) > 0.05
+
+
 def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
     name = robot.muscles[MUSCLE]
     hot = hold(arm, robot, [f'overheating {name} 95'], 0.1).temperature

@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, IN_A_ROW, AnomalyDetector
+from musculoskeletal_ae.estimation.anomaly import (
+    DEAD_TIME,
+    DISTANCE,
+    IN_A_ROW,
+    AnomalyDetector,
+)
 
 DT = 0.01
 
@@ -99,3 +104,19 @@ def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):
     detector, verdicts = judge(mae)
     detector.commanded(tension=np.full(6, 0.5 * robot.tension.bias))
     assert not any(verdict.cause for verdict in verdicts(slack, 100))
+
+
+@pytest.mark.parametrize(
+    ('away', 'cut', 'found'), [(0.0, 0, True), (0.5, 0, False), (0.5, 1, True)]
+)
+def test_far_from_what_was_calibrated_less_is_sure_but_not_of_a_slack_muscle(
+    robot, calibrated, judge, healthy, away, cut, found
+):
+    message = healthy._replace(tension=healthy.tension * (1.0 - cut * np.eye(6)[2]))
+    state = calibrated.estimate(*message)
+    distance = judge(calibrated)[1](message)[0].distance
+    known = state.theta[None] + away * (robot.upper - robot.lower)
+    statistics = replace(calibrated.anomaly, postures=known, thresholds={DISTANCE: 0.8 * distance})
+    detector, verdicts = judge(replace(calibrated, anomaly=statistics))
+    assert (detector.unfamiliar(state.theta) > 1.0) == bool(away)
+    assert any(verdict.cause for verdict in verdicts(message, IN_A_ROW)) == found

@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, AnomalyDetector
+from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Slack
 
 DT = 0.01
@@ -77,3 +81,25 @@ def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, 
         state = calibrated.estimate(tension, length)
         causes.append(detector.step(state, tension, length, DT).cause)
     assert any(cause.startswith('d = ') for cause in causes[:50]) == found
+
+
+@pytest.mark.parametrize('speed', [0.009, 0.036])
+@pytest.mark.parametrize('commanded', [True, False])
+def test_an_emulated_slow_winch_takes_up_slack_without_alarm(robot, calibrated, speed, commanded):
+    """Before calibration, and before any command as well."""
+    arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
+    arm.step(3.0)
+    estimator, hold = Estimator(robot), arm.sense().length
+    estimator.use(replace(calibrated, anomaly=None))
+    arm.faults.set([f'slack_wire {name} 0.05', f'winch_speed {name} {speed}'])
+    slack = 0
+    for n in range(round((0.05 / speed + 1.0) / DT)):
+        if commanded:
+            arm.command_length(hold)
+            estimator.commanded(n * DT, length=hold)
+        read = arm.sense()
+        slack += read.tension[MUSCLE] < 1.0
+        estimator.step(read.tension, read.length, n * DT, n * DT)
+        assert not estimator.cause
+        arm.step(DT)
+    assert slack * DT > 0.5

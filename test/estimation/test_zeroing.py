@@ -39,8 +39,8 @@ def moment(robot, mae):
 def run(zeros, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
-        for _ in range(25):
-            zeros.step(tension, length + OFFSET, WINDOW / 25, theta if sees else None)
+        for k in range(25):  # angles come more seldom than lengths
+            zeros.step(tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None)
         if zeros.done:
             break
     return zeros

@@ -20,13 +20,19 @@ def check(graph, *options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
+def started(graph, **parameters):
+    graph.start('hardware_emulator', robot='arm26', **parameters)
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.next('muscle_states')
+
+
 def ended(process, deadline=2 * DEADLINE):
     output, _ = process.communicate(timeout=deadline)
     return process.returncode, output
 
 
 def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
-    graph.start('hardware_emulator', robot='arm26')
+    started(graph)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
     # A busy machine may keep a sound driver waiting: it is listened to until it is heard well.
     assert ended(check(graph, '--wait', '--seconds', '2'))[0] == 0
@@ -59,7 +65,7 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
     ],
 )
 def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
-    graph.start('hardware_emulator', robot='arm26', faults=[fault])
+    started(graph, faults=[fault])
     status, output = ended(check(graph, '--seconds', '2', *options))
     assert status == 1, output
     assert told in output
@@ -89,7 +95,7 @@ def test_a_topic_of_another_type_is_told(graph):
 
 
 def test_it_does_not_move_what_a_controller_moves(graph):
-    graph.start('hardware_emulator', robot='arm26')
+    started(graph)
     graph.publisher(Float64MultiArray, 'muscle_length_command')
     status, output = ended(check(graph, '--seconds', '1', '--move'))
     assert status == 1

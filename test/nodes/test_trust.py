@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import rclpy
 from controlled_arm import RATE_LIMIT, ControlledArm
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -90,6 +91,22 @@ def test_a_second_source_of_muscle_states_stops_the_arm_by_name_until_it_is_gone
     arm.graph.node.destroy_publisher(stranger)
     arm.graph.wait(lambda: arm.graph.call(Trigger, 'controller/reset').success, 'the reset')
     arm.goes_to(HERE)
+
+
+def test_a_second_driver_of_the_same_name_is_one_too_many(arm):
+    space, states = arm.graph.namespace, arm.graph.listen(Float64MultiArray, 'muscle_states')
+    twin = rclpy.create_node('hardware_emulator', namespace=space, context=arm.graph.node.context)
+    try:
+        publisher = twin.create_publisher(Float64MultiArray, 'muscle_states', 10)
+
+        def repeated():  # what the first one says, by a second one
+            publisher.publish(states[-1])
+            return f'from 2 nodes {space}/hardware_emulator' in arm.controller.core.intruder
+
+        arm.graph.wait(lambda: states, 'muscle states')
+        arm.graph.wait(repeated, 'the stop')
+    finally:
+        twin.destroy_node()
 
 
 def test_lengths_no_muscle_can_have_stop_the_arm_by_name_and_without_a_jump(arm):

@@ -4,27 +4,41 @@
 from __future__ import annotations
 
 import numpy as np
-from std_srvs.srv import Trigger
+import pytest
+from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.estimation import zeroing
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 
 
-def test_a_stated_posture_tells_the_zeros_to_all_nodes(graph, trained_file, tmp_path):
-    offset = [0.1, -0.05, 0.06, -0.13, 0.08, -0.07]
-    hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, length_offset=offset)
+@pytest.mark.parametrize('stands', [True, False], ids=['stated posture', 'gentle motion'])
+def test_winches_that_forgot_their_zeros_are_told_them(
+    graph, trained_file, tmp_path, monkeypatch, stands
+):
+    monkeypatch.setattr(zeroing, 'ENOUGH_SEEN', 2.0)
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
-    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
-    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    node = graph.host(Estimator, **common)
+    # Nothing is late on a loaded machine.
+    controller = graph.host(Controller, **common, max_age=10.0)
     learner = graph.host(Learner, robot='arm26', state_directory=str(tmp_path))
-    graph.set_parameter('estimator', 'zero_posture', hardware.arm.theta.tolist())
+    if stands:
+        graph.set_parameter('estimator', 'zero_posture', hardware.arm.theta.tolist())
     assert graph.call(Trigger, 'estimator/zero').success
     assert not node.core.zeros.known
-    told = [controller, learner]
-    graph.wait(lambda: all(n.zeros.known and n.zeros.offset.any() for n in told), 'the zeros')
-    for other in told:
+    if not stands:
+        assert graph.call(SetBool, 'controller/explore', SetBool.Request(data=True)).success
+    nodes = [node, controller, learner]
+    graph.wait(lambda: all(n.zeros.known and n.zeros.offset.any() for n in nodes), 'the zeros')
+    offset = hardware.arm.faults.zero
+    assert np.abs(offset).min() > 0.05
+    for other in nodes:
         # The network knows the geometric model alone.
         np.testing.assert_allclose(other.zeros.offset, offset, atol=0.03)
-    assert controller.core.safety.zeroed
+        assert not any('length' in reason for reason in other.rejected)
+    assert controller.core.safety.zeroed and not controller.core.safety.cause
+    assert not node.core.cause
