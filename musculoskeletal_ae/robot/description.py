@@ -21,7 +21,7 @@ from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.entries import Entry, refusal
-from musculoskeletal_ae.robot.kinematics import Coupling
+from musculoskeletal_ae.robot.kinematics import Coupling, resolved
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import read_mimics, read_urdf
 
@@ -197,7 +197,6 @@ def _read_couplings(
         ratio, offset = given.get('ratio', 1.0).number(), given.get('offset', 0.0).number()
         links[names[-1]] = Coupling(given['master'].name(), ratio, offset)
     entry.unique(names)
-    resolved = {}
     for slave in links:
         _one_axis_joint(entry, slave, model)
         if slave in joints:
@@ -206,17 +205,13 @@ def _read_couplings(
                 f'joint {slave!r} follows {links[slave].master!r} by {source}; '
                 'list only joints that follow none under joints'
             )
-        master, ratio, offset = links[slave]
-        seen = {slave}
-        while master in links:
-            if master in seen:
-                raise entry.fail(f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}')
-            seen.add(master)
-            master, gear, shift = links[master]
-            ratio, offset = ratio * gear, ratio * shift + offset
-        _one_axis_joint(entry, master, model)
-        resolved[slave] = Coupling(master, ratio, offset)
-    return resolved
+    try:
+        couplings = resolved(links)
+    except ValueError as error:
+        raise entry.fail(str(error)) from error
+    for coupling in couplings.values():
+        _one_axis_joint(entry, coupling.master, model)
+    return couplings
 
 
 def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:

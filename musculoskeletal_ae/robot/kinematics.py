@@ -43,6 +43,29 @@ class Coupling(NamedTuple):
     offset: float  # [rad] or [m]
 
 
+def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
+    """Return couplings to joints that follow none; a ValueError names one that follows itself."""
+    result = {}
+    for slave, (master, ratio, offset) in couplings.items():
+        seen = {slave}
+        while master in couplings:
+            if master in seen:
+                told = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
+                raise ValueError(told)
+            seen.add(master)
+            master, gear, shift = couplings[master]
+            ratio, offset = ratio * gear, ratio * shift + offset
+        result[slave] = Coupling(master, ratio, offset)
+    return result
+
+
+def joint_axis(joint: pin.JointModel) -> Array:
+    """Return the axis (3,) of a revolute or prismatic joint."""
+    data = joint.createData()
+    joint.calc(data, np.zeros(joint.idx_q + 1))
+    return np.ravel(data.S).reshape(2, 3)[0 if joint.shortname() in PRISMATIC else 1]
+
+
 class Kinematics:
     """Rigid-body side of a robot: link poses, gravity torque and end-effector Jacobian."""
 
@@ -83,9 +106,7 @@ class Kinematics:
         self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])
         self._first, self._second = np.zeros((2, count, 4, 4))
         for i, turn in enumerate(self.placement_rotation[1:], 1):
-            joint = self.model.joints[i].createData()
-            self.model.joints[i].calc(joint, pin.neutral(self.model))
-            axis = np.ravel(joint.S).reshape(2, 3)[0 if self.prismatic[i] else 1]
+            axis = joint_axis(self.model.joints[i])
             self.local_axis[i], cross = axis, pin.skew(axis)
             if self.prismatic[i]:
                 self._first[i, :3, 3] = turn @ axis

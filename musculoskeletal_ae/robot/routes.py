@@ -75,24 +75,9 @@ class Routes:
         if not wraps:
             return np.zeros(0, dtype=int), None
         # Only here, so that an arm of straight lines does not wait for numba.
-        from musculoskeletal_ae.robot.wrapping import WrapObjects
+        from musculoskeletal_ae.robot.wrapping import place_objects
 
-        placed = [self._kinematics.placement(wrap.link) for _, wrap in wraps]
-        joints, poses = zip(*placed)
-        nowhere, nothing = np.full(3, np.nan), np.zeros(3)
-        parts = {
-            'centre': [at.act(wrap.xyz) for at, (_, wrap) in zip(poses, wraps)],
-            'axis': [
-                nothing if wrap.axis is None else at.rotation @ wrap.axis
-                for at, (_, wrap) in zip(poses, wraps)
-            ],
-            'side': [
-                nowhere if wrap.side is None else at.rotation @ (wrap.side - wrap.xyz)
-                for at, (_, wrap) in zip(poses, wraps)
-            ],
-            'radius': [wrap.radius for _, wrap in wraps],
-        }
-        objects = WrapObjects(np.array(joints), **{k: np.array(v) for k, v in parts.items()})
+        objects = place_objects(self._kinematics, [wrap for _, wrap in wraps])
         return np.array([segment for segment, _ in wraps]), objects
 
     def _wrapped(self, poses: JointPoses, points: Array) -> tuple[Array, Array, Array]:

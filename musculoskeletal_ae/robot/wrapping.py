@@ -18,12 +18,15 @@ calls it for many, the emulator in each of its steps.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.robot.description import Wrap
+from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12
 Vector = tuple[float, float, float]
@@ -37,6 +40,21 @@ class WrapObjects(NamedTuple):
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
     side: Array  # from the centre [m], NaN for none, (S, 3)
     radius: Array  # [m], 0 for no object, (S,)
+
+
+def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
+    """Return what a description wraps segments round, one each, in the frames of tree joints."""
+    joints, poses = zip(*(kinematics.placement(wrap.link) for wrap in wraps))
+    rows = [
+        (
+            at.act(wrap.xyz),
+            np.zeros(3) if wrap.axis is None else at.rotation @ wrap.axis,
+            np.full(3, np.nan) if wrap.side is None else at.rotation @ (wrap.side - wrap.xyz),
+            wrap.radius,
+        )
+        for at, wrap in zip(poses, wraps)
+    ]
+    return WrapObjects(np.array(joints), *map(np.array, zip(*rows)))
 
 
 @njit(cache=True)
