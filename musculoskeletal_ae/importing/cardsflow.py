@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
-from musculoskeletal_ae.importing.source import KINDS, Source, inertia, numbers, refuse, safe_name
+from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import PRISMATIC, Kinematics
 from musculoskeletal_ae.robot.routes import Routes
@@ -155,14 +155,12 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
             elif kind != 'fixed':
                 source.note('held fixed', f'joint {label}: it is {kind}')
         stands[name] = carrier, at
-        own, centres[name] = links[name].find('inertial'), np.zeros(3)
-        weight = pin.Inertia.Zero()
-        if own is not None:
-            centre, parts = pose(own), own.find('inertia')
-            pairs = combinations_with_replacement('xyz', 2)
-            xx, xy, xz, yy, yz, zz = (value(parts, f'i{a}{b}')[0] for a, b in pairs)
-            tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            centres[name] = centre.translation
-            weight = inertia(value(own, 'mass')[0], centre.translation, tensor, centre.rotation)
+        own = links[name].find('inertial')
+        parts = None if own is None else own.find('inertia')
+        pairs = combinations_with_replacement('xyz', 2)
+        xx, xy, xz, yy, yz, zz = (value(parts, f'i{a}{b}')[0] for a, b in pairs)
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        weight = pose(own).act(pin.Inertia(float(value(own, 'mass')[0]), np.zeros(3), tensor))
+        centres[name] = pose(own).translation
         source.add_link(name, carrier, at.inverse() * pose(links[name]), weight)
     return source, centres

@@ -17,14 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import (
-    STRENGTH,
-    Source,
-    SourceError,
-    inertia,
-    refuse,
-    safe_name,
-)
+from musculoskeletal_ae.importing.source import Source, SourceError, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 
 
@@ -76,8 +69,8 @@ class _Reader:
         at = at * _pose(m.body_pos[i], m.body_quat[i])
         for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
             carrier, at = self._joint(j, carrier, at)
-        turn = _pose(np.zeros(3), m.body_iquat[i]).rotation
-        own = inertia(m.body_mass[i], m.body_ipos[i], np.diag(m.body_inertia[i]), turn)
+        still = pin.Inertia(float(m.body_mass[i]), np.zeros(3), np.diag(m.body_inertia[i]))
+        own = _pose(m.body_ipos[i], m.body_iquat[i]).act(still)
         self.places.append((carrier, at))
         self.source.add_link(name, carrier, at, own)
 
@@ -109,7 +102,7 @@ class _Reader:
 
     def _couplings(self) -> None:
         m, source = self.model, self.source
-        for e in np.flatnonzero(m.eq_active0):
+        for e in np.flatnonzero(m.eq_active0).tolist():
             if m.eq_type[e] != self.mj.mjtEq.mjEQ_JOINT:
                 source.note('dropped', f'equality {self.name("equality", e)}: not of joints')
                 continue
@@ -142,8 +135,6 @@ class _Reader:
                 self.tendons[name] = t
                 self._route(name, range(first, first + m.tendon_num[t]))
                 source.strength[name] = max(driven.get(t, [0.0]))
-        if any(source.strength.values()):
-            source.note('chosen', STRENGTH)
 
     def _strength(self, a: int) -> float:
         m = self.model

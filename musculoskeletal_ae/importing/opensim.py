@@ -11,25 +11,19 @@ what the approximation costs; wrap objects are those of the result on both sides
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
 
-from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import (
-    STRENGTH,
-    Function,
-    Source,
-    inertia,
-    numbers,
-    refuse,
-    safe_name,
-)
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.importing.source import Function, Source, numbers, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
@@ -44,50 +38,24 @@ AXES = {
     'GimbalJoint': 'xyz',
     'PlanarJoint': 'zXY',
     'WeldJoint': '',
+    'FreeJoint': '',
 }
+IDENTITY: Function = np.poly1d([1.0, 0.0])
+
+#: whether it slides, direction, coordinate ('': none), function of it that is its value
+Axis = tuple[bool, Array, str, Function]
+#: body, a coordinate and a function of it for each axis, and within what a coordinate must be
+Point = tuple[str, Sequence[tuple[str, Function]], tuple[str, float, float]]
+#: values (N,) of coordinates, and poses (N, J, 4, 4) of the model's joints
+Postures = tuple[dict[str, Array], Array]
 
 
-class Axis(NamedTuple):
-    """One axis of a joint: its value is a function of a coordinate, or of none."""
-
-    slides: bool
-    axis: Array
-    coordinate: str
-    function: Function
-
-
-class Coordinate(NamedTuple):
-    """A coordinate of the model."""
-
-    low: float
-    high: float
-    default: float
-    locked: bool
-
-
-class Point(NamedTuple):
-    """A path point as OpenSim has it."""
-
-    body: str
-    at: list[
-        tuple[str, Function]
-    ]  # in the body, a function of a coordinate ('': none) for each axis
-    condition: tuple[str, float, float] | None  # active while the coordinate is within
-
-
-class Postures(NamedTuple):
-    """Postures in which lengths are asked for."""
-
-    values: dict[str, Array]  # of coordinates, '' is 0, (N,)
-    poses: Array  # of the model's joints, (N, J, 4, 4)
-
-
-def read_osim(file: Path, root: ET.Element) -> Source:
+def read_osim(_file: Path, root: ET.Element) -> Source:
     """Read an .osim file."""
     model, version = root.find('Model'), root.get('Version', '0')
     if model is None or not version.isdigit() or int(version) < OLDEST:
         told = f'expected a Model of version {OLDEST} or later, got {version[:20]!r}'
-        raise refuse(file, f'{told}; open it in OpenSim 4 and save it')
+        raise ValueError(f'{told}; open it in OpenSim 4 and save it')
     return _Reader(model).source
 
 
@@ -100,42 +68,43 @@ def _number(element: ET.Element, tag: str) -> float:
     return float(_vector(element, tag, 1)[0])
 
 
-def _word(element: ET.Element, tag: str) -> str:
-    """Return the last part of a path, or ''."""
-    return element.findtext(tag, '').strip().split('/')[-1]
+def _word(element: ET.Element, tag: str, default: str = '') -> str:
+    """Return a word of a child, the last part of a path."""
+    return (element.findtext(tag) or default).strip().split('/')[-1]
 
 
-def _turn(angles: Array) -> Array:
-    """Return the rotation of body-fixed x-y-z angles [rad]."""
-    x, y, z = (pin.exp3(axis * angle) for axis, angle in zip(np.eye(3), angles))
-    turned: Array = x @ y @ z
-    return turned
+def _offset(element: ET.Element, angles: str) -> pin.SE3:
+    """Return a pose whose rotation is given by body-fixed x-y-z angles [rad]."""
+    turn = Rotation.from_euler('XYZ', _vector(element, angles)).as_matrix()
+    return pin.SE3(turn, _vector(element, 'translation'))
+
+
+def _scaled(function: Function, scale: float) -> Function:
+    return lambda x: scale * function(x)
 
 
 def _function(element: ET.Element | None) -> Function:
-    """Return a function of OpenSim; splines go on straight beyond their points."""
+    """Return a function of OpenSim; those through points go on straight beyond them."""
     if element is None:
         return np.poly1d([0.0])
     kind = element.tag
-    if kind == 'function' or kind.endswith('_location') or kind == 'coupled_coordinates_function':
+    if kind.endswith(('function', '_location')):
         return _function(next(iter(element), None))
     if kind == 'Constant':
         return np.poly1d(_vector(element, 'value', 1))
     if kind in ('LinearFunction', 'PolynomialFunction'):
-        words = element.findtext('coefficients', '0').split()
-        return np.poly1d(numbers(' '.join(words), len(words), f'{kind}: coefficients'))
+        count = len(element.findtext('coefficients', '0').split())
+        return np.poly1d(_vector(element, 'coefficients', count))
     if kind == 'MultiplierFunction':
-        inner, scale = _function(element.find('function')), _number(element, 'scale')
-        return lambda x: scale * inner(x)
+        return _scaled(_function(element.find('function')), _number(element, 'scale'))
     if kind not in ('SimmSpline', 'NaturalCubicSpline', 'PiecewiseLinearFunction'):
         raise ValueError(f'a {kind} is not read')
-    count = len(element.findtext('x', '').split())
-    x, y = _vector(element, 'x', count), _vector(element, 'y', count)
-    if count < 2 or not (np.diff(x) > 0.0).all():
-        raise ValueError(f'a {kind} needs at least 2 points with rising x')
-    if kind == 'PiecewiseLinearFunction' or count == 2:
-        return lambda at: np.interp(at, x, y)
-    spline = CubicSpline(x, y, bc_type='natural' if kind.startswith('Natural') else 'not-a-knot')
+    x, y = (_vector(element, tag, len(element.findtext('x', '').split())) for tag in 'xy')
+    spline: Any
+    if kind == 'PiecewiseLinearFunction':
+        spline = make_interp_spline(x, y, k=1)
+    else:
+        spline = CubicSpline(x, y, bc_type='natural' if kind[0] == 'N' else 'not-a-knot')
 
     def value(at: Array) -> Array:
         inside = np.clip(at, x[0], x[-1])
@@ -147,89 +116,82 @@ def _function(element: ET.Element | None) -> Function:
 class _Reader:
     def __init__(self, model: ET.Element) -> None:
         self.model, self.source = model, Source(safe_name(model.get('name'), 'robot'))
-        down = model.find('gravity') is None
-        self.source.model.gravity.linear = -np.eye(3)[1] if down else _vector(model, 'gravity')
-        self.coordinates = {
-            e.get('name', ''): self._coordinate(e) for e in model.iter('Coordinate')
-        }
-        #: coordinate that follows another, and how
-        self.coupled: dict[str, tuple[str, Function]] = {}
-        #: coordinate that each joint of the result follows as OpenSim has it, and how
+        given = model.find('gravity') is not None
+        self.source.model.gravity.linear = _vector(model, 'gravity') if given else -np.eye(3)[1]
+        #: ranges and defaults of coordinates that are free; which of them ('': none) drives each
+        #: coordinate, and by what function
+        self.ranges, self.rest = {'': (0.0, 0.0)}, {'': 0.0}
+        self.drivers: dict[str, tuple[str, Function]] = {'': ('', IDENTITY)}
+        self._coordinates()
+        #: the coordinate and the function that are each joint's exact value
         self.moves: dict[str, tuple[str, Function]] = {}
         #: body that a frame belongs to, and its pose there
         self.frames = {'ground': ('ground', pin.SE3.Identity())}
-        self.points: dict[str, list[Point]] = {}
-        #: what a muscle wraps round after its points, by their numbers
-        self.wraps: dict[str, dict[int, Wrap]] = {}
-        self._couplers()
         self._tree()
         self._couple()
         self.kinematics = Kinematics(self.source.model, list(self.moves), 'ground')
-        self.objects = self._wrap_objects()
         rng = np.random.default_rng(0)
-        self.random = self._postures(
-            {n: rng.uniform(*self._span(n), 200) for n in self.coordinates}
-        )
+        self.random = self._postures({n: rng.uniform(*r, 200) for n, r in self.ranges.items() if n})
+        self.objects = self._wrap_objects()
+        self.points: dict[str, list[Point]] = {}
+        #: what a muscle wraps round after some of its points
+        self.wraps: dict[str, dict[int, Wrap]] = {}
         for item in model.find('ForceSet/objects') or ():
             self._muscle(item)
         if any(self.wraps.values()):
             told = 'lengths are compared round the wrap objects of the result'
             self.source.note('approximated', told)
-        if self.source.strength:
-            self.source.note('chosen', STRENGTH)
         self.source.lengths = self._lengths
 
     # -- bodies and joints -----------------------------------------------------------------------
 
-    def _coordinate(self, item: ET.Element) -> Coordinate:
-        ranged = item.find('range') is not None
-        low, high = _vector(item, 'range', 2) if ranged else (-np.inf, np.inf)
-        locked = item.findtext('locked', 'false').strip().lower() == 'true'
-        default = _number(item, 'default_value')
-        if locked:
-            self.source.note('held fixed', f'locked coordinate {item.get("name")} at {default:.4g}')
-        return Coordinate(low, high, default, locked)
+    def _coordinates(self) -> None:
+        for item in self.model.iter('Coordinate'):
+            name, default = item.get('name', ''), _number(item, 'default_value')
+            low, high = _vector(item, 'range', 2)
+            if _word(item, 'locked').lower() == 'true':
+                self.drivers[name] = '', np.poly1d([default])
+                self.source.note('held fixed', f'locked coordinate {name} at {default:.4g}')
+            else:
+                free = not 0.0 < high - low < 100.0
+                self.drivers[name] = name, IDENTITY
+                self.ranges[name] = (-np.pi, np.pi) if free else (low, high)
+                self.rest[name] = default
+        for item in self.model.findall('ConstraintSet/objects/*'):
+            master, slave = (_word(item, f'{which}dependent_coordinate_name{s}') for which, s in (('in', 's'), ('', '')))  # noqa: E501  # fmt: skip
+            if item.tag != 'CoordinateCouplerConstraint' or master not in self.drivers:
+                self.source.note('dropped', f'{item.tag} {item.get("name")}')
+                continue
+            scale = 1.0 if item.find('scale_factor') is None else _number(item, 'scale_factor')
+            function = _function(item.find('coupled_coordinates_function'))
+            self.drivers[slave] = master, _scaled(function, scale)
 
-    def _span(self, name: str) -> tuple[float, float]:
-        """Return between which values a coordinate moves."""
-        c = self.coordinates[name]
-        if c.locked:
-            return c.default, c.default
-        if name in self.coupled:
-            master, function = self.coupled[name]
-            values = function(np.linspace(*self._span(master), 201))
-            return float(values.min()), float(values.max()) + 1e-6
-        return (c.low, c.high) if c.high - c.low < 100.0 else (-np.pi, np.pi)
+    def _driver(self, name: str, function: Function = IDENTITY) -> tuple[str, Function]:
+        """Return a function of a coordinate as one of the free coordinate that drives it."""
+        master, inner = self.drivers[name]
+        if master in ('', name):
+            return master, lambda x: function(inner(x))
+        return self._driver(master, lambda x: function(inner(x)))
+
+    def _span(self, name: str, function: Function = IDENTITY) -> Array:
+        """Return values (201,) of a function of a coordinate over its range."""
+        free, value = self._driver(name, function)
+        return value(np.linspace(*self.ranges[free], 201))
 
     def _add_frames(self, owner: ET.Element, path: str) -> None:
         for frame in owner.iter('PhysicalOffsetFrame'):
-            parent, offset = self._frame(frame.findtext('socket_parent', path), path)
-            at = pin.SE3(_turn(_vector(frame, 'orientation')), _vector(frame, 'translation'))
-            self.frames[f'{path}/{frame.get("name")}'] = parent, offset * at
+            parent, pose = self._frame(frame, 'socket_parent', path)
+            at = parent, pose * _offset(frame, 'orientation')
+            self.frames[f'{path}/{frame.get("name")}'] = at
 
-    def _frame(self, socket: str, owner: str = '') -> tuple[str, pin.SE3]:
-        """Return the body of a frame that a socket names, and its pose in that body."""
-        parts = [part for part in socket.strip().split('/') if part not in ('', '..', 'bodyset')]
+    def _frame(self, item: ET.Element, tag: str, owner: str = '') -> tuple[str, pin.SE3]:
+        """Return the body of the frame that a socket names, and its pose in that body."""
+        socket = item.findtext(tag, owner).strip()
+        parts = [part for part in socket.split('/') if part not in ('', '..', 'bodyset')]
         for name in ('/'.join([owner, *parts]), '/'.join(parts[-2:]), *parts[-1:]):
             if name in self.frames:
                 return self.frames[name]
         raise ValueError(f'there is no frame {socket!r}')
-
-    def _couplers(self) -> None:
-        for item in self.model.findall('ConstraintSet/objects/*'):
-            masters = item.findtext('independent_coordinate_names', '').split()
-            slave = item.findtext('dependent_coordinate_name', '').strip()
-            element = item.find('coupled_coordinates_function')
-            if (
-                element is None
-                or len(masters) != 1
-                or not {slave, *masters} <= set(self.coordinates)
-            ):
-                self.source.note('dropped', f'{item.tag} {item.get("name")}')
-                continue
-            function = _function(element)
-            scale = 1.0 if item.find('scale_factor') is None else _number(item, 'scale_factor')
-            self.coupled[slave] = masters[0], lambda x, f=function, s=scale: s * f(x)
 
     def _tree(self) -> None:
         """Make links of the bodies, parents first, and joints of the axes between them."""
@@ -239,150 +201,128 @@ class _Reader:
             self._add_frames(body, name)
         joints = {}
         for joint in self.model.find('JointSet/objects') or ():
-            name = joint.get('name', '')
-            self._add_frames(joint, name)
-            parent, before = self._frame(joint.findtext('socket_parent_frame', ''), name)
-            child, after = self._frame(joint.findtext('socket_child_frame', ''), name)
-            joints[child] = parent, before, self._axes(joint), after.inverse()
+            self._add_frames(joint, joint.get('name', ''))
+            parent, before = self._frame(joint, 'socket_parent_frame', joint.get('name', ''))
+            child, after = self._frame(joint, 'socket_child_frame', joint.get('name', ''))
+            joints[child] = parent, before, joint, after.inverse()
         source, order = self.source, ['ground']
         source.add_link('ground', 0, pin.SE3.Identity())
         for above in order:
             for name in [body for body, (parent, *_) in joints.items() if parent == above]:
-                _, before, axes, after = joints.pop(name)
+                _, before, joint, after = joints.pop(name)
                 carrier, at = source.place(above)
-                carrier, at = self._chain(name, axes, carrier, at * before)
+                carrier, at = self._chain(name, joint, carrier, at * before)
                 xx, yy, zz, xy, xz, yz = _vector(bodies[name], 'inertia', 6)
                 tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-                mass = max(_number(bodies[name], 'mass'), 0.0)
-                own = inertia(mass, _vector(bodies[name], 'mass_center'), tensor)
+                mass, centre = _number(bodies[name], 'mass'), _vector(bodies[name], 'mass_center')
+                own = pin.Inertia(max(mass, 0.0), centre, tensor)
                 source.add_link(name, carrier, at * after, own)
                 order.append(name)
-        if lost := sorted(joints.keys() | bodies.keys() - set(order)):
-            raise ValueError(f'body {lost[0]} does not hang on ground')
+        if lost := joints.keys() | bodies.keys() - set(order):
+            raise ValueError(f'body {min(lost)} does not hang on ground')
 
-    def _axes(self, joint: ET.Element) -> list[Axis]:
-        names = [item.get('name', '') for item in joint.findall('coordinates/Coordinate')]
-        if joint.tag == 'FreeJoint':
-            self.source.note('held fixed', f'free joint {joint.get("name")} at 0')
-            return []
+    def _axes(self, joint: ET.Element) -> Iterator[Axis]:
         if joint.tag in AXES:
-            letters = zip(names, AXES[joint.tag], strict=True)
-            identity = np.poly1d([1.0, 0.0])
-            return [Axis(c.isupper(), np.eye(3)['xyz'.index(c.lower())], n, identity) for n, c in letters]  # noqa: E501  # fmt: skip
-        if joint.tag != 'CustomJoint':
-            legal = ', '.join(['FreeJoint', 'CustomJoint', *AXES])
+            names = [item.get('name', '') for item in joint.findall('coordinates/Coordinate')]
+            if joint.tag == 'FreeJoint':
+                self.source.note('held fixed', f'free joint {joint.get("name")} at 0')
+            for name, letter in zip(names, AXES[joint.tag]):
+                yield letter.isupper(), np.eye(3)['xyz'.index(letter.lower())], name, IDENTITY
+        elif joint.tag != 'CustomJoint':
+            legal = ', '.join(['CustomJoint', *AXES])
             raise ValueError(f'joint {joint.get("name")} is a {joint.tag}; read are {legal}')
-        axes = []
         for item in joint.findall('SpatialTransform/TransformAxis'):
             part = next((part for part in item if part.tag not in ('coordinates', 'axis')), None)
-            coordinate = item.findtext('coordinates', '').split() or ['']
-            if len(coordinate) > 1:
-                told = f'joint {joint.get("name")}: an axis of several coordinates'
-                raise ValueError(f'{told} cannot be expressed')
-            slides, axis = item.get('name', '').startswith('translation'), _vector(item, 'axis')
+            slides = item.get('name', '').startswith('translation')
+            coordinate, axis = item.findtext('coordinates', '').strip(), _vector(item, 'axis')
             size = max(float(np.linalg.norm(axis)), 1e-12)
-            axes.append(Axis(slides, axis / size, coordinate[0], _function(part)))
-        return sorted(axes, key=lambda axis: not axis.slides)
+            yield slides, axis / size, coordinate, _function(part)
 
-    def _chain(self, body: str, axes: list[Axis], carrier: int, at: pin.SE3) -> tuple[int, pin.SE3]:
+    def _chain(
+        self, body: str, joint: ET.Element, carrier: int, at: pin.SE3
+    ) -> tuple[int, pin.SE3]:
         """Add a joint for each axis that moves; return the last one, and what follows in it."""
-        for slides, axis, name, function in axes:
-            c = self.coordinates[name] if name else Coordinate(0.0, 0.0, 0.0, True)
-            if c.locked:
-                still = float(function(np.array([c.default]))[0]) * axis
+        for slides, axis, coordinate, own in sorted(self._axes(joint), key=lambda a: not a[0]):
+            name, function = self._driver(coordinate, own)
+            if not name:
+                still = float(function(np.zeros(1))[0]) * axis
                 turn, shift = (np.zeros(3), still) if slides else (still, np.zeros(3))
                 at = at * pin.SE3(pin.exp3(turn), shift)
                 continue
-            x = np.linspace(-1.0, 1.0, 5)
-            sign = next(
-                (s for s in (1.0, -1.0) if np.allclose(function(x), s * x, atol=1e-12)), 0.0
-            )
-            if sign and name not in self.moves:
-                joint, axis, function = name, sign * axis, np.poly1d([1.0, 0.0])
-                limits, rest = self._span(name), c.default
-            else:
-                joint = f'{name}_of_{body}_{len(self.moves)}'
-                y = function(np.linspace(*self._span(name), 201))
-                limits, rest = (float(y.min()) - 1e-6, float(y.max()) + 1e-6), 0.0
-            carrier = self.source.add_joint(joint, carrier, at, slides, axis, limits, rest)
-            self.moves[joint], at = (name, function), pin.SE3.Identity()
+            x, label = np.linspace(-1.0, 1.0, 5), f'{coordinate}_of_{body}_{len(self.moves)}'
+            for sign in (1.0, -1.0):
+                if name not in self.moves and np.allclose(function(x), sign * x, atol=1e-12):
+                    # It carries the coordinate itself.
+                    label, axis, function = name, sign * axis, IDENTITY
+            y, rest = self._span(name, function), float(function(np.array([self.rest[name]]))[0])
+            margin = 0.0 if label == name else 1e-6
+            limits = float(y.min()) - margin, float(y.max()) + margin
+            carrier = self.source.add_joint(label, carrier, at, slides, axis, limits, rest)
+            self.moves[label], at = (name, function), pin.SE3.Identity()
         return carrier, at
 
     def _couple(self) -> None:
-        """Couple joints to coordinates, and coordinates to each other."""
         source = self.source
         for joint, (name, function) in list(self.moves.items()):
-            if joint == name:
-                continue
             if name not in self.moves:
                 # No joint turns by the coordinate itself: a link without mass carries its value.
-                limits, rest = self._span(name), self.coordinates[name].default
-                carrier = source.add_joint(
-                    name, 0, pin.SE3.Identity(), False, np.eye(3)[0], limits, rest
-                )
-                source.add_link(f'value_of_{name}', carrier, pin.SE3.Identity())
-                self.moves[name] = name, np.poly1d([1.0, 0.0])
+                place, axis, limits = pin.SE3.Identity(), np.eye(3)[0], self.ranges[name]
+                carrier = source.add_joint(name, 0, place, False, axis, limits, self.rest[name])
+                source.add_link(f'value_of_{name}', carrier, place)
                 source.note('chosen', f'link value_of_{name}: it carries a coordinate, and no mass')
-            source.couple(joint, name, function)
-        for slave, (master, function) in self.coupled.items():
-            if {slave, master} <= self.moves.keys():
-                source.couple(slave, master, function)
-            else:
-                source.note('dropped', f'coupling of {slave} to {master}')
+                self.moves[name] = name, IDENTITY
+            if joint != name:
+                source.couple(joint, name, function)
 
     # -- muscles ---------------------------------------------------------------------------------
 
     def _wrap_objects(self) -> dict[str, Wrap]:
         objects = {}
         owners = [*self.model.findall('Ground'), *self.model.findall('BodySet/objects/Body')]
-        for body, item in [
-            (b, item) for b in owners for item in b.findall('WrapObjectSet/objects/*')
-        ]:
-            if item.findtext('active', 'true').strip().lower() != 'true':
+        items = [(b, item) for b in owners for item in b.findall('WrapObjectSet/objects/*')]
+        for body, item in items:
+            if _word(item, 'active', 'true').lower() != 'true':
                 continue
-            kind, name, centre = item.tag, item.get('name', ''), _vector(item, 'translation')
-            turn = _turn(_vector(item, 'xyz_body_rotation'))
-            axis, side, told = None, None, ''
-            if kind == 'WrapSphere':
+            kind, name, pose = item.tag, item.get('name', ''), _offset(item, 'xyz_body_rotation')
+            axis, side, told, radius = pose.rotation[:, 2], None, '', 0.0
+            if kind in ('WrapSphere', 'WrapCylinder'):
                 radius = _number(item, 'radius')
-            elif kind == 'WrapCylinder':
-                radius, axis, told = _number(item, 'radius'), turn[:, 2], 'without its ends'
+                axis, told = (None, '') if kind == 'WrapSphere' else (axis, 'without its ends')
             elif kind == 'WrapTorus':
-                radius, axis, side = _number(item, 'inner_radius'), turn[:, 2], centre
+                radius, side = _number(item, 'inner_radius'), pose.translation
                 told = 'a ring along its axis'
             elif kind == 'WrapEllipsoid':
                 sizes = np.abs(_vector(item, 'dimensions'))
                 least, middle, most = np.sort(sizes)
-                radius, told = float(np.cbrt(sizes.prod())), 'a sphere'
+                radius, axis, told = float(np.cbrt(sizes.prod())), None, 'a sphere'
                 if middle < 1.25 * least and most > 1.25 * middle:
-                    radius, axis = float(np.sqrt(least * middle)), turn[:, sizes.argmax()]
+                    radius, axis = float(np.sqrt(least * middle)), pose.rotation[:, sizes.argmax()]
                     told = 'a cylinder'
                 told += f' of {1e3 * radius:.1f} mm'
-            else:
-                radius = 0.0
             if radius <= 0.0:
                 self.source.note('dropped', f'{kind} {name}')
                 continue
+            if told:
+                self.source.note('approximated', f'{kind} {name}: {told}')
             # Whether a quadrant forces a wire round depends on where a finite object ends.
-            anywhere = item.findtext('quadrant', 'all').strip().lower() in ('', 'all')
-            for note in (told, '' if anywhere else 'it is passed on any side'):
-                if note:
-                    self.source.note('approximated', f'{kind} {name}: {note}')
-            objects[name] = Wrap(body.get('name') or 'ground', centre, radius, axis, side)
+            if _word(item, 'quadrant', 'all').lower() != 'all':
+                self.source.note('approximated', f'{kind} {name}: it is passed on any side')
+            objects[name] = Wrap(body.get('name') or 'ground', pose.translation, radius, axis, side)
         return objects
 
     def _point(self, item: ET.Element) -> Point:
-        body, offset = self._frame(item.findtext('socket_parent_frame', ''))
+        (body, offset), always = self._frame(item, 'socket_parent_frame'), ('', -1.0, 1.0)
         if item.tag == 'MovingPathPoint':
             if not offset.isIdentity(1e-9):
                 raise ValueError(f'a moving point {item.get("name")} in an offset frame')
             names = [_word(item, f'socket_{letter}_coordinate') for letter in 'xyz']
             functions = [_function(item.find(f'{letter}_location')) for letter in 'xyz']
-            return Point(body, list(zip(names, functions)), None)
+            return body, list(zip(names, functions)), always
         at = [('', np.poly1d([v])) for v in offset.act(_vector(item, 'location'))]
         if item.tag != 'ConditionalPathPoint':
-            return Point(body, at, None)
-        return Point(body, at, (_word(item, 'socket_coordinate'), *_vector(item, 'range', 2)))
+            return body, at, always
+        low, high = _vector(item, 'range', 2)
+        return body, at, (_word(item, 'socket_coordinate'), low, high)
 
     def _muscle(self, item: ET.Element) -> None:
         source, name = self.source, safe_name(item.get('name'), 'force')
@@ -392,101 +332,93 @@ class _Reader:
             return
         points = [self._point(p) for p in path.findall('PathPointSet/objects/*')]
         places, active = self._path(points, self.random)
-        always = _always_active(points, places, active)
-        kept = np.flatnonzero(always).tolist()
+        always = _always_active(places, active)
         stands = [self._standing(f'muscle {name}', *each) for each in zip(points, always)]
+        kept = np.flatnonzero(always).tolist()
         if len(kept) < 2:
             source.note('dropped', f'muscle {name}: fewer than 2 points')
             return
-        self.points[name], self.wraps[name] = points, {}
-        for wrap in path.findall('PathWrapSet/objects/PathWrap'):
-            label = _word(wrap, 'wrap_object')
-            if told := self._place_wrap(name, wrap, label, places, kept):
-                source.note('dropped', f'muscle {name}: wrap round {label}{told}')
+        self.points[name] = points
+        wraps = self.wraps[name] = self._place_wraps(name, path, places, kept)
         route: list[RoutePoint | Wrap] = []
         for i in kept:
-            route.append(RoutePoint(points[i].body, stands[i]))
-            route += [self.wraps[name][i]] if i in self.wraps[name] else []
+            route += [RoutePoint(points[i][0], stands[i]), *([wraps[i]] if i in wraps else [])]
         source.routes[name] = tuple(route)
-        force = 'max_isometric_force' if item.find('max_isometric_force') is not None else 'optimal_force'  # noqa: E501  # fmt: skip
-        source.strength[name] = _number(item, force)
+        isometric = item.find('max_isometric_force') is not None
+        force = _number(item, 'max_isometric_force' if isometric else 'optimal_force')
+        source.strength[name] = force
 
     def _standing(self, muscle: str, point: Point, kept: bool) -> Array:
         """Return where a point is taken to be, in its body, and say so."""
-        note = self.source.note
-        if point.condition:
-            name, low, high = point.condition
-            least, most = self._span(name)
-            share = max(min(high, most) - max(low, least), 0.0) / max(most - least, 1e-9)
-            told = f'{muscle}: a point active in {100 * share:.0f} % of {name}'
-            note('approximated', f'{told} is {"always there" if kept else "left out"}')
-        span = {n: np.linspace(*self._span(n), 201) if n else np.zeros(1) for n, _ in point.at}
-        ways = [function(span[name]) for name, function in point.at]
-        off = 1e3 * max(float(np.abs(way - way.mean()).max()) for way in ways)
-        if off > 0.0:
-            note('approximated', f'{muscle}: a moving point stands still, off by {off:.1f} mm')
-        return np.array([way.mean() for way in ways])
+        _, axes, (name, low, high) = point
+        if name:
+            values = self._span(name)
+            share = 100 * np.mean((values >= low) & (values <= high))
+            told = f'{muscle}: a point active in {share:.0f} % of {name}'
+            told += f' is {"always there" if kept else "left out"}'
+            self.source.note('approximated', told)
+        ways = [self._span(*axis) for axis in axes]
+        stands = np.array([way.mean() for way in ways])
+        if (off := 1e3 * np.abs(np.transpose(ways) - stands).max()) > 1e-6:
+            told = f'{muscle}: a moving point stands still, off by {off:.1f} mm'
+            self.source.note('approximated', told)
+        return stands
 
-    def _place_wrap(
-        self, muscle: str, item: ET.Element, label: str, places: Array, kept: list[int]
-    ) -> str:
-        """Put a wrap object between the points between which it is met most; say if nowhere."""
-        if label not in self.objects:
-            return ', which is not there'
-        wrap, most, best = self.objects[label], 0.0, -1
-        first, last = map(int, numbers(item.findtext('range') or '-1 -1', 2, f'range of {label}'))
-        for i, k in pairwise(kept):
-            if (
-                (first > 0 and i + 1 < first)
-                or (last > 0 and k + 1 > last)
-                or i in self.wraps[muscle]
-            ):
-                continue
-            ends = places[:, i], places[:, k]
-            added = self._round(wrap, self.random, *ends) - np.linalg.norm(
-                ends[1] - ends[0], axis=1
-            )
-            if added.mean() > most:
-                best, most = i, float(added.mean())
-        if best < 0:
-            return ', which it does not meet'
-        self.wraps[muscle][best] = wrap
-        return ''
+    def _place_wraps(
+        self, muscle: str, path: ET.Element, places: Array, kept: list[int]
+    ) -> dict[int, Wrap]:
+        """Return after which point each wrap object stands: where it is met most."""
+        chosen: dict[int, Wrap] = {}
+        for item in path.findall('PathWrapSet/objects/PathWrap'):
+            best, most, label = -1, 0.0, _word(item, 'wrap_object')
+            first, last = numbers(item.findtext('range') or '-1 -1', 2, f'range of {label}')
+            for i, k in pairwise(kept):
+                if i + 1 < first or k + 1 > last > 0 or i in chosen or label not in self.objects:
+                    continue
+                line = np.linalg.norm(places[:, k] - places[:, i], axis=1)
+                ends = places[:, i], places[:, k]
+                added = (self._round(self.objects[label], self.random, *ends) - line).mean()
+                if added > most:
+                    best, most = i, added
+            if best >= 0:
+                chosen[best] = self.objects[label]
+            else:
+                told = f'muscle {muscle}: wrap round {label}, which it does not meet'
+                self.source.note('dropped', told)
+        return chosen
 
     # -- OpenSim's own lengths -------------------------------------------------------------------
 
     def _postures(self, given: dict[str, Array]) -> Postures:
-        """Return postures for coordinates (N,); those that are not given are at their defaults."""
+        """Return postures for free coordinates (N,); those not given are at their defaults."""
         count = len(next(iter(given.values())))
-        values = {n: given.get(n, np.full(count, c.default)) for n, c in self.coordinates.items()}
-        values[''] = np.zeros(count)
-        for _ in self.coupled:  # as often as one may follow another
-            for slave, (master, function) in self.coupled.items():
-                values[slave] = function(values[master])
+        free = {n: given.get(n, np.full(count, rest)) for n, rest in self.rest.items()}
+        values = {}
+        for name in self.drivers:
+            master, function = self._driver(name)
+            values[name] = function(free[master])
         q = np.stack([function(values[name]) for name, function in self.moves.values()], axis=1)
-        return Postures(values, self.kinematics.transforms(q))
+        return values, self.kinematics.transforms(q)
 
-    def _path(self, points: list[Point], at: Postures) -> tuple[Array, Array]:
+    def _path(self, points: list[Point], at: Postures) -> tuple[Array, Bools]:
         """Return points (N, P, 3), and whether each is active (N, P)."""
+        values, poses = at
         places, active = [], []
-        for body, functions, condition in points:
+        for body, axes, (name, low, high) in points:
             joint, pose = self.source.place(body)
-            local = np.stack([function(at.values[name]) for name, function in functions], axis=1)
-            local = local @ pose.rotation.T + pose.translation
-            world = at.poses[:, joint]
+            local = np.stack([function(values[name]) for name, function in axes], axis=1)
+            world, local = poses[:, joint], local @ pose.rotation.T + pose.translation
             places.append(np.einsum('nij,nj->ni', world[:, :3, :3], local) + world[:, :3, 3])
-            name, low, high = condition or ('', -1.0, 1.0)
-            active.append((at.values[name] >= low) & (at.values[name] <= high))
+            active.append((values[name] >= low) & (values[name] <= high))
         return np.stack(places, axis=1), np.stack(active, axis=1)
 
     def _round(self, wrap: Wrap, at: Postures, start: Array, end: Array) -> Array:
         """Return lengths (N,) round an object from start to end (N, 3)."""
         from musculoskeletal_ae.robot.wrapping import place_objects, wrapped_segments
 
-        objects = place_objects(self.kinematics, [wrap])
-        turned, moved = (np.ascontiguousarray(part) for part in (at.poses[..., :3, :3], at.poses[..., :3, 3]))  # noqa: E501  # fmt: skip
-        ends = (np.ascontiguousarray(point[:, None]) for point in (start, end))
-        return wrapped_segments(objects, turned, moved, *ends)[0][:, 0]
+        parts = at[1][..., :3, :3], at[1][..., :3, 3], start[:, None], end[:, None]
+        arrays = (np.ascontiguousarray(part) for part in parts)
+        return wrapped_segments(place_objects(self.kinematics, [wrap]), *arrays)[0][:, 0]
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
         at, result = self._postures(values), {}
@@ -496,11 +428,11 @@ class _Reader:
             steps = np.linalg.norm(after - places, axis=2)
             for i, wrap in self.wraps[name].items():
                 steps[:, i] = self._round(wrap, at, places[:, i], after[:, i])
-            result[name] = np.nansum(np.where(active, steps, 0.0), axis=1)
+            result[name] = np.nansum(steps * active, axis=1)
         return result
 
 
-def _following(places: Array, active: Array) -> Array:
+def _following(places: Array, active: Bools) -> Array:
     """Return for each of the points (N, P, 3) the active one that follows, NaN for none."""
     after, last = np.empty_like(places), np.full(places[:, 0].shape, np.nan)
     for i in reversed(range(places.shape[1])):
@@ -508,24 +440,24 @@ def _following(places: Array, active: Array) -> Array:
     return after
 
 
-def _always_active(points: list[Point], places: Array, active: Array) -> Array:
+def _always_active(places: Array, active: Bools) -> Bools:
     """Return which points the route keeps: of conditional ones those that err least.
 
     Begins with all and changes one at a time, as long as that lowers the squared error of how the
     length changes.
     """
 
-    def length(mask: Array) -> Array:
+    def length(mask: Bools) -> Array:
         steps = np.linalg.norm(_following(places, mask) - places, axis=2)
-        return np.nansum(np.where(mask, steps, 0.0), axis=1)
+        return np.nansum(steps * mask, axis=1)
 
-    def error(tried: Array) -> float:
+    def error(tried: Bools) -> float:
         return float(np.var(length(np.broadcast_to(tried, active.shape)) - true))
 
-    true, kept = length(active), np.ones(len(points), dtype=bool)
-    conditional = [i for i, point in enumerate(points) if point.condition]
+    true, kept = length(active), np.ones(active.shape[1], dtype=bool)
+    conditional = np.flatnonzero(~active.all(axis=0))
     for _ in conditional:
-        best = min((kept ^ (np.arange(len(points)) == i) for i in conditional), key=error)
+        best = min((kept ^ (np.arange(len(kept)) == i) for i in conditional), key=error)
         if error(best) >= error(kept):
             break
         kept = best

@@ -111,12 +111,6 @@ class Source:
             self.note('approximated', f'joint {told} {"m" if slides else "rad"}')
 
 
-def inertia(mass: float, centre: Array, tensor: Array, turn: Array | None = None) -> pin.Inertia:
-    """Return an inertia in the link's frame; the tensor [kg·m²] is about the centre of mass."""
-    turn = np.eye(3) if turn is None else turn
-    return pin.Inertia(float(mass), np.asarray(centre, float), turn @ tensor @ turn.T)
-
-
 def numbers(text: str | None, count: int, where: str) -> Array:
     """Return numbers of an XML text; a ValueError says where they are not."""
     try:
@@ -197,6 +191,8 @@ def cut(
         elif not muscles or name in muscles:
             continue
         del source.routes[name]
+    if any(source.strength.values()):
+        source.note('chosen', STRENGTH)
     if not wanted:
         raise SourceError('no joint is left that moves')
 
@@ -250,9 +246,9 @@ def urdf(source: Source) -> str:
         carriers.setdefault(i, f'{model.names[i]}_link')
         kind = 'prismatic' if model.joints[i].shortname() in PRISMATIC else 'revolute'
         own, at = model.inertias[i], model.jointPlacements[i]
-        link = attach(model.names[i], kind, carriers[i], model.parents[i], at)
+        body = attach(model.names[i], kind, carriers[i], model.parents[i], at)
         if own.mass > 0.0:
-            inertial = ET.SubElement(link, 'inertial')
+            inertial = ET.SubElement(body, 'inertial')
             ET.SubElement(inertial, 'origin', xyz=_text(own.lever))
             ET.SubElement(inertial, 'mass', value=_text(own.mass))
             pairs = [(i, j) for i in range(3) for j in range(i, 3)]

@@ -17,6 +17,7 @@ calls it for many, the emulator in each of its steps.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12
-Vector = tuple[float, float, float]
+Vector = tuple[float, float, float] | Array
 
 
 class WrapObjects(NamedTuple):
@@ -58,86 +59,84 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
 
 
 @njit(cache=True)
-def _meet(ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float) -> bool:  # noqa: E501  # fmt: skip
+def _cross2(a: complex, b: complex) -> float:
+    return a.real * b.imag - a.imag * b.real
+
+
+@njit(cache=True)
+def _dot2(a: complex, b: complex) -> float:
+    return a.real * b.real + a.imag * b.imag
+
+
+@njit(cache=True)
+def _meet(a: complex, b: complex, c: complex, d: complex) -> bool:
     """Return whether the segments a–b and c–d cross."""
-    determinant = (dy - cy) * (bx - ax) - (dx - cx) * (by - ay)
+    determinant = _cross2(b - a, d - c)
     if abs(determinant) < TINY:
         return False
-    p = ((dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)) / determinant
-    q = ((bx - ax) * (ay - cy) - (by - ay) * (ax - cx)) / determinant
+    p, q = _cross2(d - c, a - c) / determinant, _cross2(b - a, a - c) / determinant
     return 0.0 <= p <= 1.0 and 0.0 <= q <= 1.0
 
 
 @njit(cache=True)
-def _through_ring(ax: float, ay: float, bx: float, by: float, r: float) -> tuple[bool, float, float]:  # noqa: E501  # fmt: skip
-    """Return whether a wire is drawn to a ring's inside, and the point where it touches it.
+def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, complex, complex]:
+    """Return what `_round` does for a wire that is drawn to a ring's inside.
 
-    There both straight parts make the same angle with the radius: with z its sine,
+    Where it touches, both straight parts make the same angle with the radius: with z its sine,
     asin(r z / a) + asin(r z / b) − 2 asin z + (angle between the ends) = 0.
     """
-    a, b = math.hypot(ax, ay), math.hypot(bx, by)
-    square = (bx - ax) ** 2 + (by - ay) ** 2
-    if a <= r or b <= r or square < TINY:
-        return False, 0.0, 0.0
-    share = -((bx - ax) * ax + (by - ay) * ay) / square
-    if 0.0 < share < 1.0 and math.hypot(ax + share * (bx - ax), ay + share * (by - ay)) <= r:
-        return False, 0.0, 0.0
-    cosine = (ax * bx + ay * by) / (a * b)
-    if cosine <= -1.0 + TINY:
-        return False, 0.0, 0.0
+    straight = False, 0.0, 0j, 0j
+    d, far, near = b - a, abs(a), abs(b)
+    if far <= r or near <= r or abs(d) < TINY:
+        return straight
+    share = min(1.0, max(0.0, -_dot2(d, a) / _dot2(d, d)))
+    cosine = _dot2(a, b) / (far * near)
+    if abs(a + share * d) <= r or cosine <= TINY - 1.0:
+        return straight
     angle = math.acos(min(1.0, cosine))
     low, high = 0.0, 1.0
     for _ in range(60):
         z = 0.5 * (low + high)
-        if math.asin(r * z / a) + math.asin(r * z / b) - 2.0 * math.asin(z) + angle > 0.0:
+        if math.asin(r * z / far) + math.asin(r * z / near) - 2.0 * math.asin(z) + angle > 0.0:
             low = z
         else:
             high = z
-    turn = math.asin(low) - math.asin(r * low / a)
-    if ax * by - ay * bx < 0.0:
-        turn = -turn
-    start = math.atan2(ay, ax) + turn
-    return True, r * math.cos(start), r * math.sin(start)
+    turn = math.asin(low) - math.asin(r * low / far)
+    touch = a / far * r * cmath.rect(1.0, math.copysign(turn, _cross2(a, b)))
+    first, second = max(abs(touch - a), TINY), max(abs(touch - b), TINY)
+    return True, first + second, (touch - a) / first, (touch - b) / second
 
 
 @njit(cache=True)
-def _flat(ax: float, ay: float, bx: float, by: float, r: float, sided: bool, sx: float, sy: float) -> tuple[bool, float, float, float, float, float]:  # noqa: E501  # fmt: skip
-    """Return whether it wraps in the plane, its length, and the unit pulls at a and at b."""
-    straight = False, 0.0, 0.0, 0.0, 0.0, 0.0
-    da, db = math.hypot(ax, ay), math.hypot(bx, by)
-    dx, dy = bx - ax, by - ay
-    square = dx * dx + dy * dy
-    if da < r or db < r or square < TINY * TINY:
+def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float, complex, complex]:
+    """Return whether it wraps in the plane, its length, and the unit pulls at a and at b.
+
+    The side is a direction, or 0 for none.
+    """
+    straight = False, 0.0, 0j, 0j
+    d, sided = b - a, abs(side) > 0.5
+    if abs(a) < r or abs(b) < r or abs(d) < TINY:
         return straight
-    share = min(1.0, max(0.0, -(dx * ax + dy * ay) / square))
-    nx, ny = ax + share * dx, ay + share * dy
-    if nx * nx + ny * ny > r * r and (not sided or sx * nx + sy * ny >= 0.0):
+    nearest = a + min(1.0, max(0.0, -_dot2(d, a) / _dot2(d, d))) * d
+    if abs(nearest) > r and (not sided or _dot2(side, nearest) >= 0.0):
         return straight
-    best, found = -1e9, False
-    arc = ta = tb = chosen = 0.0
+    best, result = -1e9, straight
     for way in (1.0, -1.0):
-        pa = math.atan2(ay, ax) + way * math.acos(r / da)
-        pb = math.atan2(by, bx) - way * math.acos(r / db)
-        ux, uy, vx, vy = r * math.cos(pa), r * math.sin(pa), r * math.cos(pb), r * math.sin(pb)
-        if sided:
-            middle = math.hypot(ux + vx, uy + vy) + TINY
-            good = ((ux + vx) * sx + (uy + vy) * sy) / middle
-        else:
-            good = -((ux - vx) ** 2) - (uy - vy) ** 2
-        crosses = _meet(ax, ay, ux, uy, bx, by, vx, vy)
+        start = cmath.phase(a) + way * math.acos(r / abs(a))
+        end = cmath.phase(b) - way * math.acos(r / abs(b))
+        u, v = cmath.rect(r, start), cmath.rect(r, end)
+        good = _dot2(u + v, side) / (abs(u + v) + TINY) if sided else -abs(u - v)
+        crosses = _meet(a, u, b, v)
         if crosses:
             good = -1e4
         if good > best:
+            best, arc = good, (way * (end - start)) % (2.0 * math.pi)
             # An arc that rounding made just less than nothing is no turn round the object.
-            best, turn = good, (way * (pb - pa)) % (2.0 * math.pi)
-            found = not crosses and turn < 2.0 * math.pi - 1e-9
-            arc, ta, tb = turn, pa, pb
-            chosen = way
-    if not found:
-        return straight
-    length = math.sqrt(da * da - r * r) + math.sqrt(db * db - r * r) + r * arc
-    # Where it meets the circle, the wire goes the way it turns.
-    return True, length, -chosen * math.sin(ta), chosen * math.cos(ta), chosen * math.sin(tb), -chosen * math.cos(tb)  # noqa: E501  # fmt: skip
+            wraps = not crosses and arc < 2.0 * math.pi - 1e-9
+            length = math.sqrt(abs(a) ** 2 - r * r) + math.sqrt(abs(b) ** 2 - r * r) + r * arc
+            # Where it meets the circle, the wire goes the way it turns.
+            result = wraps, length, way * 1j * u / r, -way * 1j * v / r
+    return result
 
 
 @njit(cache=True)
@@ -146,12 +145,14 @@ def _dot(a: Vector, b: Vector) -> float:
 
 
 @njit(cache=True)
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
 def _cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    x, y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+    return x, y, a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
@@ -162,22 +163,13 @@ def _unit(a: Vector) -> Vector:
 
 @njit(cache=True)
 def _beside(a: Vector) -> Vector:
-    """Return some unit vector across another one."""
-    x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
-    if x <= y and x <= z:
-        return _unit((0.0, -a[2], a[1]))
-    if y <= z:
-        return _unit((a[2], 0.0, -a[0]))
-    return _unit((-a[1], a[0], 0.0))
+    """Return some unit vector across a unit vector."""
+    return _unit(_cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
 
 
 @njit(cache=True)
 def _placed(rotation: Array, vector: Array) -> Vector:
-    return (
-        rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
-        rotation[1, 0] * vector[0] + rotation[1, 1] * vector[1] + rotation[1, 2] * vector[2],
-        rotation[2, 0] * vector[0] + rotation[2, 1] * vector[1] + rotation[2, 2] * vector[2],
-    )
+    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
 
 
 @njit(cache=True)
@@ -191,18 +183,15 @@ def wrapped_segment(
     vectors along which the wire pulls its start (`leave`) and its end (`arrive`).
     """
     j, radius = objects.joint[s], objects.radius[s]
-    centre = _placed(rotation[j], objects.centre[s])
     axis, side = _placed(rotation[j], objects.axis[s]), _placed(rotation[j], objects.side[s])
-    base = translation[j]
-    x, y, z = centre[0] + base[0], centre[1] + base[1], centre[2] + base[2]
-    a = (start[0] - x, start[1] - y, start[2] - z)
-    b = (end[0] - x, end[1] - y, end[2] - z)
-    line = (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+    centre = _placed(rotation[j], objects.centre[s])
+    a = _minus(_minus(start, translation[j]), centre)
+    b = _minus(_minus(end, translation[j]), centre)
+    line, sided = _minus(b, a), not math.isnan(side[0])
     straight = math.sqrt(_dot(line, line))
     for k in range(3):
         leave[k] = line[k] / max(straight, TINY)
         arrive[k] = -leave[k]
-    sided = not math.isnan(side[0])
     if _dot(axis, axis) > 0.5:
         u = _beside(axis)
         v = _cross(axis, u)
@@ -212,27 +201,19 @@ def wrapped_segment(
             # Through the centre every plane is as good: take that of the side, or any.
             normal = _cross(a, side) if sided else _beside(u)
         v = _cross(_unit(normal), u)
-    ax, ay, bx, by = _dot(a, u), _dot(a, v), _dot(b, u), _dot(b, v)
-    sx = sy = 0.0
+    flat_a, flat_b = complex(_dot(a, u), _dot(a, v)), complex(_dot(b, u), _dot(b, v))
     if sided and _dot(side, side) < radius * radius:
-        wraps, tx, ty = _through_ring(ax, ay, bx, by, radius)
-        first, second = math.hypot(tx - ax, ty - ay), math.hypot(tx - bx, ty - by)
-        flat = first + second
-        lx, ly = (tx - ax) / max(first, TINY), (ty - ay) / max(first, TINY)
-        rx, ry = (tx - bx) / max(second, TINY), (ty - by) / max(second, TINY)
+        wraps, flat, first, last = _through_ring(flat_a, flat_b, radius)
     else:
-        if sided:
-            sx, sy = _dot(side, u), _dot(side, v)
-            size = max(math.hypot(sx, sy), TINY)
-            sx, sy = sx / size, sy / size
-        wraps, flat, lx, ly, rx, ry = _flat(ax, ay, bx, by, radius, sided, sx, sy)
+        way = complex(_dot(side, u), _dot(side, v)) if sided else 0j
+        wraps, flat, first, last = _round(flat_a, flat_b, radius, way / max(abs(way), TINY))
     if not wraps:
         return straight
     rise = _dot(line, axis)
     length = math.sqrt(flat * flat + rise * rise)
     for k in range(3):
-        leave[k] = (flat * (lx * u[k] + ly * v[k]) + rise * axis[k]) / length
-        arrive[k] = (flat * (rx * u[k] + ry * v[k]) - rise * axis[k]) / length
+        leave[k] = (flat * (first.real * u[k] + first.imag * v[k]) + rise * axis[k]) / length
+        arrive[k] = (flat * (last.real * u[k] + last.imag * v[k]) - rise * axis[k]) / length
     return length
 
 
@@ -260,29 +241,18 @@ def touched(
     length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
     if np.linalg.norm(leave + arrive) < 1e-9:
         return np.zeros((0, 3))
-    j = objects.joint[s]
-    axis = rotation[j] @ objects.axis[s]
-    centre = translation[j] + rotation[j] @ objects.centre[s]
-
-    def across(vector: Array) -> Array:
-        return vector - (vector @ axis) * axis
-
-    if objects.side[s] @ objects.side[s] < objects.radius[s] ** 2:
+    j, radius = objects.joint[s], objects.radius[s]
+    if objects.side[s] @ objects.side[s] < radius**2:
         # A ring: the straight parts meet where the wire touches it.
-        both = np.stack([leave, -arrive], axis=1)
-        first = float(np.linalg.lstsq(both, end - start, rcond=None)[0][0])
-        return (start + first * leave)[None]
-
-    def foot(point: Array, pull: Array) -> float:
-        flat = across(pull)
-        return float(-(across(point - centre) @ flat) / (flat @ flat))
-
-    first, last = foot(start, leave), foot(end, arrive)
-    arc = max(length - first - last, 0.0)
-    ahead = across(leave)
-    speed = np.linalg.norm(ahead)
-    turn = np.linspace(0.0, speed * arc / objects.radius[s], 9)[:, None]
+        parts = np.linalg.lstsq(np.stack([leave, -arrive], axis=1), end - start, rcond=None)[0]
+        return (start + parts[0] * leave)[None]
+    axis, centre = rotation[j] @ objects.axis[s], translation[j] + rotation[j] @ objects.centre[s]
+    across = np.eye(3) - np.outer(axis, axis)
+    ahead, speed = across @ leave, float(np.linalg.norm(across @ leave))
+    # The straight parts end where they are nearest to the axis.
+    first, last = ((centre - start) @ ahead / speed**2, (centre - end) @ across @ arrive / speed**2)
+    turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, 9)[:, None]
     begin = start + first * leave - centre
-    along = begin @ axis + turn * objects.radius[s] / speed * (leave @ axis)
-    points: Array = centre + along * axis + np.cos(turn) * across(begin)
-    return points + np.sin(turn) * objects.radius[s] * ahead / speed
+    along = (begin @ axis + turn * radius / speed * (leave @ axis)) * axis
+    points: Array = centre + along + np.cos(turn) * (across @ begin)
+    return points + np.sin(turn) * radius * ahead / speed
