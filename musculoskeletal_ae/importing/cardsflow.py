@@ -20,7 +20,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import PRISMATIC, Kinematics
+from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, parse_xml, read_mimics, read_urdf
 
@@ -92,7 +92,8 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
     for joint in root.findall('joint[@type="continuous"]'):
         joint.set('type', 'revolute')
-        joint.remove(joint.find('limit') or ET.SubElement(joint, 'limit'))
+        for limit in joint.findall('limit'):
+            joint.remove(limit)
         ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
     text = ET.tostring(root, encoding='unicode')
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
@@ -101,8 +102,8 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for name, joint in zip(model.names[1:], model.joints[1:]):
         if joint.shortname() in KINDS:
-            slides, q = joint.shortname() in PRISMATIC, joint.idx_q
-            low[q], high[q] = source.limited(name, slides, low[q], high[q])
+            q = joint.idx_q
+            low[q], high[q] = source.limited(name, source.slides(name), low[q], high[q])
     model.lowerPositionLimit, model.upperPositionLimit = low, high
     source.couplings = read_mimics(file, text)
     origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}

@@ -14,6 +14,7 @@ from musculoskeletal_ae.importing.mjcf import read_mjcf
 from musculoskeletal_ae.importing.opensim import read_osim
 from musculoskeletal_ae.importing.source import POSTURES, Source, compare, cut, refuse, write
 from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
+from musculoskeletal_ae.robot.kinematics import resolved
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
@@ -48,6 +49,7 @@ def read_source(file: Path) -> Source:
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')
     try:
         source = READERS[root.tag](file, root)
+        source.couplings = resolved(source.couplings)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
         told = str(e) if isinstance(e, ValueError) else repr(e)
         raise refuse(file, f'it is not as its format has it: {told}') from e

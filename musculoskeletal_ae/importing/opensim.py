@@ -31,15 +31,9 @@ OLDEST = 40000  # version of a document: joints in a JointSet, frames by sockets
 
 #: axis of each coordinate of joints without a SpatialTransform; it slides along capital letters
 AXES = {
-    'PinJoint': 'z',
-    'SliderJoint': 'X',
-    'UniversalJoint': 'xy',
-    'BallJoint': 'xyz',
-    'GimbalJoint': 'xyz',
-    'PlanarJoint': 'zXY',
-    'WeldJoint': '',
-    'FreeJoint': '',
-}
+    'PinJoint': 'z', 'SliderJoint': 'X', 'UniversalJoint': 'xy', 'BallJoint': 'xyz',
+    'GimbalJoint': 'xyz', 'PlanarJoint': 'zXY', 'WeldJoint': '', 'FreeJoint': '',
+}  # fmt: skip
 IDENTITY: Function = np.poly1d([1.0, 0.0])
 
 #: whether it slides, direction, coordinate ('': none), function of it that is its value

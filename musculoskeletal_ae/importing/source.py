@@ -6,9 +6,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
@@ -17,9 +18,10 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import PRISMATIC, REVOLUTE, Coupling, joint_axis, resolved
+from musculoskeletal_ae.robot.kinematics import PRISMATIC, REVOLUTE, Coupling, joint_axis
 from musculoskeletal_ae.robot.robot import Robot
 
+KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # in which lengths are compared
 STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
 UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
@@ -99,6 +101,10 @@ class Source:
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
+    def slides(self, joint: str) -> bool:
+        """Return whether a joint is prismatic."""
+        return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
+
     def couple(self, slave: str, master: str, function: Function) -> None:
         """Let a joint follow another by the line nearest to a function, in squares."""
         x = np.linspace(*self.span(master), 201)
@@ -106,9 +112,8 @@ class Source:
         slope, offset = (round(float(v), 12) for v in np.polyfit(x, y, 1))
         self.couplings[slave] = Coupling(master, slope, offset)
         if (error := float(np.abs(slope * x + offset - y).max())) > 1e-6:
-            slides = self.model.joints[self.model.getJointId(slave)].shortname() in PRISMATIC
             told = f'{slave} follows {master} by a line, off by up to {error:.3g}'
-            self.note('approximated', f'joint {told} {"m" if slides else "rad"}')
+            self.note('approximated', f'joint {told} {"m" if self.slides(slave) else "rad"}')
 
 
 def numbers(text: str | None, count: int, where: str) -> Array:
@@ -140,9 +145,9 @@ def cut(
     nor are one piece with it go, with the muscles that are fastened to them or move no joint.
     """
     model, links = source.model, source.links
-    for option, name, legal in (('--base', base, links), ('--end', end, links)):
-        if name and name not in legal:
-            raise SourceError(f'{option} {name}: no such link; links: {", ".join(legal)}')
+    for option, name in (('--base', base), ('--end', end)):
+        if name and name not in links:
+            raise SourceError(f'{option} {name}: no such link; links: {", ".join(links)}')
     root = source.place(base)[0] if base else 0
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
@@ -152,10 +157,7 @@ def cut(
     source.links.sort(key=lambda name: name != base)
     inner = [model.names[i] for i in inside if i not in (0, root)]
     movable = [n for n in inner if model.joints[model.getJointId(n)].shortname() in KINDS]
-    try:
-        couplings = resolved(source.couplings)
-    except ValueError as error:
-        raise SourceError(str(error)) from error
+    couplings = source.couplings
     free = [name for name in movable if name not in {*couplings, *source.fixed}]
     wanted = set(joints or free)
     if missing := sorted(wanted - set(free)):
@@ -180,8 +182,8 @@ def cut(
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
     source.model = pin.buildReducedModel(model, locked, at_rest)
     if unknown := [name for name in muscles if name not in source.routes]:
-        legal_muscles = ', '.join(source.routes)
-        raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal_muscles}')
+        legal = ', '.join(source.routes)
+        raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal}')
     for name, route in list(source.routes.items()):
         lost = [item.link for item in route if item.link not in source.links]
         if lost:
@@ -197,19 +199,15 @@ def cut(
         raise SourceError('no joint is left that moves')
 
 
-KINDS = REVOLUTE + PRISMATIC
-
-
 def _text(values: Any) -> str:
     return ' '.join(f'{v:.12g}' for v in np.ravel(values))
 
 
 def urdf(source: Source) -> str:
     """Return the text of a URDF, without the weight of the root, whose z axis points upwards."""
-    model, robot = source.model, ET.Element('robot', name=source.name)
-    root, (_, pose) = source.links[0], source.place(source.links[0])
-    upright = pin.SE3(pose.rotation, np.zeros(3))
-    if (size := np.linalg.norm(model.gravity.linear)) < 1e-6:
+    model, root, (_, pose) = source.model, source.links[0], source.place(source.links[0])
+    upright, size = pin.SE3(pose.rotation, np.zeros(3)), np.linalg.norm(model.gravity.linear)
+    if size < 1e-6:
         source.note('chosen', 'gravity: along −z, the source has none')
     else:
         down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
@@ -222,43 +220,35 @@ def urdf(source: Source) -> str:
         joint, at = source.place(link)
         if joint and at.isIdentity(1e-9):
             carriers.setdefault(joint, link)
+    parts = ['<?xml version="1.0"?>', f'<robot name="{source.name}">']
+    parts.append(f'  <link name={quoteattr(carriers[0])}/>')
 
-    def attach(name: str, kind: str, link: str, parent: int, at: pin.SE3) -> ET.Element:
-        if not parent:
-            at = upright * pose.inverse() * at
-        child, joint = ET.SubElement(robot, 'link', name=link), ET.Element('joint', name=name)
-        robot.append(joint)
-        joint.set('type', kind)
-        ET.SubElement(joint, 'parent', link=carriers[parent])
-        ET.SubElement(joint, 'child', link=link)
-        turn = pin.rpy.matrixToRpy(at.rotation)
-        ET.SubElement(joint, 'origin', xyz=_text(at.translation), rpy=_text(turn))
-        if kind != 'fixed':
-            low, high = (_text(limit) for limit in source.span(name))
-            ET.SubElement(
-                joint, 'axis', xyz=_text(joint_axis(model.joints[model.getJointId(name)]))
-            )
-            ET.SubElement(joint, 'limit', lower=low, upper=high, effort='1000', velocity='10')
-        return child
+    def attach(name: str, kind: str, link: str, parent: int, at: pin.SE3, more: str = '') -> None:
+        at = at if parent else upright * pose.inverse() * at
+        ends = f'<parent link={quoteattr(carriers[parent])}/><child link={quoteattr(link)}/>'
+        turn = _text(pin.rpy.matrixToRpy(at.rotation))
+        origin = f'<origin xyz="{_text(at.translation)}" rpy="{turn}"/>'
+        parts.append(f'  <joint name={quoteattr(name)} type="{kind}">{ends}{origin}{more}</joint>')
 
-    ET.SubElement(robot, 'link', name=carriers[0])
-    for i in range(1, model.njoints):
-        carriers.setdefault(i, f'{model.names[i]}_link')
-        kind = 'prismatic' if model.joints[i].shortname() in PRISMATIC else 'revolute'
-        own, at = model.inertias[i], model.jointPlacements[i]
-        body = attach(model.names[i], kind, carriers[i], model.parents[i], at)
-        if own.mass > 0.0:
-            inertial = ET.SubElement(body, 'inertial')
-            ET.SubElement(inertial, 'origin', xyz=_text(own.lever))
-            ET.SubElement(inertial, 'mass', value=_text(own.mass))
-            pairs = [(i, j) for i in range(3) for j in range(i, 3)]
-            entries = {f'i{"xyz"[i]}{"xyz"[j]}': _text(own.inertia[i, j]) for i, j in pairs}
-            ET.SubElement(inertial, 'inertia', entries)
+    for i, name in enumerate(model.names[1:], 1):
+        link, own = carriers.setdefault(i, f'{name}_link'), model.inertias[i]
+        pairs = combinations_with_replacement(range(3), 2)
+        tensor = ' '.join(f'i{"xyz"[j]}{"xyz"[k]}="{own.inertia[j, k]:.12g}"' for j, k in pairs)
+        body = (
+            f'<origin xyz="{_text(own.lever)}"/><mass value="{own.mass:.12g}"/><inertia {tensor}/>'
+        )
+        weighs = f'<inertial>{body}</inertial>' if own.mass > 0.0 else ''
+        parts.append(f'  <link name={quoteattr(link)}>{weighs}</link>')
+        low, high = source.span(name)
+        limits = f'lower="{low:.12g}" upper="{high:.12g}" effort="1000" velocity="10"'
+        more = f'<axis xyz="{_text(joint_axis(model.joints[i]))}"/><limit {limits}/>'
+        kind = 'prismatic' if source.slides(name) else 'revolute'
+        attach(name, kind, link, model.parents[i], model.jointPlacements[i], more)
     for link in source.links:
         if link not in carriers.values():
+            parts.append(f'  <link name={quoteattr(link)}/>')
             attach(f'to_{link}', 'fixed', link, *source.place(link))
-    ET.indent(robot)
-    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding='unicode') + '\n'
+    return '\n'.join([*parts, '</robot>', ''])
 
 
 def _item(item: RoutePoint | Wrap) -> dict[str, Any]:
@@ -285,7 +275,7 @@ def write(source: Source, out: Path) -> None:
         document['end_effector'] = source.end_effector
     if source.couplings:
         document['couplings'] = [{'joint': s, **c._asdict()} for s, c in source.couplings.items()]
-    text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100), urdf(source)  # noqa: E501  # fmt: skip
+    text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
     out.mkdir(parents=True, exist_ok=True)
     (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
