@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -86,16 +86,13 @@ class Individual:
         )
         nominal = robot.routes
         shift = rng.normal(0.0, spread.attachment, nominal.point.shape)
-        sphere_joint, radius = _bone_heads(robot, spread.wrap, rng)
         self.routes = WrappedRoutes(
             nominal.joint.astype(np.int64),
             nominal.point + shift,
             nominal.first.astype(np.int64),
             nominal.second.astype(np.int64),
             nominal.muscle.astype(np.int64),
-            sphere_joint,
-            radius,
-            _objects(robot, nominal.point + shift, spread.wrap > 0.0, seed),
+            _objects(robot, nominal.point + shift, spread.wrap, seed, rng),
         )
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         nominal_elastic = robot.series_elastic
@@ -132,73 +129,56 @@ class Individual:
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
 
-def _objects(robot: Robot, point: Array, differs: bool, seed: int) -> WrapObjects:
-    """Return what the description wraps each segment round, a little thicker or thinner.
+def _objects(
+    robot: Robot, point: Array, quantile: float, seed: int, rng: np.random.Generator
+) -> WrapObjects:
+    """Return what each segment wraps round: as described, a little thicker or thinner, or a head.
 
-    Never so thick that the true route's points come to lie inside it.
+    A bone's head sits at the joint centre nearest to the line. It is thick enough to touch the line
+    in a share `quantile` of the postures, but never so thick that the wire could slip over to its
+    other side. Nothing ever reaches an attachment, those of the description not the true `point`.
     """
     kin, routes = robot.kinematics, robot.routes
     count = len(routes.first)
-    centre, axis, side = np.zeros((3, count, 3))
-    objects = WrapObjects(np.zeros(count, np.int64), centre, axis, side, np.zeros(count))
-    if routes.objects is None:
-        return objects
-    for whole, part in zip(objects, routes.objects, strict=True):
-        whole[routes.wrapping] = part
-    if differs:
-        poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
-        thickness = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
-        for s in routes.wrapping:
-            turn = poses.rotation[:, objects.joint[s]]
-            centre = poses.translation[:, objects.joint[s]] + turn @ objects.centre[s]
-            least = np.inf
-            for end in (routes.first[s], routes.second[s]):
-                joint = routes.joint[end]
-                at = poses.translation[:, joint] + poses.rotation[:, joint] @ point[end]
-                away, axis = at - centre, turn @ objects.axis[s]
-                away = away - (away * axis).sum(axis=1, keepdims=True) * axis
-                least = min(least, float(np.linalg.norm(away, axis=1).min()))
-            objects.radius[s] = min(objects.radius[s] * thickness[s], 0.95 * least)
-    return objects
-
-
-def _bone_heads(robot: Robot, quantile: float, rng: np.random.Generator) -> tuple[Ints, Array]:
-    """Return for each segment the joint whose head it may wrap round, and the head's radius.
-
-    The head sits at the joint centre nearest to the line. It is thick enough to touch the line in
-    a share `quantile` of the postures, but never so thick that the wire could slip over to its
-    other side, and never reaches an attachment.
-    """
-    kin, routes = robot.kinematics, robot.routes
-    sphere_joint = np.zeros(len(routes.first), dtype=np.int64)
-    radius = np.zeros(len(routes.first))
+    nothing, nowhere = np.zeros((count, 3)), np.full((count, 3), np.nan)
+    objects = WrapObjects(
+        np.zeros(count, np.int64), nothing, 1.0 * nothing, nowhere, np.zeros(count)
+    )
+    if routes.objects is not None:
+        for whole, part in zip(objects, routes.objects, strict=True):
+            whole[routes.wrapping] = part
     if quantile <= 0.0:
-        return sphere_joint, radius
-    postures = robot.random_postures(300, np.random.default_rng(0))
-    poses, points = kin.joint_poses(postures), routes.points(postures)
-    # The description says of some segments what they wrap round.
-    described = set(routes.wrapping.tolist())
-    thickness = rng.uniform(0.8, 1.2, len(routes.first))
-    for s, (first, second) in enumerate(zip(routes.first, routes.second, strict=True)):
-        moved = kin.moved_by[routes.joint[first]] ^ kin.moved_by[routes.joint[second]]
-        crossed = [i for i in range(1, len(kin.parent)) if moved[kin.theta_index[i]]]
-        crossed = [i for i in crossed if not kin.prismatic[i]]
+        return objects
+    poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
+    points, true = routes.placed(poses), routes.placed(poses, point)
+    thickness = rng.uniform(0.8, 1.2, count)
+    described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
+    for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
+        if objects.radius[s] > 0.0:
+            turn, origin = (
+                poses.rotation[:, objects.joint[s]],
+                poses.translation[:, objects.joint[s]],
+            )
+            away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]
+            axis = (turn @ objects.axis[s])[:, None]
+            away -= (away * axis).sum(axis=-1, keepdims=True) * axis
+            least = np.linalg.norm(away, axis=-1).min()
+            objects.radius[s] = min(objects.radius[s] * described[s], 0.95 * least)
+            continue
+        moved = kin.moved_by[routes.joint[ends[0]]] ^ kin.moved_by[routes.joint[ends[1]]]
         best = np.inf
-        for joint in crossed if s not in described else ():
-            centre = poses.translation[:, joint]
-            start, end = points[:, first] - centre, points[:, second] - centre
+        for joint in range(1, len(kin.parent)):
+            if kin.prismatic[joint] or not moved[kin.theta_index[joint]]:
+                continue
+            start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start
             share = -np.sum(start * line, axis=1) / np.sum(line * line, axis=1)
             share = np.clip(share, 0.0, 1.0)
             distance = np.linalg.norm(start + share[:, None] * line, axis=1)
             if np.median(distance) < best:
                 best = float(np.median(distance))
-                ends = np.minimum(np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1))
-                sphere_joint[s] = joint
-                radius[s] = min(
-                    thickness[s] * np.quantile(distance, quantile),
-                    2.0 * distance.min(),
-                    0.8 * ends.min(),
-                    THICKEST_BONE,
-                )
-    return sphere_joint, radius
+                least = min(np.linalg.norm(e, axis=1).min() for e in (start, end))
+                touching = thickness[s] * np.quantile(distance, quantile)
+                objects.joint[s] = joint
+                objects.radius[s] = min(touching, 2.0 * distance.min(), 0.8 * least, THICKEST_BONE)
+    return objects

@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle routes that wrap round bones, compiled by numba: the true lengths of the emulated arm.
 
-A segment between two route points may pass a sphere (a bone's head) of radius r at centre c. Where
-the straight line would cut the sphere, the wire leaves along a tangent, follows the great circle
-and arrives along the other tangent:
-
-    length = √(a² − r²) + √(b² − r²) + r (φ − acos(r/a) − acos(r/b))
-
-with a, b the distances of the end points from c and φ the angle between them. Nothing of these
-bones is known to the geometric model of `robot/routes.py`. Where the description itself wraps a
-segment (`robot/wrapping.py`), it wraps here too, round an object of its own size.
+A segment between two route points may pass a sphere (a bone's head) that the geometric model of
+`robot/routes.py` does not know; where the description itself wraps it, it wraps here too, round an
+object of its own size. How a wire lies on either, `robot/wrapping.py` says.
 """
 
 from __future__ import annotations
@@ -43,7 +37,7 @@ class Tree(NamedTuple):
 
 
 class WrappedRoutes(NamedTuple):
-    """True routes: points on joints of the tree, segments between them, a sphere for each segment.
+    """True routes: points on joints of the tree, segments between them.
 
     Attributes:
         point_joint: Tree joint that carries each point, shape (P,).
@@ -51,9 +45,7 @@ class WrappedRoutes(NamedTuple):
         first: Point where each segment starts, shape (S,).
         second: Point where it ends, shape (S,).
         muscle: Muscle it belongs to, shape (S,).
-        sphere_joint: Tree joint at whose origin the sphere sits, shape (S,).
-        radius: Radius of the sphere, 0 for none [m], shape (S,).
-        objects: What the description wraps each segment round, radius 0 for nothing.
+        objects: What each segment wraps round, radius 0 for nothing.
     """
 
     point_joint: Ints
@@ -61,8 +53,6 @@ class WrappedRoutes(NamedTuple):
     first: Ints
     second: Ints
     muscle: Ints
-    sphere_joint: Ints
-    radius: Array
     objects: WrapObjects
 
 
@@ -120,50 +110,6 @@ def place_points(routes: WrappedRoutes, rotation: Array, translation: Array, wor
 
 
 @njit(cache=True)
-def segment_length(
-    start: Array, end: Array, centre: Array, radius: float, leave: Array, arrive: Array
-) -> float:
-    """Return the length of one segment and fill the unit pulls at its ends.
-
-    `leave` is the direction in which the wire pulls the start point, `arrive` the end point; the
-    sphere is pushed by −(leave + arrive), through its centre.
-    """
-    line = end - start
-    straight = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2) + 1e-12
-    if radius > 0.0:
-        a, b = start - centre, end - centre
-        da = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
-        db = math.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-        if da > radius and db > radius:
-            cosine = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / (da * db)
-            angle = math.acos(min(1.0, max(-1.0, cosine)))
-            alpha, beta = math.acos(radius / da), math.acos(radius / db)
-            arc = angle - alpha - beta
-            if arc > 0.0:
-                sine = math.sin(angle)
-                # The tangent points lie at alpha from a and beta from b, in the plane of a and b.
-                for r in range(3):
-                    ea, eb = a[r] / da, b[r] / db
-                    if sine > 1e-6:
-                        across_a = (eb - cosine * ea) / sine
-                        across_b = (ea - cosine * eb) / sine
-                    else:
-                        # Through the centre every way round is as short: take one.
-                        k = int(abs(a[0]) > 0.5 * da)
-                        away = -a[k] * a[r] / (da * da) + (1.0 if r == k else 0.0)
-                        across_a = across_b = away / math.sqrt(1.0 - (a[k] / da) ** 2)
-                    leave[r] = -math.sin(alpha) * ea + math.cos(alpha) * across_a
-                    arrive[r] = -math.sin(beta) * eb + math.cos(beta) * across_b
-                tangents = math.sqrt(da * da - radius * radius)
-                tangents += math.sqrt(db * db - radius * radius)
-                return tangents + radius * arc
-    for r in range(3):
-        leave[r] = line[r] / straight
-        arrive[r] = -leave[r]
-    return straight
-
-
-@njit(cache=True)
 def wrapped_lengths(
     tree: Tree, routes: WrappedRoutes, muscles: int, q: Array
 ) -> tuple[Array, Array]:
@@ -192,10 +138,7 @@ def route_segment(
 ) -> float:  # fmt: skip
     """Return the length of segment s, placed by `place_points`, and fill the unit pulls."""
     start, end = world[routes.first[s]], world[routes.second[s]]
-    if routes.objects.radius[s] > 0.0:
-        return wrapped_segment(routes.objects, s, rotation, translation, start, end, leave, arrive)
-    centre = translation[routes.sphere_joint[s]]
-    return segment_length(start, end, centre, routes.radius[s], leave, arrive)
+    return wrapped_segment(routes.objects, s, rotation, translation, start, end, leave, arrive)
 
 
 @njit(cache=True)
@@ -212,10 +155,6 @@ def add_pull(
         joint = routes.objects.joint[s]
         add_torque(tree, translation, axis, joint, world[i], leave, -pull, torque)
         add_torque(tree, translation, axis, joint, world[k], arrive, -pull, torque)
-    elif routes.radius[s] > 0.0:
-        joint = routes.sphere_joint[s]
-        push = leave + arrive
-        add_torque(tree, translation, axis, joint, translation[joint], push, -pull, torque)
 
 
 @njit(cache=True)

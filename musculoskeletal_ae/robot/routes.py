@@ -92,7 +92,7 @@ class Routes:
     def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
         """Return each muscle at θ (D,) as a polyline with its arcs, (K, 3) [m]; see `points`."""
         poses = self._kinematics.joint_poses(theta[None])
-        points = self._points(poses)[0] if points is None else points
+        points = self.placed(poses)[0] if points is None else points
         arcs = {}
         if self.objects is not None:
             from musculoskeletal_ae.robot.wrapping import touched
@@ -112,33 +112,34 @@ class Routes:
 
     def points(self, theta: Array) -> Array:
         """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
-        return self._points(self._kinematics.joint_poses(theta))
+        return self.placed(self._kinematics.joint_poses(theta))
 
-    def _points(self, poses: JointPoses) -> Array:
+    def placed(self, poses: JointPoses, point: Array | None = None) -> Array:
+        """Return route points, or other ones (P, 3) on the same links, for poses, (N, P, 3)."""
         rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
-        return np.einsum('npij,pj->npi', rotation, self.point) + translation
+        point = self.point if point is None else point
+        return np.einsum('npij,pj->npi', rotation, point) + translation
+
+    def _segments(self, theta: Array) -> tuple[Array, Array]:
+        """Return lengths (N, S) of the segments, and of the straight lines between their ends."""
+        poses = self._kinematics.joint_poses(theta)
+        points = self.placed(poses)
+        straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
+        if self.objects is None:
+            return straight, straight
+        lengths = straight.copy()
+        lengths[:, self.wrapping] = self._wrapped(poses, points)[0]
+        return lengths, straight
 
     @_in_chunks
     def absolute_lengths(self, theta: Array) -> Array:
         """Return f_geo,abs(θ) [m]: θ (..., D) gives (..., M)."""
-        poses = self._kinematics.joint_poses(theta)
-        points = self._points(poses)
-        segment = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
-        if self.objects is not None:
-            segment[:, self.wrapping] = self._wrapped(poses, points)[0]
-        return segment @ self._sum.T
+        return self._segments(theta)[0] @ self._sum.T
 
     @_in_chunks
     def detours(self, theta: Array) -> Array:
         """Return what wrapping adds to straight lines [m]: θ (..., D) gives (..., M)."""
-        added = np.zeros((len(theta), len(self.first)))
-        if self.objects is not None:
-            poses = self._kinematics.joint_poses(theta)
-            points = self._points(poses)
-            line = points[:, self.second[self.wrapping]] - points[:, self.first[self.wrapping]]
-            lengths = self._wrapped(poses, points)[0]
-            added[:, self.wrapping] = lengths - np.linalg.norm(line, axis=-1)
-        return added @ self._sum.T
+        return np.subtract(*self._segments(theta)) @ self._sum.T
 
     def relative_lengths(self, theta: Array) -> Array:
         """Return f_geo(θ) [m], zero at θ = 0: θ (..., D) gives (..., M)."""
@@ -149,7 +150,7 @@ class Routes:
         """Return G(θ) [m/rad]: θ (..., D) gives (..., M, D)."""
         kin = self._kinematics
         poses = kin.joint_poses(theta)
-        points = self._points(poses)
+        points = self.placed(poses)
         line = points[:, self.second] - points[:, self.first]
         norm = np.linalg.norm(line, axis=-1, keepdims=True)
         direction = np.divide(line, norm, out=np.zeros_like(line), where=norm > 0.0)

@@ -182,16 +182,17 @@ def wrapped_segment(
     The objects are placed by the poses (J, 3, 3), (J, 3) of the tree's joints. Fills the unit
     vectors along which the wire pulls its start (`leave`) and its end (`arrive`).
     """
-    j, radius = objects.joint[s], objects.radius[s]
-    axis, side = _placed(rotation[j], objects.axis[s]), _placed(rotation[j], objects.side[s])
-    centre = _placed(rotation[j], objects.centre[s])
-    a = _minus(_minus(start, translation[j]), centre)
-    b = _minus(_minus(end, translation[j]), centre)
-    line, sided = _minus(b, a), not math.isnan(side[0])
+    j, radius, line = objects.joint[s], objects.radius[s], _minus(end, start)
     straight = math.sqrt(_dot(line, line))
     for k in range(3):
         leave[k] = line[k] / max(straight, TINY)
         arrive[k] = -leave[k]
+    if radius <= 0.0:
+        return straight
+    axis, side = _placed(rotation[j], objects.axis[s]), _placed(rotation[j], objects.side[s])
+    centre, sided = _placed(rotation[j], objects.centre[s]), not math.isnan(side[0])
+    a = _minus(_minus(start, translation[j]), centre)
+    b = _minus(_minus(end, translation[j]), centre)
     if _dot(axis, axis) > 0.5:
         u = _beside(axis)
         v = _cross(axis, u)

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -42,6 +44,32 @@ def robot(request, tmp_path_factory):
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
     route[1:2] = [WRAPS[request.param]]
     return Robot.load(write_muscles(directory, document))
+
+
+@pytest.mark.parametrize(
+    ('start', 'end', 'expected'),
+    [
+        ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # misses the ball
+        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches it
+        # straight at the centre: two tangents and an arc
+        ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
+    ],
+)
+def test_a_wire_is_straight_or_two_tangents_and_an_arc(start, end, expected):
+    assert wire(start, end, 0.5)[0] == pytest.approx(expected)
+
+
+point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
+
+
+@given(point, point, st.floats(0.001, 0.1))
+def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
+    straight = np.linalg.norm(np.subtract(end, start))
+    value, leave, arrive = wire(start, end, radius)
+    assert value >= straight - 1e-9
+    if straight > 1e-6:
+        assert np.linalg.norm(leave) == pytest.approx(1.0, abs=1e-4)
+        assert np.linalg.norm(arrive) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_over_a_drum_the_wire_is_the_geodesic():
