@@ -152,7 +152,8 @@ class _Reader:
                 self.ranges[name] = (-np.pi, np.pi) if free else (low, high)
                 self.rest[name] = default
         for item in self.model.findall('ConstraintSet/objects/*'):
-            master, slave = (_word(item, f'{which}dependent_coordinate_name{s}') for which, s in (('in', 's'), ('', '')))  # noqa: E501  # fmt: skip
+            master = _word(item, 'independent_coordinate_names')
+            slave = _word(item, 'dependent_coordinate_name')
             if item.tag != 'CoordinateCouplerConstraint' or master not in self.drivers:
                 self.source.note('dropped', f'{item.tag} {item.get("name")}')
                 continue
@@ -162,21 +163,16 @@ class _Reader:
 
     def _driver(self, name: str, function: Function = IDENTITY) -> tuple[str, Function]:
         """Return a function of a coordinate as one of the free coordinate that drives it."""
+        if name not in self.drivers:
+            raise ValueError(f'there is no coordinate {name!r}')
         master, inner = self.drivers[name]
-        if master in ('', name):
-            return master, lambda x: function(inner(x))
-        return self._driver(master, lambda x: function(inner(x)))
+        both: Function = lambda x: function(inner(x))  # noqa: E731
+        return (master, both) if master in ('', name) else self._driver(master, both)
 
     def _span(self, name: str, function: Function = IDENTITY) -> Array:
         """Return values (201,) of a function of a coordinate over its range."""
         free, value = self._driver(name, function)
         return value(np.linspace(*self.ranges[free], 201))
-
-    def _add_frames(self, owner: ET.Element, path: str) -> None:
-        for frame in owner.iter('PhysicalOffsetFrame'):
-            parent, pose = self._frame(frame, 'socket_parent', path)
-            at = parent, pose * _offset(frame, 'orientation')
-            self.frames[f'{path}/{frame.get("name")}'] = at
 
     def _frame(self, item: ET.Element, tag: str, owner: str = '') -> tuple[str, pin.SE3]:
         """Return the body of the frame that a socket names, and its pose in that body."""
@@ -190,20 +186,23 @@ class _Reader:
     def _tree(self) -> None:
         """Make links of the bodies, parents first, and joints of the axes between them."""
         bodies = {b.get('name', ''): b for b in self.model.findall('BodySet/objects/Body')}
-        for name, body in bodies.items():
-            self.frames[name] = name, pin.SE3.Identity()
-            self._add_frames(body, name)
-        joints = {}
-        for joint in self.model.find('JointSet/objects') or ():
-            self._add_frames(joint, joint.get('name', ''))
-            parent, before = self._frame(joint, 'socket_parent_frame', joint.get('name', ''))
-            child, after = self._frame(joint, 'socket_child_frame', joint.get('name', ''))
-            joints[child] = parent, before, joint, after.inverse()
+        joints = {j.get('name', ''): j for j in self.model.findall('JointSet/objects/*')}
+        self.frames |= {name: (name, pin.SE3.Identity()) for name in bodies}
+        for path, owner in [*bodies.items(), *joints.items()]:
+            for frame in owner.iter('PhysicalOffsetFrame'):
+                parent, pose = self._frame(frame, 'socket_parent', path)
+                at = pose * _offset(frame, 'orientation')
+                self.frames[f'{path}/{frame.get("name")}'] = parent, at
+        waiting = {}
+        for name, joint in joints.items():
+            parent, before = self._frame(joint, 'socket_parent_frame', name)
+            child, after = self._frame(joint, 'socket_child_frame', name)
+            waiting[child] = parent, before, joint, after.inverse()
         source, order = self.source, ['ground']
         source.add_link('ground', 0, pin.SE3.Identity())
         for above in order:
-            for name in [body for body, (parent, *_) in joints.items() if parent == above]:
-                _, before, joint, after = joints.pop(name)
+            for name in [body for body, (parent, *_) in waiting.items() if parent == above]:
+                _, before, joint, after = waiting.pop(name)
                 carrier, at = source.place(above)
                 carrier, at = self._chain(name, joint, carrier, at * before)
                 xx, yy, zz, xy, xz, yz = _vector(bodies[name], 'inertia', 6)
@@ -212,7 +211,7 @@ class _Reader:
                 own = pin.Inertia(max(mass, 0.0), centre, tensor)
                 source.add_link(name, carrier, at * after, own)
                 order.append(name)
-        if lost := joints.keys() | bodies.keys() - set(order):
+        if lost := waiting.keys() | bodies.keys() - set(order):
             raise ValueError(f'body {min(lost)} does not hang on ground')
 
     def _axes(self, joint: ET.Element) -> Iterator[Axis]:
@@ -338,9 +337,8 @@ class _Reader:
         for i in kept:
             route += [RoutePoint(points[i][0], stands[i]), *([wraps[i]] if i in wraps else [])]
         source.routes[name] = tuple(route)
-        isometric = item.find('max_isometric_force') is not None
-        force = _number(item, 'max_isometric_force' if isometric else 'optimal_force')
-        source.strength[name] = force
+        forces = (_number(item, f'{kind}_force') for kind in ('max_isometric', 'optimal'))
+        source.strength[name] = max(forces)
 
     def _standing(self, muscle: str, point: Point, kept: bool) -> Array:
         """Return where a point is taken to be, in its body, and say so."""

@@ -171,9 +171,8 @@ def cut(
     for slave, c in couplings.items():
         source.rest[slave] = c.ratio * source.rest.get(c.master, 0.0) + c.offset
     velocity = np.zeros(model.nv)
-    for i, joint in enumerate(model.joints[1:], 1):
-        if joint.nv == 1:
-            velocity[joint.idx_v] = source.rest.get(model.names[i], 0.0)
+    for name, value in source.rest.items():
+        velocity[model.joints[model.getJointId(name)].idx_v] = value
     kept = wanted | set(source.couplings)
     for name in inner:
         if name not in kept:
@@ -220,8 +219,7 @@ def urdf(source: Source) -> str:
         joint, at = source.place(link)
         if joint and at.isIdentity(1e-9):
             carriers.setdefault(joint, link)
-    parts = ['<?xml version="1.0"?>', f'<robot name="{source.name}">']
-    parts.append(f'  <link name={quoteattr(carriers[0])}/>')
+    parts = [f'<robot name="{source.name}">', f'  <link name={quoteattr(carriers[0])}/>']
 
     def attach(name: str, kind: str, link: str, parent: int, at: pin.SE3, more: str = '') -> None:
         at = at if parent else upright * pose.inverse() * at
@@ -234,11 +232,9 @@ def urdf(source: Source) -> str:
         link, own = carriers.setdefault(i, f'{name}_link'), model.inertias[i]
         pairs = combinations_with_replacement(range(3), 2)
         tensor = ' '.join(f'i{"xyz"[j]}{"xyz"[k]}="{own.inertia[j, k]:.12g}"' for j, k in pairs)
-        body = (
-            f'<origin xyz="{_text(own.lever)}"/><mass value="{own.mass:.12g}"/><inertia {tensor}/>'
-        )
-        weighs = f'<inertial>{body}</inertial>' if own.mass > 0.0 else ''
-        parts.append(f'  <link name={quoteattr(link)}>{weighs}</link>')
+        mass = f'<origin xyz="{_text(own.lever)}"/><mass value="{_text(own.mass)}"/>'
+        mass = f'<inertial>{mass}<inertia {tensor}/></inertial>' if own.mass > 0.0 else ''
+        parts.append(f'  <link name={quoteattr(link)}>{mass}</link>')
         low, high = source.span(name)
         limits = f'lower="{low:.12g}" upper="{high:.12g}" effort="1000" velocity="10"'
         more = f'<axis xyz="{_text(joint_axis(model.joints[i]))}"/><limit {limits}/>'
@@ -289,4 +285,4 @@ def compare(source: Source, robot: Robot) -> dict[str, float] | None:
     theta, kin = robot.random_postures(POSTURES, np.random.default_rng(0)), robot.kinematics
     ours = dict(zip(robot.muscles, robot.routes.absolute_lengths(theta).T))
     theirs = source.lengths(dict(zip(kin.model.names[1:], kin.tree_angles(theta).T)))
-    return {name: float(np.abs(ours[name] - own).max()) for name, own in theirs.items() if name in ours}  # noqa: E501  # fmt: skip
+    return {name: float(np.abs(ours[name] - theirs[name]).max()) for name in ours if name in theirs}

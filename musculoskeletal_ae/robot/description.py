@@ -111,15 +111,9 @@ def load_description(robot: str | Path) -> RobotDescription:
     urdf = read_text(urdf_file, refusal)
     model = read_urdf(urdf_file, urdf)
     top = Entry(muscle_file, read_yaml(muscle_file, refusal), 'top level', '').mapping(
-        'joints',
-        'muscles',
-        'series_elastic',
-        'stiffness',
-        'tension',
-        'end_effector',
-        'end_effectors',
-        'couplings',
-    )
+        'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector',
+        'end_effectors', 'couplings',
+    )  # fmt: skip
     joints = _read_joints(top['joints'], model)
     couplings = _read_couplings(top, read_mimics(urdf_file, urdf), joints, model)
     default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
@@ -295,12 +289,12 @@ def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
 def _read_end_effectors(top: Entry, model: pin.Model, joints: tuple[str, ...]) -> tuple[str, ...]:
     one, several = top.get('end_effector'), top.get('end_effectors')
     links = [str(frame.name) for frame in _links(model)]
-    if several.value is not None:
-        if one.value is not None:
-            raise several.fail('expected end_effector or end_effectors, both are given')
-        return several.unique([_read_link(item, links) for item in several.items(1, 'links')])
+    if one.value is not None and several.value is not None:
+        raise several.fail('expected end_effector or end_effectors, both are given')
     if one.value is not None:
         return (_read_link(one, links),)
+    if several.value is not None:
+        return several.unique([_read_link(item, links) for item in several.items(1, 'links')])
     # The last link of the chain: the one with the most of our joints above it, and of several
     # on the same joint the one listed last.
     depth = [0]

@@ -21,14 +21,12 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')
-    parser.add_argument('--joints', type=names, default=[], metavar='NAME,…', help='joints to keep')
-    parser.add_argument(
-        '--muscles', type=names, default=[], metavar='NAME,…', help='muscles to keep'
-    )
+    for kind in ('joints', 'muscles'):
+        told = f'{kind} to keep'
+        parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=told)
     parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-    parser.add_argument(
-        '--end', metavar='LINK', help='end effector; joints beside the way to it are held'
-    )
+    told = 'end effector; joints beside the way to it are held'
+    parser.add_argument('--end', metavar='LINK', help=told)
     args = parser.parse_args(argv)
     return exit_status(lambda: load('musculoskeletal_ae.importing.convert').run(args))
 
