@@ -83,27 +83,16 @@ class Command(NamedTuple):
 
 
 class MuscleState(NamedTuple):
-    """What changes, each of shape (M,); the compiled step writes into it.
+    """What changes, each of shape (M,); the compiled step writes into it."""
 
-    Attributes:
-        length: l at the motor, true [m].
-        tension: T at the motor, true [N].
-        end_tension: T at the elastic unit [N].
-        sliding: Friction state s in [−1, 1].
-        winding: c₁ [°C].
-        housing: c₂ [°C].
-        reference: T_ref of the module [N].
-        ruptured: 1 where the wire is cut.
-    """
-
-    length: Array
-    tension: Array
-    end_tension: Array
-    sliding: Array
-    winding: Array
-    housing: Array
-    reference: Array
-    ruptured: Array
+    length: Array  # l at the motor, true [m]
+    tension: Array  # T at the motor, true [N]
+    end_tension: Array  # T at the elastic unit [N]
+    sliding: Array  # friction state s in [−1, 1]
+    winding: Array  # c₁ [°C]
+    housing: Array  # c₂ [°C]
+    reference: Array  # T_ref of the module [N]
+    ruptured: Array  # 1 where the wire is cut
 
 
 class JointState(NamedTuple):

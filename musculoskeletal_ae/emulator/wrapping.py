@@ -19,41 +19,24 @@ from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segment
 
 
 class Tree(NamedTuple):
-    """Joints in pinocchio's order, joint 0 being the root link.
+    """Joints in pinocchio's order, joint 0 being the root link."""
 
-    Attributes:
-        parent: Shape (J,).
-        rotation: Fixed placement in the parent, shape (J, 3, 3).
-        translation: Fixed placement in the parent [m], shape (J, 3).
-        axis: In the joint's frame, shape (J, 3).
-        prismatic: Shape (J,).
-    """
-
-    parent: Ints
-    rotation: Array
-    translation: Array
-    axis: Array
-    prismatic: Bools
+    parent: Ints  # (J,)
+    rotation: Array  # fixed placement in the parent, (J, 3, 3)
+    translation: Array  # [m], (J, 3)
+    axis: Array  # in the joint's frame, (J, 3)
+    prismatic: Bools  # (J,)
 
 
 class WrappedRoutes(NamedTuple):
-    """True routes: points on joints of the tree, segments between them.
+    """True routes: points on joints of the tree, segments between them."""
 
-    Attributes:
-        point_joint: Tree joint that carries each point, shape (P,).
-        point: In that joint's frame [m], shape (P, 3).
-        first: Point where each segment starts, shape (S,).
-        second: Point where it ends, shape (S,).
-        muscle: Muscle it belongs to, shape (S,).
-        objects: What each segment wraps round, radius 0 for nothing.
-    """
-
-    point_joint: Ints
-    point: Array
-    first: Ints
-    second: Ints
-    muscle: Ints
-    objects: WrapObjects
+    point_joint: Ints  # tree joint that carries each point, (P,)
+    point: Array  # in that joint's frame [m], (P, 3)
+    first: Ints  # points where each segment starts
+    second: Ints  # and ends, (S,)
+    muscle: Ints  # it belongs to, (S,)
+    objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
 
 
 @njit(cache=True)
@@ -159,15 +142,9 @@ def add_pull(
 
 @njit(cache=True)
 def add_torque(
-    tree: Tree,
-    translation: Array,
-    axis: Array,
-    joint: int,
-    point: Array,
-    force: Array,
-    scale: float,
-    torque: Array,
-) -> None:
+    tree: Tree, translation: Array, axis: Array, joint: int, point: Array, force: Array,
+    scale: float, torque: Array,
+) -> None:  # fmt: skip
     """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
     while joint > 0:
         ax, ay, az = axis[joint]
