@@ -36,13 +36,9 @@ def energy(robot, theta):
 
 
 def slope(function, theta, step=1e-6):
-    return np.stack(
-        [
-            (function(theta + d) - function(theta - d)) / (2 * step)
-            for d in step * np.eye(len(theta))
-        ],
-        axis=-1,
-    )
+    shifts = step * np.eye(len(theta))
+    ends = [function(theta + d) - function(theta - d) for d in shifts]
+    return np.stack(ends, axis=-1) / (2 * step)
 
 
 def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
