@@ -15,6 +15,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.importing.source import Source, SourceError, refuse, safe_name
@@ -35,11 +36,6 @@ def read_mjcf(file: Path, _root: ET.Element) -> Source:
     return _Reader(mujoco, model, file.stem).source
 
 
-def _pose(position: Array, quaternion: Array) -> pin.SE3:
-    turn = pin.Quaternion(*map(float, quaternion)).normalized()
-    return pin.SE3(turn.matrix(), np.array(position))
-
-
 class _Reader:
     def __init__(self, mujoco: Any, model: Any, name: str) -> None:
         self.mj, self.model, self.source = mujoco, model, Source(safe_name(name, 'robot'))
@@ -50,11 +46,7 @@ class _Reader:
         #: joint that follows another (−1: none), by which polynomial
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
-        #: of each body: the number of the joint that carries it, and its pose in that joint's frame
-        self.places = [(0, pin.SE3.Identity())]
-        self.source.add_link(self.name('body', 0), *self.places[0])
-        for i in range(1, model.nbody):
-            self._body(i)
+        self._bodies()
         self._couplings()
         self._tendons()
         self.source.lengths = self._lengths
@@ -63,42 +55,41 @@ class _Reader:
         """Return the name of a thing, or its kind and number."""
         return safe_name(getattr(self.model, kind)(i).name, f'{kind}_{i}')
 
-    def _body(self, i: int) -> None:
-        m, name = self.model, self.name('body', i)
-        carrier, at = self.places[m.body_parentid[i]]
-        at = at * _pose(m.body_pos[i], m.body_quat[i])
-        for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
-            carrier, at = self._joint(j, carrier, at)
-        still = pin.Inertia(float(m.body_mass[i]), np.zeros(3), np.diag(m.body_inertia[i]))
-        own = _pose(m.body_ipos[i], m.body_iquat[i]).act(still)
-        self.places.append((carrier, at))
-        self.source.add_link(name, carrier, at, own)
+    def _bodies(self) -> None:
+        """Add links and joints; at the start a joint stands as its body does, in its anchor."""
+        m, data, at_start = self.model, self.start, {0: (0, pin.SE3.Identity())}
+        for i in range(m.nbody):
+            turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
+            for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
+                if m.jnt_type[j] == self.mj.mjtJoint.mjJNT_FREE:
+                    told = f'free joint {self.name("joint", j)}, where the file puts it'
+                    self.source.note('held fixed', told)
+                    continue
+                before, stand = stand, pin.SE3(turn, data.xanchor[j].copy())
+                carrier = self._joint(j, carrier, before.inverse() * stand)
+            at_start[i] = carrier, stand
+            at = pin.SE3(turn, data.xpos[i].copy())
+            weight = pin.Inertia(float(m.body_mass[i]), np.zeros(3), np.diag(m.body_inertia[i]))
+            centre = at.inverse() * pin.SE3(data.ximat[i].reshape(3, 3), data.xipos[i].copy())
+            link = self.name('body', i), carrier, stand.inverse() * at
+            self.source.add_link(*link, centre.act(weight))
 
-    def _joint(self, j: int, carrier: int, at: pin.SE3) -> tuple[int, pin.SE3]:
-        """Add a joint to a body that is at a pose in the carrier; return where it is then."""
+    def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
+        """Add a joint that stands at a pose in the carrier at the start; return its number."""
         m, source, types, name = self.model, self.source, self.mj.mjtJoint, self.name('joint', j)
-        kind, zero = m.jnt_type[j], m.qpos0[m.jnt_qposadr[j] :]
-        if kind == types.mjJNT_FREE:
-            source.note('held fixed', f'free joint {name}, where the file puts it')
-            return self.places[0][0], _pose(zero[:3], zero[3:7])
         low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
-        slides, anchor = kind == types.mjJNT_SLIDE, pin.SE3(np.eye(3), m.jnt_pos[j].copy())
-        at = at * anchor
-        axes, names, rest = [m.jnt_axis[j].copy()], [name], float(zero[0])
+        kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
+        axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
         if kind == types.mjJNT_BALL:
             source.note('approximated', f'ball joint {name}: three hinges, x then y then z')
             axes, names, rest, low = list(np.eye(3)), [f'{name}_{c}' for c in 'xyz'], 0.0, -high
             self.balls[j] = names
-            at = at * _pose(np.zeros(3), zero[:4])
-        elif slides:
-            at = at * pin.SE3(np.eye(3), -axes[0] * rest)
-        else:
-            at = at * pin.SE3(pin.exp3(-axes[0] * rest), np.zeros(3))
         for part, axis in zip(names, axes):
+            back, still = -axis * rest, np.zeros(3)
+            at = at * (pin.SE3(np.eye(3), back) if slides else pin.SE3(pin.exp3(back), still))
             carrier = source.add_joint(part, carrier, at, slides, axis, (low, high), rest)
             at = pin.SE3.Identity()
-        # The source's frame, turned by the joint about the anchor.
-        return carrier, anchor.inverse()
+        return carrier
 
     def _couplings(self) -> None:
         m, source = self.model, self.source
@@ -167,14 +158,14 @@ class _Reader:
 
     def _wrap(self, name: str, geom: int, site: int, round_axis: bool) -> Wrap:
         m, body, data, side = self.model, int(self.model.geom_bodyid[geom]), self.start, None
-        turn = _pose(np.zeros(3), m.geom_quat[geom]).rotation
+        turn = data.xmat[body].reshape(3, 3)
         if site >= 0:
-            away = data.site_xpos[site] - data.xpos[body]
-            side = data.xmat[body].reshape(3, 3).T @ away
+            side = turn.T @ (data.site_xpos[site] - data.xpos[body])
             if m.site_bodyid[site] != body:
                 told = f'muscle {name}: side site {self.name("site", site)} is on another body'
                 self.source.note('approximated', f'{told}; taken where it is at the start')
-        axis, radius = turn[:, 2] if round_axis else None, float(m.geom_size[geom][0])
+        axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
+        radius = float(m.geom_size[geom][0])
         return Wrap(self.name('body', body), m.geom_pos[geom].copy(), radius, axis, side)
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
@@ -187,11 +178,12 @@ class _Reader:
             for name in values.keys() & address:
                 data.qpos[address[name]] = values[name][n]
             for j, parts in self.balls.items():
-                at, turn = m.jnt_qposadr[j], _pose(np.zeros(3), start[m.jnt_qposadr[j] :][:4])
-                for axis, part in zip(np.eye(3), parts):
-                    angle = values[part][n] if part in values else 0.0
-                    turn = turn * pin.SE3(pin.exp3(axis * angle), np.zeros(3))
-                data.qpos[at : at + 4] = np.roll(pin.Quaternion(turn.rotation).coeffs(), 1)
+                at = slice(m.jnt_qposadr[j], m.jnt_qposadr[j] + 4)
+                angles = [values[part][n] if part in values else 0.0 for part in parts]
+                turn = Rotation.from_quat(np.roll(start[at], -1)) * Rotation.from_euler(
+                    'XYZ', angles
+                )
+                data.qpos[at] = np.roll(turn.as_quat(), 1)
             for _ in self.polynomials:  # as often as one may follow another
                 for slave, (master, terms) in self.polynomials.items():
                     at = m.jnt_qposadr[[slave, master]]
