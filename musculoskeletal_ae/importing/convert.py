@@ -39,9 +39,7 @@ class Imported(NamedTuple):
 def read_source(file: Path) -> Source:
     """Read a file of any of the formats, told by its root element.
 
-    Raises:
-        SourceError: Naming the file, what is wrong and what is legal.
-        RobotDescriptionError: If it is not XML, or has a DOCTYPE.
+    A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
     """
     root = parse_xml(file, read_text(file, refuse, LARGEST))
     if root.tag not in READERS:
@@ -59,11 +57,9 @@ def read_source(file: Path) -> Source:
 
 
 def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
-    """Import a file as a robot directory; of `chain`, the options of `cut`, that much is left.
+    """Import a file as a robot directory; `chain`: the options of `cut`.
 
-    Raises:
-        SourceError: Naming what is wrong.
-        RobotDescriptionError: If what was written is no valid robot, as of wrong inertias.
+    A RobotDescriptionError says if what was written is no valid robot, as of wrong inertias.
     """
     source = read_source(file)
     cut(source, **chain)

@@ -435,8 +435,7 @@ def _following(places: Array, active: Bools) -> Array:
 def _always_active(places: Array, active: Bools) -> Bools:
     """Return which points the route keeps: of conditional ones those that err least.
 
-    Begins with all and changes one at a time, as long as that lowers the squared error of how the
-    length changes.
+    From all, changes one at a time while that lowers the squared error of how the length changes.
     """
 
     def length(mask: Bools) -> Array:
@@ -446,11 +445,9 @@ def _always_active(places: Array, active: Bools) -> Bools:
     def error(tried: Bools) -> float:
         return float(np.var(length(np.broadcast_to(tried, active.shape)) - true))
 
-    true, kept = length(active), np.ones(active.shape[1], dtype=bool)
-    conditional = np.flatnonzero(~active.all(axis=0))
-    for _ in conditional:
-        best = min((kept ^ (np.arange(len(kept)) == i) for i in conditional), key=error)
-        if error(best) >= error(kept):
-            break
+    true, kept, best = length(active), None, np.ones(active.shape[1], dtype=bool)
+    flips = np.eye(len(best), dtype=bool)[~active.all(axis=0)]
+    while kept is None or error(best) < error(kept):
         kept = best
+        best = min((kept ^ flip for flip in flips), key=error, default=kept)
     return kept

@@ -60,10 +60,9 @@ def read_urdf(file: Path, text: str) -> pin.Model:
 
 
 def parse_xml(file: Path, text: str) -> ET.Element:
-    """Return the root of an XML text that has no DOCTYPE, and so no entities, and is not too deep.
+    """Return the root of an XML text; a RobotDescriptionError says what is wrong with it.
 
-    Raises:
-        RobotDescriptionError: Naming the file and what is wrong.
+    It must have no DOCTYPE, and so no entities, and not be too deep.
     """
     try:
         if '<!DOCTYPE' in text or '<!ENTITY' in text:

@@ -59,22 +59,19 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
 
 
 @njit(cache=True)
-def _cross2(a: complex, b: complex) -> float:
-    return a.real * b.imag - a.imag * b.real
-
-
-@njit(cache=True)
-def _dot2(a: complex, b: complex) -> float:
-    return a.real * b.real + a.imag * b.imag
+def _product(a: complex, b: complex) -> complex:
+    """Return a · b in the real part, a × b in the imaginary one."""
+    return a.conjugate() * b
 
 
 @njit(cache=True)
 def _meet(a: complex, b: complex, c: complex, d: complex) -> bool:
     """Return whether the segments a–b and c–d cross."""
-    determinant = _cross2(b - a, d - c)
+    determinant = _product(b - a, d - c).imag
     if abs(determinant) < TINY:
         return False
-    p, q = _cross2(d - c, a - c) / determinant, _cross2(b - a, a - c) / determinant
+    p = _product(d - c, a - c).imag / determinant
+    q = _product(b - a, a - c).imag / determinant
     return 0.0 <= p <= 1.0 and 0.0 <= q <= 1.0
 
 
@@ -89,8 +86,8 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
     d, far, near = b - a, abs(a), abs(b)
     if far <= r or near <= r or abs(d) < TINY:
         return straight
-    share = min(1.0, max(0.0, -_dot2(d, a) / _dot2(d, d)))
-    cosine = _dot2(a, b) / (far * near)
+    share = min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real))
+    cosine = _product(a, b).real / (far * near)
     if abs(a + share * d) <= r or cosine <= TINY - 1.0:
         return straight
     angle = math.acos(min(1.0, cosine))
@@ -102,7 +99,7 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
         else:
             high = z
     turn = math.asin(low) - math.asin(r * low / far)
-    touch = a / far * r * cmath.rect(1.0, math.copysign(turn, _cross2(a, b)))
+    touch = a / far * r * cmath.rect(1.0, math.copysign(turn, _product(a, b).imag))
     first, second = max(abs(touch - a), TINY), max(abs(touch - b), TINY)
     return True, first + second, (touch - a) / first, (touch - b) / second
 
@@ -117,15 +114,15 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
     d, sided = b - a, abs(side) > 0.5
     if abs(a) < r or abs(b) < r or abs(d) < TINY:
         return straight
-    nearest = a + min(1.0, max(0.0, -_dot2(d, a) / _dot2(d, d))) * d
-    if abs(nearest) > r and (not sided or _dot2(side, nearest) >= 0.0):
+    nearest = a + min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real)) * d
+    if abs(nearest) > r and (not sided or _product(side, nearest).real >= 0.0):
         return straight
     best, result = -1e9, straight
     for way in (1.0, -1.0):
         start = cmath.phase(a) + way * math.acos(r / abs(a))
         end = cmath.phase(b) - way * math.acos(r / abs(b))
         u, v = cmath.rect(r, start), cmath.rect(r, end)
-        good = _dot2(u + v, side) / (abs(u + v) + TINY) if sided else -abs(u - v)
+        good = _product(u + v, side).real / (abs(u + v) + TINY) if sided else -abs(u - v)
         crosses = _meet(a, u, b, v)
         if crosses:
             good = -1e4
