@@ -23,29 +23,20 @@ THICKEST_BONE = 0.04  # [m] radius of a bone's head
 
 @dataclass(frozen=True)
 class Spread:
-    """How much individuals differ, calibrated once (`bench/calibration.py`).
+    """How much individuals differ, calibrated once (`bench/calibration.py`)."""
 
-    Attributes:
-        attachment: Standard deviation of each coordinate of each route point [m].
-        wrap: Quantile, over the joint range, of the straight line's distance from the joint
-            centre that the bone's head reaches; 0 for no wrapping.
-        elastic: Standard deviation of the logarithm of each elastic constant.
-        cable_friction: Mean of the relative tension loss along the route (capstan exponent).
-        joint_friction: Mean Coulomb torque of a joint, as a share of the largest torque that
-            the arm's weight puts on any joint.
-        length_bias: Standard deviation of each length sensor's zero error [m].
-        tension_bias: Standard deviation of each tension sensor's zero error [N].
-        tension_gain: Standard deviation of each tension sensor's relative gain error.
-    """
-
-    attachment: float = 0.0085
+    attachment: float = 0.0085  # standard deviation of each coordinate of each route point [m]
+    #: quantile, over the joint range, of the straight line's distance from the joint centre that
+    #: the bone's head reaches; 0 for no wrapping
     wrap: float = 0.4
-    elastic: float = 0.15
-    cable_friction: float = 0.095
+    elastic: float = 0.15  # standard deviation of the logarithm of each elastic constant
+    cable_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
+    #: mean Coulomb torque of a joint, as a share of the largest torque that the arm's weight puts
+    #: on any joint
     joint_friction: float = 0.02
-    length_bias: float = 0.0005
-    tension_bias: float = 1.0
-    tension_gain: float = 0.01
+    length_bias: float = 0.0005  # standard deviation of each length sensor's zero error [m]
+    tension_bias: float = 1.0  # of each tension sensor's zero error [N]
+    tension_gain: float = 0.01  # of each tension sensor's relative gain error
 
 
 #: No difference at all: the geometric model itself as a body, without friction.
@@ -53,25 +44,10 @@ NOMINAL = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Individual:
-    """True routes, elastic constants, friction and sensor errors of one arm.
-
-    Attributes:
-        elastic: True elastic constants of the M muscles.
-        cable_friction: Capstan exponent of each muscle's route, shape (M,).
-        joint_friction: Coulomb torque of each joint [N·m], shape (D,), order of θ.
-        length_bias: Zero error of the length sensors [m], shape (M,).
-        tension_bias: Zero error of the tension sensors [N], shape (M,).
-        tension_gain: Gain of the tension sensors, shape (M,).
-    """
+    """True routes, elastic constants, friction and sensor errors of one arm."""
 
     def __init__(self, robot: Robot, seed: int, spread: Spread | None = None) -> None:
-        """Draw the individual.
-
-        Args:
-            robot: Geometric model that it differs from.
-            seed: Which individual.
-            spread: How much individuals differ; the calibrated one by default.
-        """
+        """Draw individual `seed`, by the calibrated spread or another."""
         spread = spread or Spread()
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles = robot.muscle_count
@@ -101,11 +77,13 @@ class Individual:
             nominal_elastic.rate * factor[1],
             nominal_elastic.wire_stretch * factor[2],
         )
+        #: of muscles (M,) and joints [N·m], (D,) in the order of θ
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         largest = np.abs(kin.holding_torque(robot.random_postures(200, rng))).max()
         self.joint_friction: Array = (
             spread.joint_friction * largest * rng.uniform(0.5, 1.5, robot.joint_count)
         )
+        #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
