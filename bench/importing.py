@@ -5,7 +5,7 @@ python -m bench importing FILE… [--out DIR]
 
 The files are public models that you have fetched; nothing of them is part of this repository. For
 each it prints one row: joints, muscles, how many of them wrap, the largest and the median length
-error over 1000 postures, and what `check_robot` says of 100.
+error over 1000 postures (nan: it has no lengths of its own), and what `check_robot` says of 100.
 """
 
 from __future__ import annotations
@@ -28,11 +28,8 @@ def row(file: Path, out: Path) -> list[str]:
         robot, notes, errors = import_robot(file, out)
     except MusculoskeletalError as error:
         return [name, str(error)[-160:], *[''] * 5]
-    if errors:
-        values = 1e3 * np.array(list(errors.values()))
-        lengths = f'{values.max():.3f}', f'{np.median(values):.3f}'
-    else:
-        lengths = 'none', 'of its own'
+    values = 1e3 * np.array(list(errors.values())) if errors else np.array([np.nan])
+    lengths = f'{values.max():.3f}', f'{np.median(values):.3f}'
     check = check_verdict(check_robot(robot, 100)).removeprefix('check_robot: ')
     wraps = len(set(robot.routes.muscle[robot.routes.wrapping].tolist()))
     counts = (robot.joint_count, robot.muscle_count, wraps)
