@@ -30,6 +30,10 @@ doc/your_robot.md leads from a robot of your own to one that learns.
   --duration S               stop after S seconds, counted from when the system is up
                              (default: run until Ctrl-C)
   --record DIR               record the topics to an mcap bag
+  --view                     show the arm on a page, http://localhost:8080 (the first time: installs
+                             what it needs)
+  --port N                   of the page (default: 8080)
+  --read-only                a page without controls
   -h, --help                 this text
 
 Exit status: 0 at the end of --duration, 130 on Ctrl-C, 1 if a part died, 2 for a wrong option.
@@ -54,13 +58,16 @@ controller=true
 hardware=false
 bag=
 recording=
+view=
+port=8080
+read_only=()
 duration= # until Ctrl-C
 
 while [ $# -gt 0 ]; do
   # Both "--seed 1" and "--seed=1".
   if [[ $1 == --*=* ]]; then set -- "${1%%=*}" "${1#*=}" "${@:2}"; fi
   case $1 in
-    --robot | --checkpoint | --bag | --preset | --seed | --namespace | --duration | --record)
+    --robot | --checkpoint | --bag | --preset | --seed | --namespace | --duration | --record | --port)
       if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
       ;;
   esac
@@ -69,6 +76,9 @@ while [ $# -gt 0 ]; do
     --checkpoint) checkpoint=$2 && shift ;;
     --bag) bag=$2 && shift ;;
     --record) recording=$2 && shift ;;
+    --view) view=view ;;
+    --port) port=$2 && shift ;;
+    --read-only) read_only=(--read-only) ;;
     --explore) explore=true ;;
     --no-explore) explore=false ;;
     --no-learner) learner=false ;;
@@ -81,7 +91,8 @@ while [ $# -gt 0 ]; do
     -h | --help) usage && exit ;;
     *)
       refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
- --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --help"
+ --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --view, --port,\
+ --read-only, --help"
       ;;
   esac
   shift
@@ -123,6 +134,9 @@ if [ -n "$duration" ]; then
   [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
     refuse "--duration '$duration' must be a number of seconds above 0, such as 30 or 2.5"
 fi
+if ! [[ $port =~ ^[0-9]{1,5}$ ]] || [ $((10#$port)) -lt 1 ] || [ $((10#$port)) -gt 65535 ]; then
+  refuse "--port '$port' must be a whole number from 1 to 65535"
+fi
 namespace=${namespace#/}
 [[ -z $namespace || $namespace =~ ^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$ ]] ||
   refuse "--namespace '$namespace' must be letters, digits and _ (and / between levels)"
@@ -131,7 +145,7 @@ namespace=${namespace#/}
 
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"
-environment_setup
+environment_setup $view # installs nothing more without --view
 
 # Emulated arms are nobody else's business on the network, unless the user says so. A driver may well
 # run on another machine.
@@ -305,6 +319,11 @@ elif [ $controller = true ]; then
   # A pause of a busy desktop is no fault of an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
   start controller controller "${common[@]}" "${moving[@]}"
+fi
+
+if [ -n "$view" ]; then
+  start view view --robot "$robot" --port "$port" "${read_only[@]}" "${remap[@]}"
+  say "the arm is on http://localhost:$port"
 fi
 
 # The status line. It counts --duration from when estimates arrive, however late that is on a slow

@@ -25,4 +25,4 @@ export ROS_DOMAIN_ID=$(($$ % 50 * 2 + 1)) # and the next, for the second process
 export ROS_LOG_DIR=$repository/log/test
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"
-exec "$python" -m pytest -n 2 --dist worksteal "$@"
+exec "$python" -m pytest -n 3 --dist worksteal "$@"

@@ -6,7 +6,8 @@
 # changed, so that the second run takes about a second.
 #
 #     repository=…                       # absolute, before sourcing
-#     environment_setup [test]           # "test": with the tools of test.sh; exits on failure
+#     environment_setup [test|view]      # "test": with the tools of test.sh, "view": with what the
+#                                        # page in the browser needs; exits on failure
 #
 # Afterwards: $python is the interpreter, $executables the folder of the package's executables.
 
@@ -230,7 +231,7 @@ requirements_stamp() { # FILE…
   } | sha256sum
 }
 
-install_packages() { # [test]
+install_packages() { # [test|view]
   local file title='installing torch, pinocchio, numba and colcon'
   local -a base=("$repository/requirements.txt") files arguments=() torch=()
   if [ "$ros" = wheels ]; then
@@ -238,6 +239,8 @@ install_packages() { # [test]
     title+=', the ROS 2 Jazzy wheels'
   fi
   files=("${base[@]}")
+  # The tests look at the page too.
+  [ -z "${1-}" ] || files+=("$repository/.ci/requirements-view.txt")
   if [ "${1-}" = test ]; then
     files+=("$repository/.ci/requirements-test.txt")
     title+=', the test tools'
@@ -267,7 +270,17 @@ assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; t
   fi
   rm -f "$venv/.installing"
   requirements_stamp "${base[@]}" >"$venv/.installed"
-  [ "${1-}" != test ] || requirements_stamp "${files[@]}" >"$venv/.installed-test"
+  [ -z "${1-}" ] || requirements_stamp "${files[@]}" >"$venv/.installed-$1"
+}
+
+# The page is tested in a real browser. Where there is none, and we may, as in CI, it is installed.
+install_chromium() {
+  command -v chromium chromium-browser google-chrome >/dev/null && return
+  [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null || return 0
+  export DEBIAN_FRONTEND=noninteractive
+  step 'installing chromium with apt-get' bash -c 'apt-get update &&
+    apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends chromium' ||
+    say 'no chromium: the page is not tested in a browser'
 }
 
 # --- colcon --------------------------------------------------------------------------------------
@@ -307,7 +320,7 @@ build_package() {
 
 # --- all of it -----------------------------------------------------------------------------------
 
-environment_setup() { # [test]
+environment_setup() { # [test|view]
   local lock
   # Where HOME cannot be written (containers), caches and logs go into the repository.
   if [ ! -d "${HOME-}" ] || [ ! -w "${HOME-}" ]; then
@@ -340,6 +353,7 @@ environment_setup() { # [test]
   # The wheels are an installation of ROS like any other.
   [ "$ros" = wheels ] && export AMENT_PREFIX_PATH=$venv
   install_packages "$@"
+  [ "${1-}" != test ] || install_chromium
   build_package
   exec {lock}>&-
 

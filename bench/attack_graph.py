@@ -401,7 +401,7 @@ class Attack:
         """Break something of the arm."""
         name = self.rng.choice(list(KINDS))
         muscle = self.rng.choice(['', *self.robot.muscles]) if KINDS[name].of_muscle else ''
-        line = f'{name} {muscle}'.strip()
+        line = f'{name}:{muscle}' if muscle else name
         read_fault(line, self.robot)
         self.set_faults([line])
         self.tried['faults'] += 1

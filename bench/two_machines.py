@@ -205,7 +205,8 @@ def learn(initial: Path, minutes: float, seed: int, bad: tuple[float, float, flo
     folder = Path(get_package_prefix('musculoskeletal_ae')) / 'lib' / 'musculoskeletal_ae'
     environment = os.environ | {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
-        'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA',  # TCP: a datagram of 64 kB hardly survives
+        # TCP: a datagram of 64 kB hardly survives; a full socket may not hold a publisher up
+        'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA?non_blocking=true',
         'ROS_DOMAIN_ID': '0',
     }
     loss, delay, cut = bad

@@ -172,13 +172,14 @@ class Listening:
         if not moved.any():
             verdict.notes.append('sign and order show better while the arm is moved by hand')
             fit = np.maximum(fit, fit.T)  # of an arm at rest only exchanges are told
-        _, best = linear_sum_assignment(fit)
+        rows, best = linear_sum_assignment(fit)
         inverse = misfit(length + model)
+        # Antagonists mirror each other: all signs wrong is likelier than all of them exchanged.
+        all_turned = inverse[moved].sum() < fit[rows, best][moved].sum()
         for m, other in enumerate(best.tolist()):
             off = float(np.median((length - model)[:, m]))
-            follows = (
-                other == m or fit[m, m] <= BETTER * fit[m, other] or inverse[m] < fit[m, other]
-            )
+            turned = all_turned or inverse[m] < fit[m, other]
+            follows = other == m or turned or fit[m, m] <= BETTER * fit[m, other]
             if moved.any():
                 follows |= not moved[m] or fit[m, m] <= MISPLACED
             else:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of wires, motors, sensors and their cables, switched while the arm moves.
 
-A fault is one line, `KIND [QUANTITY] [MUSCLE] [SIZE]`: 'drop 0.3', 'stuck_motor biceps',
-'bias tension 40'. Without a muscle it is all of them.
+A fault is one line, `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]`: 'drop:0.3', 'stuck_motor:biceps',
+'bias:tension:40', 'dead_sensor:elbow'. Without a name it is all muscles.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class Kind(NamedTuple):
     of_quantity: bool = False
 
 
-#: sizes of spike and bias by quantity, [m], [N], [°C]: default, most
+#: sizes of spike and bias by quantity, [m], [N], [°C], of a joint [rad]: default, most
 SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3)}
+SIZES['theta'] = 0.1, 3.2
 KINDS = {
     'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
     'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),
@@ -46,10 +47,10 @@ KINDS = {
     'stuck_motor': Kind('motors stand'),
     'winch_speed': Kind('motors are slower', 0.009, SPEED_LIMIT, 'm/s'),
     'unzeroed': Kind('lengths are off by 0.4 to 1 times this', 0.13, 1.0, 'm'),
-    'slack_wire': Kind('wires are longer', 0.05, 1.0, 'm'),
-    'overheating': Kind('modules are hot', 90.0, 1e3, '°C'),
+    'slack': Kind('wires are longer', 0.05, 1.0, 'm'),
+    'overheat': Kind('modules are hot', 90.0, 1e3, '°C'),
 }
-LEGAL = 'KIND [QUANTITY] [MUSCLE] [SIZE]; kinds: ' + ', '.join(KINDS)
+LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
 class Readings(NamedTuple):
@@ -66,7 +67,7 @@ class Fault(NamedTuple):
 
     kind: str
     quantities: tuple[str, ...]
-    muscles: Ints
+    which: Ints  # muscles, or joints where the quantity is theta
     size: float
 
 
@@ -76,7 +77,7 @@ def read_fault(line: str, robot: Robot) -> Fault:
     Raises:
         MusculoskeletalError: If it says nothing legal; the message says what is.
     """
-    name, *words = line.split() or ['']
+    name, *words = (word.strip() for word in line.split(':'))
     if name not in KINDS:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
     kind = KINDS[name]
@@ -84,6 +85,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
     size, most = kind.size, kind.most
     if kind.of_quantity and words and words[0] in QUANTITIES:
         quantities = (words.pop(0),)
+    elif kind.of_quantity and words and words[0] in robot.joints:
+        quantities = ('theta',)
     elif kind.size:
         quantities = quantities[:1]  # of a spike or bias: length
     if quantities and kind.size:
@@ -97,8 +100,10 @@ def read_fault(line: str, robot: Robot) -> Fault:
     if not abs(size) <= most or (size < 0.0 and name not in ('spike', 'bias')):
         raise MusculoskeletalError(f'{line[:80]!r}; legal: sizes up to {most:g} {kind.unit}')
     if words and not kind.of_muscle:
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {name} [SIZE], which is of all readings')
-    muscles = robot.muscle_indices([' '.join(words)] if words else robot.muscles)
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {name}[:SIZE], which is of all readings')
+    if quantities == ('theta',) and len(words) == 1:
+        return Fault(name, quantities, np.array([robot.joints.index(words[0])]), size)
+    muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
     return Fault(name, quantities, np.array(muscles), size)
 
 
@@ -130,35 +135,35 @@ class Faults:
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:] = -np.inf
         for fault in self._of('winch_speed'):
-            self.stuck[fault.muscles] = 1.0 - fault.size / SPEED_LIMIT
+            self.stuck[fault.which] = 1.0 - fault.size / SPEED_LIMIT
         for fault in self._of('stuck_motor'):
-            self.stuck[fault.muscles] = 1.0
-        for fault in self._of('slack_wire'):
-            self.slack[fault.muscles] = fault.size
+            self.stuck[fault.which] = 1.0
+        for fault in self._of('slack'):
+            self.slack[fault.which] = fault.size
         for fault in self._of('unzeroed'):
-            self.zero[fault.muscles] = fault.size * self._forgotten[fault.muscles]
-        for fault in self._of('overheating'):
-            self.hot[fault.muscles] = fault.size
+            self.zero[fault.which] = fault.size * self._forgotten[fault.which]
+        for fault in self._of('overheat'):
+            self.hot[fault.which] = fault.size
 
     def _of(self, *names: str) -> list[Fault]:
         return [fault for fault in self._faults if fault.kind in names]
 
     def sensed(self, readings: Readings) -> Readings:
         """Return what the broken sensors read instead."""
-        values = {name: getattr(readings, name).copy() for name in QUANTITIES}
+        values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
         for fault in self._of('bias', 'spike', 'dead_sensor', 'freeze'):
             for name in fault.quantities:
-                value, muscles = values[name], fault.muscles
+                value, which = values[name], fault.which
                 if fault.kind == 'bias':
-                    value[muscles] += fault.size
+                    value[which] += fault.size
                 elif fault.kind == 'dead_sensor':
-                    value[muscles] = 0.0
+                    value[which] = 0.0
                 elif fault.kind == 'freeze':
-                    value[muscles] = [
-                        self._frozen.setdefault((name, m), float(value[m])) for m in muscles
+                    value[which] = [
+                        self._frozen.setdefault((name, m), float(value[m])) for m in which
                     ]
                 elif self._rng.random() < SPIKE_SHARE:
-                    value[self._rng.choice(muscles)] += fault.size
+                    value[self._rng.choice(which)] += fault.size
         return readings._replace(**values)
 
     def _happens(self, name: str) -> bool:

@@ -125,6 +125,13 @@ class AnomalyDetector:
         share = (known - theta) / (self._robot.upper - self._robot.lower)
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
+    def limit(self, theta: Array) -> float:
+        """Return the d that no healthy arm reaches at θ [rad] (D,), ∞ while nothing is known."""
+        if self._statistics is None or not self._statistics.calibrated:
+            return np.inf
+        threshold = self._statistics.thresholds.get(DISTANCE, np.inf)
+        return threshold * float(np.clip(self.unfamiliar(theta), 1.0, WIDEST))
+
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
     ) -> str:
@@ -134,8 +141,8 @@ class AnomalyDetector:
                 return ''
             limit = self._statistics.thresholds.get(DISTANCE, np.inf)
             value, what = distance, 'd'
-            if value > limit and not slack.any() and (far := self.unfamiliar(theta)) > 1.0:
-                limit, where = limit * min(WIDEST, far), ' in an unfamiliar posture'
+            if value > limit and not slack.any() and (wider := self.limit(theta)) > limit:
+                limit, where = wider, ' in an unfamiliar posture'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''

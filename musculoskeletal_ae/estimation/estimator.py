@@ -187,6 +187,8 @@ class Estimator:
                 'd': f'{self._verdict.distance:.1f}',
                 'suspect muscle': self._suspect or self._robot.muscles[self._verdict.suspect],
             }
+            if self.detector.calibrated:
+                values['d limit'] = f'{self.detector.limit(self._theta):.1f}'
         if self.zeros.offset.any():
             zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
             values['length zeros'] = ', '.join(f'{n} {o:.1f} ± {d:.1f} mm' for n, o, d in zeros)

@@ -241,8 +241,23 @@ def baselines(study: Study, rows: Rows) -> Plot:
 
 
 ROWS = (
+    *(
+        Row(f'{name}, {when} learning [rad]', NOTHING, '', f'baselines.{key}.{when}_rad')
+        for name, key in (
+            ('least squares on the geometric model', 'geometric model, least squares'),
+            ('polynomial mapping and EKF', 'polynomial mapping, EKF'),
+            ('table search', 'table search'),
+        )
+        for when in ('before', 'after')
+    ),
+    Row('estimate before learning, 3.6 kg in the hand [rad]', NOTHING,
+        '', 'before_payload_rad'),
     Row('estimate after learning, 3.6 kg in the hand [rad]', '≈ 0.186',
         '', 'after_payload_rad', '', 0.10),
+    Row('A before learning, healthy at most', NOTHING, '', 'a_before_healthy_max', digits=2),
+    Row('A before learning, muscle cut', 'hardly rises', '', 'a_before_ruptured_min', digits=2),
+    Row('A after learning, healthy at most', NOTHING, '', 'a_healthy_max', digits=2),
+    Row('A after learning, muscle cut', 'rises', '', 'a_ruptured_min', digits=2),
     Row('time until a cut muscle is noticed, slowest muscle [s]', NOTHING,
         '', 'detection_worst_s', '', 0.5, 2, worst=True),
     Row('cut muscle named rightly [share]', NOTHING,

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from musculoskeletal_ae.experiments.results import read, table
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.experiments.table import NOTHING
+from musculoskeletal_ae.experiments.table import NOTHING, individuals
 
 TEMPLATE = 'report.html.jinja'  # beside this file
 
@@ -27,7 +27,7 @@ def write_report(folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(flat=_flat, cell=_cell)
+    environment.filters.update(flat=_flat, cell=_cell, individuals=individuals)
     page = environment.get_template(TEMPLATE).render(
         results=results,
         experiments=EXPERIMENTS,

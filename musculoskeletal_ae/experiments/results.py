@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a call leaves in its folder: result.json and plots of every experiment, the README's table.
+"""What a call leaves in its folder: result.json and plots of every experiment, the results table.
 
-python -m musculoskeletal_ae.experiments.results README.md
+python -m musculoskeletal_ae.experiments.results doc/experiments.md
 
-writes the README's table anew from the result.json files in doc/results beside it; `experiment …
---readme README.md` first puts what it measured there.
+writes the table of a page anew from the result.json files in doc/results; `experiment … --readme
+doc/experiments.md` first puts what it measured there.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Results = Mapping[str, Mapping[str, Any]]
 #: counted in all, not per individual: the hour of healthy motion is spread over the seeds
 TOTALS = ('false_alarms', 'false_alarms_beside_cuts', 'healthy_s', 'counted_cuts')
 DIGITS = 6  # significant; more is noise
-BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the README's table
+BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
 
 
@@ -50,7 +50,10 @@ def write(study: Study, measured: Mapping[str, Rows], out: Path) -> list[Path]:
         text = json.dumps(result, indent=1, ensure_ascii=False)
         (folder / 'result.json').write_text(text + '\n', encoding='utf-8')
         for file, (figure, _) in drawn.items():
-            figure.savefig(folder / file, dpi=DPI)
+            figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
+            # For a paper; without a date, so that the same numbers give the same file.
+            vector = (folder / file).with_suffix('.pdf')
+            figure.savefig(vector, bbox_inches='tight', metadata={'CreationDate': None})
         files += [folder / file for file in ('result.json', *drawn)]
     return files
 
@@ -119,9 +122,9 @@ def table(results: Results) -> list[Cells]:
 
 
 def readme_table(results: Results) -> str:
-    """Return what stands between the README's markers."""
+    """Return what stands between the markers of a page."""
     if not results:
-        return '\n\nNothing measured yet: `experiment all --readme README.md`.\n\n'
+        return '\n\nNothing measured yet: `experiment all --readme doc/experiments.md`.\n\n'
     return f'\n\n{markdown(next(iter(results.values()))["about"], table(results))}\n\n'
 
 
@@ -133,7 +136,8 @@ def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
     Raises:
         MusculoskeletalError: If the README has no place between markers.
     """
-    text, kept, files = readme.read_text(encoding='utf-8'), readme.parent / KEPT, []
+    text, files = readme.read_text(encoding='utf-8'), list[Path]()
+    kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
     if text.count(BEGIN) != 1 or text.count(END) != 1:
         raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and one {END}')
     if measured is not None and measured.resolve() != kept.resolve():

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 NOTHING = '–'
@@ -62,14 +62,18 @@ def _at(result: Mapping[str, Any], key: str) -> float | None:
     return None if value == {} else float(value)
 
 
+def individuals(seeds: Sequence[int]) -> str:
+    """Return whose numbers these are, such as 'individual 0'."""
+    return f'individual{"s" * (len(seeds) > 1)} {", ".join(map(str, seeds))}'
+
+
 def markdown(about: Mapping[str, Any], lines: Iterable[Cells]) -> str:
     """Return the table as the README has it; `about` is that of a result.json."""
-    individuals = ', '.join(map(str, about['seeds']))
     text = (
-        f'{about["robot"]}, emulated individuals {individuals}, {about["minutes"]:g} minutes of '
-        f'exploration; {NOTHING}: not printed, or nothing to compare. Bound: least squares on the '
-        'true body (estimate), the least ‖T‖ that can hold the target (control), the true body '
-        'without friction (simulator).\n\n'
+        f'{about["robot"]}, emulated {individuals(about["seeds"])}, {about["minutes"]:g} minutes '
+        f'of exploration; {NOTHING}: not printed, or nothing to compare. Bound: least squares on '
+        'the true body (estimate), the least ‖T‖ that can hold the posture where the arm came to '
+        'rest (control), the true body without friction (simulator).\n\n'
         '| | paper, on Musashi | preset `paper` | preset `default` | bound | aim |\n'
         '|---|---|---|---|---|---|'
     )

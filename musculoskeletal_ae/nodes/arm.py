@@ -1,30 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm on the graph, simulated or emulated: its states, its description, and how it is drawn.
-
-RViz and Foxglove draw bones and muscles from markers in the root link's frame.
-"""
+"""An arm on the graph, simulated or emulated: its states, its description, its markers."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
-from itertools import count
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA, Float64MultiArray, String
-from visualization_msgs.msg import Marker, MarkerArray
+from std_msgs.msg import Float64MultiArray, String
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.nodes.markers import Markers
 from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line
 from musculoskeletal_ae.validity import read_wrench
 
-MARKER_RATE = 10.0  # [Hz]
 # After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
 LONGEST_STEP = 0.1  # [s]
 
@@ -36,12 +30,11 @@ class Arm(Shell):
         """Advertise NAME/markers; options are those of Node."""
         super().__init__(name, **options)
         self._arm = name
-        self._markers = self.create_publisher(MarkerArray, f'{name}/markers', RELIABLE)
-        self.create_timer(1.0 / MARKER_RATE, self._publish_markers)
+        Markers(self, name, self.lines)
 
     def follow_wrench(self, follow: Callable[[Array], object]) -> None:
         """Give `follow` what comes on NAME/external_wrench, (6,) [N, N·m] in root link axes."""
-        topic, frame = f'{self._arm}/external_wrench', self.robot.root_link
+        topic, frame = f'{self._arm}/external_wrench', self.root_frame
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
@@ -67,19 +60,3 @@ class Arm(Shell):
     def lines(self) -> list[Line]:
         """Return the arm as lines; none where there is nothing to draw yet."""
         raise NotImplementedError
-
-    def _publish_markers(self) -> None:
-        if self._markers.get_subscription_count() == 0 or not (lines := self.lines()):
-            return
-        numbers: defaultdict[str, count[int]] = defaultdict(count)
-        message, stamp = MarkerArray(), self.get_clock().now().to_msg()
-        for line in lines:
-            marker = Marker(ns=line.kind, id=next(numbers[line.kind]), type=Marker.LINE_STRIP)
-            marker.header.frame_id, marker.header.stamp = self.robot.root_link, stamp
-            marker.pose.orientation.w = 1.0
-            marker.scale.x = line.width
-            red, green, blue = line.colour
-            marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
-            marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
-            message.markers.append(marker)
-        self._markers.publish(message)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, /diagnostics →
-stdout.
+On a terminal, where rich is installed (`--view` brings it), one screen instead, with muscles.
+
+joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, muscle_states,
+/diagnostics → stdout.
 """
 
 from __future__ import annotations
@@ -10,7 +12,10 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -22,6 +27,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.robot.robot import Robot
 
 
 class BringupStatus(Shell):
@@ -36,17 +43,27 @@ class BringupStatus(Shell):
         self.theta: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.detected = self.explored = False
+        self.situation = Situation(self.get_namespace())
         self.checkpoints = 0
-        self.samples = self.suspect = self.stopped = ''
         self.started: float | None = None
         self.follow_posture('joint_states', partial(setattr, self, 'theta'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        self.listen(Bool, 'anomaly_detected', lambda m: setattr(self, 'detected', m.data), LATCHED)
+        detected = partial(setattr, self.situation, 'detected')
+        self.listen(Bool, 'anomaly_detected', lambda m: detected(m.data), LATCHED)
         self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
-        self.listen(DiagnosticArray, '/diagnostics', self._diagnosed, RELIABLE)
+        self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
+        self.states: Array | None = None
+        self.screen = open_screen()
+        if self.screen is not None:
+            self.follow_muscle_states(partial(setattr, self, 'states'))
         self.create_timer(1.0, self._print, clock=STEADY)
+
+    def destroy_node(self) -> None:
+        """Leave the last screen standing."""
+        if self.screen is not None:
+            self.screen.stop()
+        super().destroy_node()
 
     def _estimated(self, theta: Array) -> None:
         if self.theta is not None:
@@ -55,30 +72,6 @@ class BringupStatus(Shell):
     def _count_checkpoint(self, _: UInt8MultiArray) -> None:
         self.checkpoints += 1
 
-    def _diagnosed(self, message: DiagnosticArray) -> None:
-        here = self.get_namespace().rstrip('/')
-        for status in message.status:
-            values = {value.key: value.value for value in status.values}
-            if status.name.startswith(f'{here}/learner:'):
-                self.samples = values.get('samples', '')
-            elif status.name.startswith(f'{here}/estimator:'):
-                self.suspect = values.get('suspect muscle', '')
-            elif status.name.startswith(f'{here}/controller:'):
-                self.stopped = status.message if status.message.startswith('stopped') else ''
-                if not self.stopped:
-                    self.explored = 'exploring' in (status.message, values.get('doing'))
-
-    def _trouble(self) -> str:
-        """Return what keeps the arm from going on, and every step that is to be taken."""
-        told, steps = [], []
-        if self.detected:
-            told.append(f'ANOMALY: {self.suspect}')
-            steps += ['mend it', 'estimator/reset']
-        if self.stopped:
-            told.append(self.stopped.replace('stopped', 'STOPPED', 1))
-            steps += ['controller/reset', *['controller/explore'] * self.explored]
-        return f'  {", ".join(told)} (to go on: {", ".join(steps)})' if told else ''
-
     def _print(self) -> None:
         now = time.monotonic()
         if self.started is None and not self.anomalies:
@@ -86,12 +79,46 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        error, anomaly = (
-            np.mean(values) if values else math.nan for values in (self.errors, self.anomalies)
-        )
+        means = (fmean(values or [math.nan]) for values in (self.errors, self.anomalies))
+        told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []
-        line = f'{now - self.started:6.0f} s  error {error:.3f} rad  A {anomaly:.3f}'
-        line += f'  samples {self.samples or 0}  checkpoints {self.checkpoints}'
-        print(printable(line + self._trouble()), flush=True)
+        line = f'{now - self.started:6.0f} s  {known}'
+        line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
+        more = told.trouble() or told.hint()
+        if self.screen is None:
+            print(printable(f'{line}  {more}'.rstrip()), flush=True)
+        else:
+            self.screen.update(muscle_table(self.robot, self.states, [line, more]), refresh=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException
+
+
+def open_screen() -> Any:
+    """Return a rich display that is redrawn in place, None without rich or without a terminal."""
+    if not sys.stdout.isatty() or find_spec('rich') is None:
+        return None
+    from rich.live import Live
+
+    screen = Live(auto_refresh=False)
+    screen.start()
+    return screen
+
+
+def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> Any:
+    """Return lines, and l [m], T [N] and °C (3, M) as a table with bars, for a terminal."""
+    from rich.bar import Bar
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, padding=(0, 1))
+    for title in ('muscle', 'l [mm]', 'T [N]', '', '°C'):
+        table.add_column(title, justify='left' if title in ('muscle', '') else 'right')
+    for m, name in enumerate(robot.muscles if states is not None else ()):
+        length, tension, temperature = states[:, m]  # type: ignore[index]
+        limit = float(robot.tension.limit[m])
+        colour = 'blue' if tension < limit else 'dark_orange'
+        bar = Bar(limit, 0.0, max(tension, 0.0), width=30, color=colour)
+        table.add_row(name, f'{1e3 * length:.0f}', f'{tension:.0f}', bar, f'{temperature:.0f}')
+    texts = [Text(printable(lines[0])), Text(printable(lines[1]), style='bold red')]
+    return Group(*filter(None, texts), table)

@@ -2,7 +2,8 @@
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
 muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected,
-muscle_length_zeros (joint_states help to find those);
+muscle_length_zeros (joint_states help to find those), estimated/markers;
+on request muscle_joint_states and /tf;
 marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
 
@@ -24,12 +25,14 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.markers import Frames, Markers
 from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
 from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.validity import read_pose
 
 
@@ -62,13 +65,25 @@ class Estimator(Shell):
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscle_states(self._estimate, as_read=True)
-        self.follow_posture('joint_states', lambda theta: self.core.joints(theta, time.monotonic()))
+        self.follow_posture('joint_states', self._measured)
         self._tell_zeros()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
         self.listen(PoseStamped, 'marker_pose', self._see, SENSOR)
+        self.drawn: tuple[Array, Array] | None = None  # θ, T
+        Markers(self, 'estimated', lambda: draw_arm(self.robot, *self.drawn) if self.drawn else [])
+        self.mirror = None
+        if self.parameter('mirror_muscles'):
+            self.mirror = self.create_publisher(JointState, 'muscle_joint_states', RELIABLE)
+        self.tf_source = self.parameter('publish_tf')
+        self.frames = None if self.tf_source == 'none' else Frames(self)
         serve(self, Trigger, 'estimator/reset', self._reset)
         serve(self, Trigger, 'estimator/zero', self._zero)
+
+    def _measured(self, theta: Array) -> None:
+        self.core.joints(theta, time.monotonic())
+        if self.frames is not None and self.tf_source == 'sensor':
+            self.frames.publish(theta)
 
     def _use(self, mae: Mae) -> None:
         self.core.use(mae)
@@ -111,8 +126,15 @@ class Estimator(Shell):
         self.plausibility.check_muscles(tension, from_zero, temperature, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         self._tell_zeros()
+        if self.mirror is not None and from_zero is not None:
+            mirrored = joint_message(self.robot.muscles, from_zero, clock.to_msg())
+            mirrored.effort = tension.tolist()
+            self.mirror.publish(mirrored)
         if estimate is None:
             return
+        self.drawn = estimate.state.theta, tension
+        if self.frames is not None and self.tf_source == 'estimate':
+            self.frames.publish(estimate.state.theta)
         if from_zero is not None:
             self.gate.message(tension, from_zero, now)
         state = estimate.state
@@ -126,7 +148,7 @@ class Estimator(Shell):
             self.take_anomaly(True)
 
     def _see(self, message: PoseStamped) -> None:
-        theta = self.core.see(read_pose(message, self.robot.root_link))
+        theta = self.core.see(read_pose(message, self.root_frame))
         self.seen.publish(joint_message(self.robot.joints, theta, message.header.stamp))
 
     def _reset(self, _: Trigger.Request) -> str:

@@ -73,7 +73,7 @@ class HardwareEmulator(Arm):
         pose = self.arm.marker_pose()
         message = PoseStamped()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = self.robot.root_link
+        message.header.frame_id = self.root_frame
         position, turn = message.pose.position, message.pose.orientation
         position.x, position.y, position.z = pose.translation.tolist()
         turn.x, turn.y, turn.z, turn.w = pin.Quaternion(pose.rotation).coeffs().tolist()

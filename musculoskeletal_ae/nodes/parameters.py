@@ -32,7 +32,8 @@ from musculoskeletal_ae.parameters import (
     parameters_of,
 )
 
-SHARED = {'robot': ROBOT, 'rate': RATE}
+FRAME_PREFIX = Parameter('', 'put before every frame that is published, such as "left/"')
+SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}
 NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 #: by node, then by name
@@ -68,6 +69,15 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             False, 'winches that forget their zeros: find them at the start'
         ),
         **parameters_of(Slack),
+        'mirror_muscles': Parameter(
+            False, 'publish muscle_joint_states, so that plots know the names of the muscles'
+        ),
+        'publish_tf': Parameter(
+            'none',
+            'whose joint angles go to /tf as poses of all links; needs tf2_msgs, which a sourced '
+            'Jazzy has',
+            legal=('none', 'estimate', 'sensor'),
+        ),
     },
     'hardware_emulator': {
         **SHARED,
@@ -83,7 +93,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'faults': Parameter(
             ('',),
-            'what is wrong, each KIND [QUANTITY] [MUSCLE] [SIZE], such as "bias tension 40" '
+            'what is wrong, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
             '([""] mends; doc/interface.md lists the kinds)',
             settable=True,
         ),

@@ -9,12 +9,16 @@ import time
 from argparse import Namespace
 from pathlib import Path
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
@@ -22,8 +26,8 @@ from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import serve
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import array_message, serve
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
 from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
@@ -74,7 +78,14 @@ class Replay(Node):
             for recorded, name in names.items()
         }
         self._recorded_clock = RecordedClock(self, options.rate) if options.clock else None
-        self._next_service = 0.0
+        self._next_service = self._next_report = 0.0
+        self._sought: int | None = None  # where to go on [ns]
+        told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
+        number = FloatingPointRange(from_value=0.0, to_value=(self._stop - self._start) / 1e9)
+        told.floating_point_range = [number]
+        self.declare_parameter('position', 0.0, told)
+        self.add_post_set_parameters_callback(self._seek)
+        self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -96,14 +107,18 @@ class Replay(Node):
 
     def play(self, progress: tqdm) -> None:
         """Publish everything once, from start to stop."""
-        # Just before the first message, so that it is not due when the lap begins paused.
-        self._timeline.jump(self._start - 1, time.monotonic())
         progress.reset()
-        for message in lap(self._bag, self._names, self._start, self._stop):
-            self._wait(message.log_time, progress)
-            self._timeline.catch_up(message.log_time, time.monotonic())
-            self._tick()
-            self._publisher[message.topic].publish(message.data)
+        self._sought = self._start if self._sought is None else self._sought
+        while self._sought is not None:
+            start, self._sought = self._sought, None
+            # Just before the first message, so that it is not due when the lap begins paused.
+            self._timeline.jump(start - 1, time.monotonic())
+            for message in lap(self._bag, self._names, start, self._stop):
+                if not self._wait(message.log_time, progress):
+                    break
+                self._timeline.catch_up(message.log_time, time.monotonic())
+                self._tick()
+                self._publisher[message.topic].publish(message.data)
 
     def play_again_and_again(self, progress: tqdm) -> None:
         """Publish everything until the process is ended."""
@@ -118,10 +133,12 @@ class Replay(Node):
             left = max(0.0, end - time.monotonic())
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
 
-    def _wait(self, recorded: int, progress: tqdm) -> None:
-        """Answer services and publish the clock until a recorded time [ns] is due."""
+    def _wait(self, recorded: int, progress: tqdm) -> bool:
+        """Answer services and publish the clock until a recorded time [ns] is due; False: seek."""
         self._next_time = recorded
         while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
+            if self._sought is not None:
+                break
             self._tick()
             wait = min(due, SERVICE_PERIOD)
             if self._recorded_clock:
@@ -129,15 +146,29 @@ class Replay(Node):
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.spin_once(timeout_sec=wait)
+                if now > self._next_report:
+                    self._next_report = now + 1.0
+                    self._report()
                 done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
                 progress.update(max(0.0, done - progress.n))
             else:
                 time.sleep(wait)
+        return self._sought is None
 
     def _tick(self) -> None:
         now = time.monotonic()
         if self._recorded_clock:
             self._recorded_clock.tick(self._timeline.recorded(now), now)
+
+    def _seek(self, parameters: list[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name == 'position':
+                self._sought = self._start + int(1e9 * parameter.value)
+
+    def _report(self) -> None:
+        at = self._timeline.recorded(time.monotonic()) - self._start
+        seconds = np.array([max(at, 0), self._stop - self._start]) / 1e9
+        self._told.publish(array_message(seconds, 'position'))
 
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""
@@ -186,7 +217,8 @@ def parse(arguments: list[str]) -> Namespace:
         'replay',
         'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,
         'While it plays, the services replay/pause, replay/resume and replay/step '
-        '(std_srvs/Trigger) stop it, go on, and publish the messages of the next recorded time.',
+        '(std_srvs/Trigger) stop it, go on, and play the messages of the next recorded time. Its '
+        'parameter `position` [s] goes there.',
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a bag directory or an mcap file')

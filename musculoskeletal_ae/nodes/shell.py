@@ -72,6 +72,8 @@ class Shell(Node):
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
+        #: name of the root link's frame in messages that are published
+        self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         self._reception = Reception(lambda text: self.get_logger().warning(text))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason

@@ -31,12 +31,18 @@ class Line(NamedTuple):
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
 
 
+def tension_share(robot: Robot, tension: Array) -> Array:
+    """Return how far T [N] (M,) is on the way from T_bias to T_limit, within [0, 1]."""
+    limits = robot.tension
+    return np.clip((tension - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
+
+
 def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = None) -> list[Line]:
     """Return the bones of an arm, then its muscles in their order, at θ [rad] (D,) and T [N] (M,).
 
     Route points [m] (P, 3) are those of the geometric model by default.
     """
-    kin, routes, limits = robot.kinematics, robot.routes, robot.tension
+    kin = robot.kinematics
     origins = kin.joint_poses(theta[None]).translation[0]
     bones = [np.stack([origins[kin.parent[i]], origins[i]]) for i in range(1, len(origins))]
     for link in robot.description.end_effectors:
@@ -47,8 +53,8 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         for bone in bones
         if np.linalg.norm(bone[1] - bone[0]) > SHORTEST_BONE
     ]
-    red = np.clip((tension - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
-    for share, route in zip(red.tolist(), routes.drawn(theta, points), strict=True):
+    shares = tension_share(robot, tension).tolist()
+    for share, route in zip(shares, robot.routes.drawn(theta, points), strict=True):
         lines.append(Line('muscles', route, MUSCLE_WIDTH, (share, 1.0 - share, 0.0)))
     return lines
 

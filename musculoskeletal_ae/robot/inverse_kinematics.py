@@ -21,6 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 # How far the pose of a usual camera's marker can be trusted: σ_p [m], σ_R [rad].
 SPREADS = np.repeat([0.002, 0.01], 3)
+POSITION_ONLY = np.repeat([0.002, 100.0], 3)  # however the hand is turned
 ESTIMATE_SPREAD = 0.2  # σ_θ [rad]
 ITERATIONS = 30
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
@@ -35,17 +36,20 @@ class Posture(NamedTuple):
     angle: float  # [rad]
 
 
-def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
+def inverse_kinematics(
+    robot: Robot, pose: pin.SE3, start: Array, spreads: Array = SPREADS
+) -> Posture:
     """Return the joint angles that bring the end effector nearest to a pose.
 
-    The pose is in the root link's frame; the search starts at the estimate θ_est [rad] (D,).
+    The pose is in the root link's frame and known to `spreads`, (6,) σ_p [m] and σ_R [rad]; the
+    search starts at the estimate θ_est [rad] (D,).
     """
     kin, lower, upper = robot.kinematics, robot.lower, robot.upper
     theta, damping = np.clip(start, lower, upper), 1e-2
-    error = _error(robot, pose, theta, start)
+    error = _error(robot, pose, theta, start, spreads)
     prior = np.eye(len(theta)) / ESTIMATE_SPREAD
     for _ in range(ITERATIONS):
-        jacobian = np.vstack([kin.end_effector_jacobian(theta) / SPREADS[:, None], prior])
+        jacobian = np.vstack([kin.end_effector_jacobian(theta) / spreads[:, None], prior])
         # At a limit, a joint that wants to go beyond is held.
         gradient = jacobian.T @ error
         held = (theta <= lower) & (gradient < 0.0) | (theta >= upper) & (gradient > 0.0)
@@ -54,7 +58,7 @@ def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
         scale = damping * np.maximum(np.diag(normal), 1e-3 * np.diag(normal).max() + 1e-12)
         step = np.linalg.solve(normal + np.diag(scale), jacobian.T @ error)
         tried = np.clip(theta + step, lower, upper)
-        tried_error = _error(robot, pose, tried, start)
+        tried_error = _error(robot, pose, tried, start, spreads)
         if tried_error @ tried_error < error @ error:
             moved = np.abs(tried - theta).max()
             theta, error, damping = tried, tried_error, max(0.2 * damping, LEAST_DAMPING)
@@ -64,13 +68,13 @@ def inverse_kinematics(robot: Robot, pose: pin.SE3, start: Array) -> Posture:
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
-    left = error[:6] * SPREADS
+    left = error[:6] * spreads
     return Posture(theta, float(np.linalg.norm(left[:3])), float(np.linalg.norm(left[3:])))
 
 
-def _error(robot: Robot, pose: pin.SE3, theta: Array, start: Array) -> Array:
+def _error(robot: Robot, pose: pin.SE3, theta: Array, start: Array, spreads: Array) -> Array:
     """Return what is missing in position, orientation and to the estimate, weighted, (6+D,)."""
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
-    missing = np.concatenate([pose.translation - here.translation, turn]) / SPREADS
+    missing = np.concatenate([pose.translation - here.translation, turn]) / spreads
     return np.concatenate([missing, (start - theta) / ESTIMATE_SPREAD])

@@ -146,8 +146,8 @@ class Kinematics:
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
         return frame.parentJoint, frame.placement
 
-    def transforms(self, theta: Array) -> Array:
-        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
+    def in_parents(self, theta: Array) -> Array:
+        """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
         angle = self.tree_angles(theta)[:, :, None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
@@ -156,6 +156,11 @@ class Kinematics:
         poses = np.empty((len(theta), *self._placement.shape))
         poses[:, 0] = self._placement[0]
         poses[:, 1:] = self._placement[1:] + first * self._first[1:] + second * self._second[1:]
+        return poses
+
+    def transforms(self, theta: Array) -> Array:
+        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
+        poses = self.in_parents(theta)
         for i in range(2, len(self.parent)):
             if self.parent[i] > 0:
                 poses[:, i] = poses[:, self.parent[i]] @ poses[:, i]

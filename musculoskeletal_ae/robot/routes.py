@@ -27,6 +27,7 @@ from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.wrapping import WrapObjects
 
+ARC = 9  # points of a wrapped wire's arc that are drawn
 # Bounds the memory of one batched evaluation to a few tens of megabytes.
 CHUNK = 4096
 
@@ -100,7 +101,7 @@ class Routes:
             at = np.ascontiguousarray(poses.rotation[0]), poses.translation[0].copy()
             for i, s in enumerate(self.wrapping.tolist()):
                 ends = points[self.first[s]], points[self.second[s]]
-                arcs[s] = touched(self.objects, i, *at, *ends)
+                arcs[s] = touched(self.objects, i, ARC, *at, *ends)
         lines = []
         for m in range(len(self._sum)):
             own = np.flatnonzero(self.muscle == m)

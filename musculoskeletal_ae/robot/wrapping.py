@@ -232,9 +232,13 @@ def wrapped_segments(
 
 
 def touched(
-    objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array
-) -> Array:
-    """Return points along the arc of one wrapped segment for drawing, (K, 3); none if straight."""
+    objects: WrapObjects, s: int, most: int, rotation: Array, translation: Array,
+    start: Array, end: Array,
+) -> Array:  # fmt: skip
+    """Return points along the arc of one wrapped segment for drawing, (K, 3); none if straight.
+
+    K is `most` on an arc, 1 in a ring.
+    """
     leave, arrive = np.zeros(3), np.zeros(3)
     length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
     if np.linalg.norm(leave + arrive) < 1e-9:
@@ -249,7 +253,7 @@ def touched(
     ahead, speed = across @ leave, float(np.linalg.norm(across @ leave))
     # The straight parts end where they are nearest to the axis.
     first, last = ((centre - start) @ ahead / speed**2, (centre - end) @ across @ arrive / speed**2)
-    turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, 9)[:, None]
+    turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, most)[:, None]
     begin = start + first * leave - centre
     along = (begin @ axis + turn * radius / speed * (leave @ axis)) * axis
     points: Array = centre + along + np.cos(turn) * (across @ begin)

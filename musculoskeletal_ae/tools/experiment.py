@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('DIR', 'results and report', Path('experiments'))
     cores = len(os.sched_getaffinity(0))
     parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='processes')
-    text = 'also write the results table between the markers of this README'
+    text = 'also write the results table between the markers of this page'
     parser.add_argument('--readme', type=Path, metavar='FILE', help=text)
     args = parser.parse_args(argv)
     args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)

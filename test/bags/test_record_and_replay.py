@@ -107,7 +107,8 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
     assert graph.call(Trigger, 'replay/step').success
     graph.wait(lambda: received, 'the first step')
     answer = graph.call(Trigger, 'replay/step')
-    assert (answer.success, answer.message) == (True, 'stepped at 0.210000 s')
+    second = (content[1].log_time - content[0].log_time) / 1e9
+    assert (answer.success, answer.message) == (True, f'stepped at {second:.6f} s')
     graph.wait(lambda: len(received) == 2, 'the second step')
     graph.wait(lambda: now() == content[1].log_time, 'the time of the second step')
     assert graph.call(Trigger, 'replay/resume').success
@@ -119,6 +120,19 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
     output = replay.end(signal.SIGINT)
     assert replay.process.returncode == 0
     assert 'Traceback' not in output
+
+
+def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_path):
+    samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
+    length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
+    told = graph.listen(Float64MultiArray, 'replay/position')
+    tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *ros(graph))
+    graph.wait(lambda: told, 'where it is')
+    assert told[-1].data[0] == 0.0 and told[-1].data[1] == pytest.approx(length)
+    good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
+    assert good, reason
+    graph.wait(lambda: told[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
+    assert not graph.set_parameter('replay', 'position', length + 1.0)[0]
 
 
 def test_the_clock_ticks_a_hundred_times_in_a_recorded_second(tool, graph, tmp_path):

@@ -171,6 +171,7 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     [
         (['--robot', 'no_such_robot'], 'musashi_left_arm'),
         (['--duration', 'soon'], 'soon'),
+        (['--view', '--port', '65536'], '65536'),
         (['--seed', '-1'], '-1'),
         (['--preset', 'best'], 'default or paper'),
         (['--namespace', '1st'], '1st'),

@@ -208,14 +208,14 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
 @pytest.mark.parametrize(
     ('fault', 'checks'),
     [
-        ('drop 0.4', {'rate'}),
-        ('delay 0.2', {'latency'}),
-        ('duplicate 0.5', {'rate'}),
-        ('freeze biceps_long', {'rate', 'law'}),
-        ('dead_sensor biceps_long', {'rate', 'law'}),
-        ('bias biceps_long 0.1', {'zero'}),
-        ('bias tension biceps_long 40', {'law'}),
-        ('stuck_motor biceps_long', {'law'}),
+        ('drop:0.4', {'rate'}),
+        ('delay:0.2', {'latency'}),
+        ('duplicate:0.5', {'rate'}),
+        ('freeze:biceps_long', {'rate', 'law'}),
+        ('dead_sensor:biceps_long', {'rate', 'law'}),
+        ('bias:biceps_long:0.1', {'zero'}),
+        ('bias:tension:biceps_long:40', {'law'}),
+        ('stuck_motor:biceps_long', {'law'}),
     ],
 )
 def test_faults_of_the_emulated_arm_are_found(fault, checks):

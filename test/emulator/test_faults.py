@@ -37,12 +37,12 @@ def delivered(robot, line, count=400, period=0.0078125):
 
 
 def test_readings_get_lost_come_late_twice_or_after_the_next(robot):
-    assert delivered(robot, 'drop 0') == [[i] for i in range(400)]
-    lost = delivered(robot, 'drop 0.25')
+    assert delivered(robot, 'drop:0') == [[i] for i in range(400)]
+    lost = delivered(robot, 'drop:0.25')
     assert 40 < sum(one == [] for one in lost) < 160
     assert all(one in ([], [i]) for i, one in enumerate(lost))
-    assert delivered(robot, 'drop 1', 50) == [[]] * 50
-    late = delivered(robot, 'delay 0.0390625', 50)
+    assert delivered(robot, 'drop:1', 50) == [[]] * 50
+    late = delivered(robot, 'delay:0.0390625', 50)
     assert late == [[]] * 5 + [[i] for i in range(45)]
     twice = delivered(robot, 'duplicate')
     assert {len(one) for one in twice} == {1, 2}
@@ -58,27 +58,35 @@ def sensed(arm, line, count=300):
 
 
 def test_sensors_are_off_repeat_themselves_or_die(arm, robot):
-    healthy = np.mean(sensed(arm, 'drop 0'), axis=0)
+    healthy = np.mean(sensed(arm, 'drop:0'), axis=0)
     others = np.arange(robot.muscle_count) != MUSCLE
     name = robot.muscles[MUSCLE]
     for line, row, size in (
         ('bias', 0, 0.05),
-        ('bias tension', 1, 100.0),
-        ('bias length', 0, -0.1),
+        ('bias:tension', 1, 100.0),
+        ('bias:length', 0, -0.1),
     ):
-        text = f'{line} {name}' + (f' {size}' if size < 0.0 else '')
+        text = f'{line}:{name}' + (f':{size}' if size < 0.0 else '')
         off = np.mean(sensed(arm, text), axis=0) - healthy
         assert off[row, MUSCLE] == pytest.approx(size, rel=0.05)
         assert np.abs(off[:, others]).max() < 0.5
-    dead = sensed(arm, f'dead_sensor tension {name}', 3)[-1]
+    dead = sensed(arm, f'dead_sensor:tension:{name}', 3)[-1]
     assert dead[1, MUSCLE] == 0.0 and dead[1, others].min() > 5.0 and dead[0, MUSCLE] != 0.0
     assert not np.any(sensed(arm, 'dead_sensor', 1))
-    frozen = np.array(sensed(arm, f'freeze {name}', 50))
+    frozen = np.array(sensed(arm, f'freeze:{name}', 50))
     assert np.ptp(frozen[:, :, MUSCLE], axis=0).max() == 0.0
     assert np.ptp(frozen[:, 1, :], axis=0)[others].min() > 0.0
-    spikes = np.array(sensed(arm, 'spike temperature 80', 300))[:, 2]
+    spikes = np.array(sensed(arm, 'spike:temperature:80', 300))[:, 2]
     assert 1 <= np.sum(spikes > 90.0) < 60
     assert np.all(np.sum(spikes > 90.0, axis=1) <= 1)
+
+
+def test_a_joint_s_sensor_errs_alone(arm, robot):
+    angles = np.array([arm.sense().theta for _ in range(300)])
+    for line, expected in (('dead_sensor', 0.0), ('bias', 0.1 + angles[:, 1].mean())):
+        arm.faults.set([f'{line}:{robot.joints[1]}'])
+        off = np.mean([arm.sense().theta for _ in range(300)], axis=0)
+        assert off == pytest.approx([angles[:, 0].mean(), expected], abs=0.01)
 
 
 def hold(arm, robot, lines, seconds=1.5, tension=80.0):
@@ -94,7 +102,7 @@ def hold(arm, robot, lines, seconds=1.5, tension=80.0):
 
 def test_a_stuck_motor_stands_and_goes_on(arm, robot):
     before = arm.sense().length
-    after = hold(arm, robot, [f'stuck_motor {robot.muscles[MUSCLE]}']).length
+    after = hold(arm, robot, [f'stuck_motor:{robot.muscles[MUSCLE]}']).length
     assert after[MUSCLE] == pytest.approx(before[MUSCLE], abs=1e-3)
     assert np.abs(after - before).max() > 0.01
     assert abs(hold(arm, robot, []).length[MUSCLE] - before[MUSCLE]) > 0.005
@@ -103,30 +111,30 @@ def test_a_stuck_motor_stands_and_goes_on(arm, robot):
 def test_a_slack_wire_is_wound_in(robot):
     healthy, slack = (EmulatedArm(robot, 1) for _ in range(2))
     before = hold(healthy, robot, []).length
-    slack.faults.set([f'slack_wire {robot.muscles[MUSCLE]}'])
+    slack.faults.set([f'slack:{robot.muscles[MUSCLE]}'])
     slack.step(0.01)
     assert slack.tension[MUSCLE] < 5.0
-    after = hold(slack, robot, [f'slack_wire {robot.muscles[MUSCLE]}'], 4.0).length
+    after = hold(slack, robot, [f'slack:{robot.muscles[MUSCLE]}'], 4.0).length
     assert after[MUSCLE] - before[MUSCLE] < -0.02
 
 
 def test_a_slow_winch_takes_its_time(robot):
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
-    lines = [f'slack_wire {name}', f'winch_speed {name} 0.009']
+    lines = [f'slack:{name}', f'winch_speed:{name}:0.009']
     wound = hold(arm, robot, lines, 0.5).length - hold(arm, robot, lines, 2.5).length
     assert wound[MUSCLE] == pytest.approx(0.0225, abs=0.002)
 
 
 def test_winches_forget_their_zeros(arm):
     before = arm.sense().length
-    arm.faults.set(['unzeroed 0.1'])
+    arm.faults.set(['unzeroed:0.1'])
     off = arm.sense().length - before
     assert (np.abs(off) > 0.038).all() and (np.abs(off) < 0.102).all() and np.ptp(off) > 0.05
 
 
 def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
     name = robot.muscles[MUSCLE]
-    hot = hold(arm, robot, [f'overheating {name} 95'], 0.1).temperature
+    hot = hold(arm, robot, [f'overheat:{name}:95'], 0.1).temperature
     assert hot[MUSCLE] > 90.0 and np.delete(hot, MUSCLE).max() < 40.0
     arm.faults.set([])
     arm.step(0.1)
@@ -137,8 +145,8 @@ def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
 
 @pytest.mark.parametrize(
     'line',
-    ['', 'melt', 'drop 2', 'drop -0.1', 'drop nan', 'delay 11', 'drop arm26', 'stuck_motor nobody',
-     'stuck_motor 3', 'bias pressure', 'spike length inf', 'freeze length 1', 'slack_wire 1e308'],
+    ['', 'melt', 'drop:2', 'drop:-0.1', 'drop:nan', 'delay:11', 'drop:arm26', 'stuck_motor:nobody',
+     'stuck_motor:3', 'bias:pressure', 'spike:length:inf', 'freeze:length:1', 'slack:1e308'],
 )  # fmt: skip
 def test_what_is_no_fault_is_refused_with_what_is_legal(line, arm):
     arm.faults.set(['stuck_motor'])

@@ -91,7 +91,7 @@ def test_an_emulated_slow_winch_takes_up_slack_without_alarm(robot, calibrated, 
     arm.step(3.0)
     estimator, hold = Estimator(robot), arm.sense().length
     estimator.use(replace(calibrated, anomaly=None))
-    arm.faults.set([f'slack_wire {name} 0.05', f'winch_speed {name} {speed}'])
+    arm.faults.set([f'slack:{name}:0.05', f'winch_speed:{name}:{speed}'])
     slack = 0
     for n in range(round((0.05 / speed + 1.0) / DT)):
         if commanded:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The README's results table is what its command makes of the committed results."""
+"""The results table is what its command makes of the committed results."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def rows(key):
     return [row for _, row in ROWS if row.default == key]
 
 
-def test_the_readme_says_what_the_committed_results_say():
-    text = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+def test_the_page_says_what_the_committed_results_say():
+    text = (REPOSITORY / 'doc' / 'experiments.md').read_text(encoding='utf-8')
     between = text.split(BEGIN)[1].split(END)[0]
-    remedy = 'run: python -m musculoskeletal_ae.experiments.results README.md'
+    remedy = 'run: python -m musculoskeletal_ae.experiments.results doc/experiments.md'
     assert between == readme_table(read(REPOSITORY / KEPT)), remedy
 
 

@@ -49,16 +49,16 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
 @pytest.mark.parametrize(
     ('fault', 'options', 'told'),
     [
-        ('drop 0.5', [], 'fault: rate of all muscles'),
-        ('freeze biceps_long', [], 'the same reading in every message'),
-        ('bias biceps_long 0.1', [], 'fault: zero of biceps_long'),
+        ('drop:0.5', [], 'fault: rate of all muscles'),
+        ('freeze:biceps_long', [], 'the same reading in every message'),
+        ('bias:biceps_long:0.1', [], 'fault: zero of biceps_long'),
         (
-            'delay 0.2',
+            'delay:0.2',
             ['--wait', '--move', '--muscles', 'biceps_long'],
             'fault: latency of biceps_long',
         ),
         (
-            'stuck_motor biceps_long',
+            'stuck_motor:biceps_long',
             ['--wait', '--move', '--muscles', 'biceps_long'],
             'does not respond',
         ),
@@ -76,7 +76,7 @@ def test_it_says_what_it_waits_for_and_what_is_wrong_until_it_is_right(graph):
     waiting = check(graph, '--wait', '--seconds', '2')
     lines = iter(waiting.stdout.readline, '')
     assert f'waiting for {graph.namespace}/muscle_states' in next(lines)
-    graph.start('hardware_emulator', robot='arm26', faults=['bias biceps_long 0.1'])
+    graph.start('hardware_emulator', robot='arm26', faults=['bias:biceps_long:0.1'])
     for line in lines:
         if 'nothing may move' in line:
             break

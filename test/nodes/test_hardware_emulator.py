@@ -162,11 +162,11 @@ def test_faults_are_switched_at_run_time(arm, arm26):
     success, reason = arm.set_parameter('hardware_emulator', 'faults', ['melt'])
     assert not success and 'stuck_motor' in reason
     assert arm.set_parameter(
-        'hardware_emulator', 'faults', [f'overheating {name}', f'dead_sensor tension {name}']
+        'hardware_emulator', 'faults', [f'overheat:{name}', f'dead_sensor:tension:{name}']
     )[0]
     arm.wait(lambda: rows(arm, arm26)[1:, 1].tolist()[0] == 0.0, 'the dead sensor')
     assert rows(arm, arm26)[2, 1] > 80.0
-    assert arm.set_parameter('hardware_emulator', 'faults', ['drop 1'])[0]
+    assert arm.set_parameter('hardware_emulator', 'faults', ['drop:1'])[0]
     before = len(arm.received['muscle_states'])
     arm.spin(0.5)
     assert len(arm.received['muscle_states']) - before < 10

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `view`: a page in the browser that shows a running arm, and moves it on request.
+
+Nothing is subscribed to while nobody looks. While somebody does, only the newest message of a topic
+is taken, at the rate of the picture: an executor would handle every one, at a tenth of a core.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from argparse import Namespace
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3, WrenchStamped
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64, Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.nodes.messages import joint_message
+from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.reception import Reception
+from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.options import Parser, whole
+from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
+OLD = 1.0  # [s] after which something that moves is no longer shown
+ARM_TOPICS = {
+    'measured': 'joint_states',
+    'estimated': 'estimated_joint_states',
+    'simulated': 'sim/joint_states',
+}
+SET, GET = 'hardware_emulator/set_parameters', 'hardware_emulator/get_parameters'
+DO = 'controller/stop', 'controller/reset', 'estimator/reset', 'replay/pause', 'replay/resume'
+SERVICES = {'controller/explore': SetBool, **dict.fromkeys(DO, Trigger), GET: GetParameters}
+SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
+SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
+
+
+class View(Node):
+    """What comes on topics onto the page; what is asked for there to topics and services."""
+
+    def __init__(self, robot: Robot, options: Namespace) -> None:
+        """Serve the page."""
+        super().__init__('view', start_parameter_services=False)
+        try:
+            from musculoskeletal_ae.view import page
+        except ImportError as error:
+            raise MusculoskeletalError(
+                'the page needs viser: ./bringup.sh --view installs it, or '
+                'pip install -r .ci/requirements-view.txt'
+            ) from error
+        self.robot = robot
+        self.asked: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
+        address, ask = (options.host, options.port), lambda *what: self.asked.put(what)
+        self.page = page.Page(robot, *address, options.read_only, ask)
+        for note in self.page.notes:
+            self.get_logger().warning(f'mesh left out: {printable(note)}')
+        self.situation = Situation(self.get_namespace())
+        self.reception = Reception(lambda text: self.get_logger().warning(text))
+        self.came: dict[str, tuple[float, Any]] = {}  # when, and what
+        self.taken: list[Any] = []  # subscriptions
+        self.ruptured: list[str] = []
+        self.payload = 0.0
+        self.pending: list[tuple[Any, Callable[[Any], None]]] = []  # answers that are waited for
+        self.spinner = SingleThreadedExecutor()
+        self.spinner.add_node(self)
+        self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
+        self.pushes: list[Any] = []
+        if not options.read_only:
+            self.targets = self.create_publisher(JointState, 'target_joint_states', RELIABLE)
+            self.pushes = [
+                self.create_publisher(WrenchStamped, f'{arm}/external_wrench', RELIABLE)
+                for arm in ('hardware_emulator', 'sim')
+            ]
+
+    # -- what comes -----------------------------------------------------------------------------
+
+    def _subscribe(self) -> None:
+        muscles, joints = self.robot.muscle_count, self.robot.joints
+        table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
+            (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
+            for arm, topic in ARM_TOPICS.items()
+        ]
+        table += [
+            ('muscles', Float64MultiArray, 'muscle_states', NEWEST,
+             lambda m: read_array(m, len(QUANTITIES), muscles)),
+            ('played', Float64MultiArray, 'replay/position', NEWEST,
+             lambda m: read_array(m, 1, 2).tolist()),
+            ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
+            ('detected', Bool, 'anomaly_detected', LATCHED, lambda m: m.data),
+            ('isolated', String, 'isolated_muscles', LATCHED,
+             lambda m: m.data.replace(',', ' ').split()),
+            ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
+        ]  # fmt: skip
+
+        def note(what: str, read: Callable[[Any], Any], message: Any) -> None:
+            self.came[what] = time.monotonic(), read(message)
+
+        for what, kind, topic, qos, read in table:
+            publishers = partial(self.count_publishers, self.resolve_topic_name(topic))
+            receive: Any = self.reception.of(topic, partial(note, what, read), publishers)
+            self.taken.append(self.create_subscription(kind, topic, receive, qos))
+
+    def _newest(self, what: str, old: float = OLD) -> Any:
+        """Return what came last, None if that is too long ago."""
+        when, value = self.came.get(what, (-math.inf, None))
+        return value if time.monotonic() - when < old else None
+
+    def _take(self) -> None:
+        for each in self.taken:
+            with each.handle:
+                while message := each.handle.take_message(each.msg_type, each.raw):
+                    each.callback(*message)
+        for _ in range(len(self.pending) + 1 if self.pending else 0):
+            self.spinner.spin_once(timeout_sec=0.0)
+        waiting, self.pending = self.pending, []
+        for future, answered in waiting:  # an executor would call back one request later
+            if future.done():
+                answered(future.result())
+            else:
+                self.pending.append((future, answered))
+
+    # -- the loop -------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Show what comes until the process is asked to end."""
+        tell = look = 0.0
+        while rclpy.ok():
+            if not self.page.looked_at.wait(timeout=1.0):
+                for subscription in self.taken:
+                    self.destroy_subscription(subscription)
+                self.taken, self.came = [], {}
+                continue
+            if not self.taken:
+                self._subscribe()
+            begun = time.monotonic()
+            self._take()
+            while not self.asked.empty():
+                self._do(*self.asked.get())
+            self.situation.detected = bool(self._newest('detected', math.inf))
+            posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
+            states = self._newest('muscles')
+            self.page.draw(posture, None if states is None else states[1], self._kinds())
+            if begun >= tell:
+                tell = begun + TELL_PERIOD
+                self._tell(posture, states)
+            if begun >= look:
+                look = begun + LOOK_PERIOD
+                self._look()
+            time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
+
+    def _kinds(self) -> Ints:
+        suspects = [self.situation.suspect] * self.situation.detected
+        isolated = self._newest('isolated', math.inf) or []
+        kinds = np.zeros(self.robot.muscle_count, dtype=int)
+        for kind, names in enumerate((suspects, isolated, self.ruptured), 1):  # as in body.Kind
+            kinds[np.isin(self.robot.muscles, names)] = kind
+        return kinds
+
+    def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
+        told, error, anomaly = self.situation, math.nan, self._newest('anomaly')
+        if {'measured', 'estimated'} <= posture.keys():
+            error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
+        anomaly = math.nan if anomaly is None else anomaly
+        distance = '' if math.isnan(told.distance) else f'  d {told.distance:.0f}'
+        lines = [
+            figures('measured' in posture, error, anomaly) + distance,
+            f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
+            'waiting for muscle_states' if states is None else told.hint(),
+        ]
+        shown = np.zeros((2, self.robot.muscle_count)) if states is None else states[1:]
+        values = error, anomaly, told.distance, told.limit
+        self.page.tell([*filter(None, lines)], told.trouble(), shown, time.monotonic(), values)
+        self.page.follow(self.payload, self._newest('played', math.inf))
+
+    def _look(self) -> None:
+        """Offer what the nodes that are there can do, and ask the emulator how it is."""
+        there = {node for node, name in SIGNS.items() if self.ways[name].service_is_ready()}
+        if any(push.get_subscription_count() for push in self.pushes):
+            there.add('pushed')
+        self.page.offer(there)
+        self._ask(GET, self._emulated, names=['ruptured_muscles', 'payload'])
+
+    def _emulated(self, answer: Any) -> None:
+        values = [parameter_value_to_python(value) for value in answer.values]
+        if len(values) == 2:
+            self.ruptured, self.payload = [name for name in values[0] or [] if name], values[1]
+
+    def _ask(self, name: str, then: Callable[[Any], object] | None = None, **fields: Any) -> None:
+        """Call a service, tell the page what it said, and go on with the answer."""
+
+        def answered(answer: Any) -> None:
+            if name != GET:
+                said = [*getattr(answer, 'results', ()), answer][0]
+                good = getattr(said, 'success', getattr(said, 'successful', False))
+                why = getattr(said, 'message', getattr(said, 'reason', '')) or 'done'
+                self.page.notify(printable(f'{name}: {why}'), good)
+            if then is not None:
+                then(answer)
+
+        if self.ways[name].service_is_ready():
+            future = self.ways[name].call_async(SERVICES[name].Request(**fields))
+            self.pending.append((future, answered))
+
+    def _do(self, what: str, value: Any = None) -> None:
+        """Do what a visitor asked for."""
+        match what:
+            case 'targets':
+                stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
+                self.targets.publish(joint_message([*value], theta, stamp))
+            case 'hand':
+                if (theta := self._newest('estimated')) is not None:
+                    pose = pin.SE3(np.eye(3), value)
+                    target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta
+                    self._do('targets', dict(zip(self.robot.joints, target)))
+            case 'push':
+                wrench = WrenchStamped()
+                wrench.wrench.force = Vector3(**dict(zip('xyz', value.tolist())))
+                for publisher in self.pushes:
+                    publisher.publish(wrench)
+            case 'cut' | 'mend':
+                others = [name for name in self.ruptured if name != value]
+                self.ruptured = [*others, value] if what == 'cut' else others
+                self._do('ruptured_muscles', self.ruptured or [''])
+            case 'ruptured_muscles' | 'payload' | 'position':
+                parameter = Parameter(what, value=value).to_parameter_msg()
+                service = 'replay/set_parameters' if what == 'position' else SET
+                self._ask(service, parameters=[parameter])
+            case 'reset':
+                self._ask('estimator/reset', lambda _: self._ask('controller/reset'))
+            case _:
+                self._ask(what, None, **({'data': True} if SERVICES[what] is SetBool else {}))
+
+
+def _parse(arguments: list[str]) -> Namespace:
+    parser = Parser('view', 'Shows a running arm on a page in the browser.', ROS_HELP)
+    parser.add_robot()
+    add, host = parser.add_argument, 'address to listen on; 0.0.0.0: the whole network may move it'
+    add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')
+    add('--host', default='127.0.0.1', help=host)
+    add('--read-only', action='store_true', help='no controls')
+    return parser.parse_args(arguments)
+
+
+def _view(options: Namespace, arguments: list[str]) -> int:
+    robot = Robot.load(options.robot)
+    start_ros(arguments)
+    view = View(robot, options)
+    name = 'localhost' if options.host == '127.0.0.1' else options.host
+    print(f'http://{name}:{options.port}', flush=True)
+    try:
+        view.run()
+    finally:
+        view.page.close()
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Serve the page until Ctrl-C."""
+    return run_tool('view', _parse, _view, argv)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm as solids: links by the URDF's meshes or as capsules, muscles as tubes.
+
+A muscle is blue at T_bias and orange at T_limit, which everybody can tell apart, and thicker the
+harder it pulls. A cut one is black and dashed, an isolated one grey and dashed, a suspect one
+magenta and thick.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from enum import IntEnum
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+import trimesh
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_bytes
+from musculoskeletal_ae.robot import drawing
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.routes import ARC
+
+LARGEST_MESH = 50_000_000  # [bytes]
+FORMATS = ('.stl', '.obj', '.ply', '.glb')
+DASHES = 5  # of a straight segment of a muscle; whole muscles show no gaps
+#: red, green, blue at T_bias and at T_limit
+ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
+
+
+class Kind(IntEnum):
+    """What is known of a muscle."""
+
+    SOUND = 0
+    SUSPECT = 1
+    ISOLATED = 2
+    CUT = 3
+
+
+MARKS = ('', '? ', '⊘ ', '✂ ')  # by kind
+#: red, green, blue of those that are not coloured by tension
+COLOURS = {Kind.SUSPECT: (200, 0, 130), Kind.ISOLATED: (140, 140, 140), Kind.CUT: (0, 0, 0)}
+
+
+def colours(robot: Robot, tension: Array, kinds: Ints) -> Array:
+    """Return red, green and blue (M, 3), bytes, of muscles at T [N] (M,)."""
+    rgb = LOOSE + drawing.tension_share(robot, tension)[:, None] * (TIGHT - LOOSE)
+    for kind, colour in COLOURS.items():
+        rgb[kinds == kind] = colour
+    return rgb.astype(np.uint8)
+
+
+Solid = tuple[int, trimesh.Trimesh]  # joint of pinocchio's tree, and what moves with it [m]
+
+
+def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
+    """Return the meshes of a URDF's visuals, or capsules; and why any mesh was left out."""
+    solids, notes, model = [], [], robot.kinematics.model
+    root = ET.fromstring(robot.description.urdf)  # noqa: S314 - checked when it was loaded
+    for link in root.iter('link'):
+        frame = model.frames[model.getFrameId(link.get('name'), pin.FrameType.BODY)]
+        for visual in link.iterfind('visual'):
+            if (element := visual.find('geometry/mesh')) is None:
+                continue
+            try:
+                mesh = _read_mesh(robot.description.directory, element)
+            except (RobotDescriptionError, ValueError, TypeError, KeyError, IndexError) as error:
+                notes.append(f'{element.get("filename")}: {error}')
+                continue
+            origin = visual.find('origin')
+            numbers = {'xyz': '0 0 0', 'rpy': '0 0 0'} | ({} if origin is None else origin.attrib)
+            xyz, rpy = (np.array(numbers[key].split(), dtype=float) for key in ('xyz', 'rpy'))
+            placed = frame.placement * pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
+            solids.append((frame.parentJoint, mesh.apply_transform(placed.homogeneous)))
+    return solids or _capsules(robot), notes
+
+
+def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
+    """Read the file of a <mesh>: package://, file:// or relative to the robot's directory."""
+    name = element.get('filename', '')
+    places, rest = [directory], name.removeprefix('file://')
+    if name.startswith('package://'):
+        package, _, rest = name.removeprefix('package://').partition('/')
+        places += [each for each in directory.parents if each.name == package]
+        prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+        places += [Path(prefix, 'share', package) for prefix in prefixes]
+    file = next((place / rest for place in places if (place / rest).exists()), directory / rest)
+
+    def refuse(path: Path, why: str) -> Exception:
+        return RobotDescriptionError(f'{path} {why}')
+
+    if file.suffix.lower() not in FORMATS:
+        raise refuse(file, f'cannot be drawn; legal: {", ".join(FORMATS)}')
+    data = io.BytesIO(read_bytes(file, refuse, LARGEST_MESH))
+    mesh = trimesh.load(data, file_type=file.suffix.lower()[1:], force='mesh')
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        raise refuse(file, 'has no faces, or vertices that are not finite')
+    return mesh.apply_scale([float(word) for word in element.get('scale', '1 1 1').split()])
+
+
+def _capsules(robot: Robot) -> list[Solid]:
+    """Return a capsule from every joint to the next, and one to each end effector."""
+    kin, solids = robot.kinematics, []
+    bones = [*zip(kin.parent[1:], kin.placement_translation[1:])]
+    tips = [kin.placement(link) for link in robot.description.end_effectors]
+    for joint, end in [*bones, *((joint, tip.translation) for joint, tip in tips)]:
+        length = float(np.linalg.norm(end))
+        if length > drawing.SHORTEST_BONE:
+            mesh = trimesh.creation.capsule(length, 0.8 * drawing.BONE_WIDTH, count=[12, 12])
+            mesh.apply_translation([0.0, 0.0, 0.5 * length] - mesh.bounds.mean(axis=0))
+            mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length))
+            solids.append((int(joint), mesh))
+    return solids
+
+
+def pieces(robot: Robot) -> Ints:
+    """Return the muscle of each straight piece that is drawn: those of segments, and of arcs."""
+    routes = robot.routes
+    return np.sort(np.append(routes.muscle, np.repeat(routes.muscle[routes.wrapping], ARC)))
+
+
+def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
+    """Return muscles at θ [rad] (D,) and T [N] (M,) as tubes of radius 1 from −½ to ½ along z.
+
+    Positions [m], quaternions wxyz, scales and colours are those of DASHES tubes a piece.
+    """
+    owner = pieces(robot)
+    # As many pieces whether a wire wraps or not: those that it then lacks have no length.
+    drawn = zip(robot.routes.drawn(theta), np.bincount(owner).tolist(), strict=True)
+    lines = [
+        line[np.linspace(0.0, len(line) - 1.0, n + 1).round().astype(int)] for line, n in drawn
+    ]
+    first = np.concatenate([line[:-1] for line in lines])
+    line = np.concatenate([np.diff(line, axis=0) for line in lines])
+    length = np.linalg.norm(line, axis=1)
+    along = line / np.maximum(length, 1e-9)[:, None]
+    # The shortest turn from z: the half-way vector as quaternion; straight down, about x.
+    turn = np.stack([1.0 + along[:, 2], -along[:, 1], along[:, 0], 0.0 * length], axis=1)
+    turn[turn[:, 0] < 1e-9] = 0.0, 1.0, 0.0, 0.0
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    middle = (np.arange(DASHES) + 0.5) / DASHES
+    position = first[:, None] + middle[:, None] * line[:, None]
+    radius = 0.5 * drawing.MUSCLE_WIDTH * (1.0 + 1.5 * drawing.tension_share(robot, tension))
+    radius = np.where(kinds == Kind.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
+    # A whole muscle's dashes overlap a little, so that none of its joints can be seen.
+    dash = np.where(kinds >= Kind.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
+    each = {
+        'batched_wxyzs': turn,
+        'batched_scales': np.stack([radius, radius, dash], axis=1),
+        'batched_colors': colours(robot, tension, kinds)[owner],
+    }
+    repeated = {name: np.repeat(rows, DASHES, axis=0) for name, rows in each.items()}
+    return {'batched_positions': position.reshape(-1, 3), **repeated}

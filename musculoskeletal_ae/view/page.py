@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page itself: three arms, curves, bars and controls, served by viser.
+
+What a visitor asks for goes to `act`, called in viser's threads with a name and its value:
+
+    targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · cut name · mend name · payload kg
+    position s · or the name of a service
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import trimesh
+import viser
+from scipy.spatial.transform import Rotation
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.view import body
+from musculoskeletal_ae.view.body import MARKS, Kind
+
+ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
+HISTORY = 60.0  # [s] that curves show
+GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
+DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
+CURVES: dict[str, tuple[list[Any], list[int]]] = {  # lines, and columns of what `tell` is given
+    'error [rad]': ([GREEN], [1]),
+    'A': ([BLUE], [2]),
+    'd (dashed: what is an anomaly)': ([DASHED, BLUE], [4, 3]),
+}
+LOCAL = ('localhost', '127.0.0.1', '::1')
+PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
+MOST_PAYLOAD = 5.0  # [kg]
+HOT = 80.0  # [°C] at the right end of a bar
+LEGEND = (
+    '<div style="font-size:11px;padding:6px 10px">{}<br>T_bias <span style="display:inline-block;'
+    'width:90px;height:8px;background:linear-gradient(90deg,rgb{},rgb{})"></span> T_limit<br>'
+    '✂ cut &nbsp; ? suspect &nbsp; ⊘ isolated</div>'
+).format(
+    ''.join(f'<span style="color:rgb{rgb}">●</span> {arm} &nbsp; ' for arm, rgb in ARMS.items()),
+    *(tuple(end.tolist()) for end in body.ENDS),
+)
+ALARM = (
+    '<div style="background:#b00020;color:#fff;font-weight:700;padding:6px 8px;border-radius:6px;'
+    'margin-bottom:4px">{}</div>'
+)
+BAR = '<td style="width:{}%;background:linear-gradient(90deg,{} {:.0f}%,#e8e8e8 0)">'
+
+
+class Page:
+    """One page for any number of visitors."""
+
+    def __init__(
+        self, robot: Robot, host: str, port: int, read_only: bool, act: Callable[..., None]
+    ) -> None:
+        """Serve the page on an address; without `read_only`, `act` hears what visitors ask for.
+
+        Raises:
+            MusculoskeletalError: If the port is in use.
+        """
+        self._robot, self._act, self._host = robot, act, host
+        self._visitors: set[int] = set()
+        self.looked_at = threading.Event()
+        # A browser opens connections that it never uses; no traceback of each.
+        logging.getLogger('websockets.server').setLevel(logging.CRITICAL)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
+            server = self._server = viser.ViserServer(host, port, verbose=False)
+        if server.get_port() != port:
+            server.stop()
+            raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
+        # A tunnel to the world is nothing that a visitor may ask for.
+        server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
+        sockets = server._websock_server
+        sockets.on_client_connect(self._check_origin)
+        for early in [*sockets._live_connections.values()]:  # a browser comes again by itself
+            asyncio.run_coroutine_threadsafe(early.close(), server.get_event_loop())
+        server.on_client_connect(lambda client: self._count(client.client_id, True))
+        server.on_client_disconnect(lambda client: self._count(client.client_id, False))
+        self._curves: deque[list[float]] = deque()
+        self._kinds: Ints = np.zeros(robot.muscle_count, dtype=int)
+        self._posture: dict[str, Array] = {}
+        self._picked, self._targeted, self._pushing = '', False, False
+        self._build_scene()
+        self._build_panels()
+        self._controls: dict[str, Any] = {}  # shown while a node is there
+        if not read_only:
+            self._build_controls()
+        self.offer(())
+
+    async def _check_origin(self, connection: Any) -> None:
+        """Turn away pages of other sites, which a browser lets connect to localhost."""
+        socket = self._server._websock_server._live_connections[connection.client_id]
+        asked, origin = (socket.request.headers.get(key, '') for key in ('Host', 'Origin'))
+        came = urlsplit(origin)
+        foreign = self._host in LOCAL and came.hostname not in LOCAL
+        if origin and (came.netloc != asked or foreign):
+            await socket.close(1008, 'another site')
+            raise ConnectionError(f'a page of {origin} was turned away')
+
+    def _count(self, visitor: int, here: bool) -> None:
+        (self._visitors.add if here else self._visitors.discard)(visitor)
+        (self.looked_at.set if self._visitors else self.looked_at.clear)()
+
+    def close(self) -> None:
+        """End the page."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    # -- what is shown --------------------------------------------------------------------------
+
+    def _build_scene(self) -> None:
+        robot, scene, kin = self._robot, self._server.scene, self._robot.kinematics
+        solids, self.notes = body.link_solids(robot)
+        middle = 0.5 * (robot.lower + robot.upper)
+        points = robot.routes.points(middle[None])[0]
+        points = np.vstack([points, kin.end_effector_pose(middle).translation])
+        centre, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), float(np.ptp(points))
+        self._arms: dict[str, list[Any]] = {}  # its frame, then those of its joints
+        for arm, colour in ARMS.items():
+            frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
+            for i, parent in enumerate(kin.parent[1:], 1):
+                name = f'{frames[parent].name}/{kin.model.names[i]}'
+                at = kin.placement_translation[i]
+                frames.append(scene.add_frame(name, show_axes=False, position=at))
+            opacity = None if arm == 'measured' else 0.4
+            for number, (joint, mesh) in enumerate(solids):
+                name = f'{frames[joint].name}/solid_{number}'
+                look: dict[str, Any] = {'color': colour, 'opacity': opacity, 'cast_shadow': False}
+                scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
+        tube = trimesh.creation.cylinder(1.0, 1.0, sections=12)
+        tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)  # open ends leave no seams
+        tubes: Any = body.muscle_tubes(robot, middle, np.zeros(robot.muscle_count), self._kinds)
+        look = {'lod': 'off', 'side': 'double', 'cast_shadow': False, 'visible': False}
+        self._tubes: Any = scene.add_batched_meshes_simple(
+            '/muscles', tube.vertices, tube.faces, **tubes, **look
+        )
+        self._labels = [
+            scene.add_label(f'/names/{name}', name, visible=False, anchor='center-left')
+            for name in robot.muscles
+        ]
+        self._owner = body.pieces(robot).repeat(body.DASHES)
+        own = [np.flatnonzero(self._owner == m) for m in range(robot.muscle_count)]
+        self._middles = [each[len(each) // 2] for each in own]
+        floor = (*centre[:2], points[:, 2].min() - 0.15 * reach)
+        scene.add_grid('/floor', 4.0 * reach, 4.0 * reach, position=floor, cell_size=0.1)
+        # Lights that leave colours what they are.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_ambient('/light', intensity=1.5)
+        scene.add_light_directional('/lamp', intensity=1.0, position=(2.0, -1.0, 3.0))
+        camera = self._server.initial_camera
+        camera.look_at, camera.fov = centre, 0.8
+        camera.position = centre + reach * np.array([1.25, 1.15, 0.35])
+        self._reach = reach
+
+    def _build_panels(self) -> None:
+        gui = self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
+        gui.set_panel_label('musculoskeletal_ae')
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(330)
+        panel = gui.add_panel()
+        with panel.add_tab(self._robot.description.directory.name):
+            self._status = gui.add_html('')
+            empty, x = np.zeros(2), {'time': False, 'auto': False, 'range': (-HISTORY, 0.0)}
+            look: dict[str, Any] = {'legend': {'show': False}, 'cursor': {'show': False}}
+            look |= {'height': 96, 'scales': {'x': x}}
+            self._plots = [
+                gui.add_uplot((empty, *[empty] * len(lines)), ({}, *lines), title=title, **look)
+                for title, (lines, _) in CURVES.items()
+            ]
+            self._bars = gui.add_html('')
+            gui.add_html(LEGEND)
+        panel.dock_left()
+        panel.set_width(350)
+        with gui.add_folder('Show'):
+            self._names = gui.add_checkbox('names of muscles', False)
+            self._names.on_update(lambda _: self._mark())
+            self._wanted = {arm: gui.add_checkbox(f'{arm} arm', True) for arm in ARMS}
+
+    def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> None:
+        """Draw arms at θ [rad] (D,), those that are known, and muscles at T [N] (M,)."""
+        kin, self._posture = self._robot.kinematics, posture
+        with self._server.atomic():
+            for arm, (root, *joints) in self._arms.items():
+                root.visible = arm in posture and self._wanted[arm].value
+                if not root.visible:
+                    continue
+                poses = kin.in_parents(posture[arm][None])[0]
+                turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+                for i, joint in enumerate(joints, 1):
+                    joint.wxyz = turns[i]
+                    if kin.prismatic[i]:
+                        joint.position = poses[i, :3, 3]
+            theta = posture.get('measured', posture.get('estimated'))
+            self._tubes.visible = theta is not None and tension is not None
+            if theta is None or tension is None:
+                return
+            tubes = body.muscle_tubes(self._robot, theta, tension, kinds)
+            for name, value in tubes.items():
+                setattr(self._tubes, name, value)
+            if (kinds != self._kinds).any():
+                self._kinds = kinds.copy()
+                self._mark()
+            for m, label in enumerate(self._labels):
+                if label.visible:
+                    label.position = tubes['batched_positions'][self._middles[m]]
+        if self._controls and not self._pushing:
+            self._ball.position = kin.end_effector_pose(theta).translation
+
+    def _mark(self) -> None:
+        """Write names where they are asked for, and always of muscles that are not sound."""
+        for name, kind, label in zip(self._robot.muscles, self._kinds.tolist(), self._labels):
+            label.visible = self._names.value or kind > Kind.SOUND or name == self._picked
+            label.text = MARKS[kind] + name + (f' {Kind(kind).name.lower()}' if kind else '')
+
+    def tell(
+        self, lines: list[str], alarm: str, states: Array, now: float, values: Sequence[float]
+    ) -> None:
+        """Show what is going on: T [N] and temperatures [°C], (2, M), as bars, values as curves.
+
+        Those are error [rad], A, d and its limit at a time [s], NaN where it is not known.
+        """
+        told = ALARM.format(escape(alarm)) if alarm else ''
+        told += ''.join(f'<div>{escape(line)}</div>' for line in lines)
+        self._status.content = f'<div style="font-size:13px;padding:0 10px">{told}</div>'
+        self._bars.content = self._bar_chart(*states)
+        self._curves.append([now, *values])
+        while self._curves[0][0] < now - HISTORY:
+            self._curves.popleft()
+        if len(self._curves) > 1:
+            table = np.array(self._curves)
+            # No curve that has a NaN in it is drawn: an unknown limit hides below d.
+            table[:, 4] = np.where(np.isnan(table[:, 4]), *table[:, 3:].T)
+            table = np.nan_to_num(table)
+            for plot, (_, columns) in zip(self._plots, CURVES.values()):
+                plot.data = (table[:, 0] - now, *table[:, columns].T)
+
+    def _bar_chart(self, tension: Array, temperature: Array) -> str:
+        rows, rgb = [], body.colours(self._robot, tension, self._kinds).tolist()
+        full = 100.0 * np.clip(tension / self._robot.tension.limit, 0.0, 1.0)
+        hot = 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0)
+        for m, (name, kind) in enumerate(zip(self._robot.muscles, self._kinds.tolist())):
+            warm = f'{temperature[m]:.0f} °C' if np.isfinite(temperature[m]) else '–'
+            pull, name = f'{tension[m]:.0f} N', escape(name)
+            title = f'{name}: {pull}, {warm}, {Kind(kind).name.lower()}'
+            rows.append(
+                f'<tr title="{title}" style="font-weight:{700 if kind else 400}">'
+                f'<td>{MARKS[kind]}{name}</td>{BAR.format(40, f"rgb{(*rgb[m],)}", full[m])}</td>'
+                f'<td>{pull}</td>{BAR.format(14, "#8c6d1f", hot[m])}</td><td>{warm}</td></tr>'
+            )
+        return (
+            '<table style="font-size:11px;line-height:1;width:100%;white-space:nowrap;'
+            f'border-spacing:6px 2px;border-collapse:separate">{"".join(rows)}</table>'
+        )
+
+    def notify(self, text: str, good: bool) -> None:
+        """Show every visitor what became of a request."""
+        title, color = ('done', 'teal') if good else ('refused', 'red')
+        for client in self._server.get_clients().values():
+            client.add_notification(title, text, color=color, auto_close_seconds=6)
+
+    # -- what visitors ask for ------------------------------------------------------------------
+
+    def _build_controls(self) -> None:
+        gui, robot, scene = self._server.gui, self._robot, self._server.scene
+
+        def heed(listen: Any, what: str, value: Any = None) -> None:
+            def heard(event: Any) -> None:
+                if event.client is not None:  # not `follow`
+                    if what in ('targets', 'hand', 'reset', 'controller/explore'):
+                        self._targeted = what in ('targets', 'hand')
+                    self._act(what, *[value(event)] if value else [])
+
+            listen(heard)
+
+        def button(label: str, what: str, value: Any = None, color: Any = None) -> None:
+            heed(gui.add_button(label, color=color).on_click, what, value)
+
+        def slider(label: str, low: float, high: float, step: float, what: str, value: Any) -> Any:
+            made = gui.add_slider(label, low, high, step, min(max(0.0, low), high))
+            heed(made.on_update, what, value)
+            return made
+
+        def chosen(event: Any) -> Any:
+            return event.target.value
+
+        with gui.add_folder('Arm') as arm:
+            button('Stop', 'controller/stop', color='red')
+            button('Explore', 'controller/explore')
+            button('Reset after a stop', 'reset')
+            gizmo = gui.add_checkbox('move the hand with the mouse', False)
+            gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
+            limits = np.ceil(100.0 * robot.lower) / 100.0, np.floor(100.0 * robot.upper) / 100.0
+            self._sliders = [
+                slider(joint, low, high, 0.01, 'targets', lambda e, j=joint: {j: chosen(e)})
+                for joint, low, high in zip(robot.joints, *limits)
+            ]
+        with gui.add_folder('Faults of the emulated arm') as faults:
+            self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on one')
+            self._muscle.on_update(lambda event: self._pick(chosen(event)))
+            button('Cut', 'cut', lambda _: self._muscle.value, 'orange')
+            button('Mend', 'mend', lambda _: self._muscle.value)
+            self._payload = slider('payload [kg]', 0.0, MOST_PAYLOAD, 0.1, 'payload', chosen)
+        with gui.add_folder('Recording') as recording:
+            self._timeline = slider('at [s]', 0.0, 1.0, 0.1, 'position', chosen)
+            button('Pause', 'replay/pause')
+            button('Play', 'replay/resume')
+        look: dict[str, Any] = {'disable_rotations': True, 'depth_test': False, 'visible': False}
+        self._gizmo: Any = scene.add_transform_controls('/target', 0.35 * self._reach, **look)
+        heed(self._gizmo.on_update, 'hand', lambda event: np.array(event.target.position))
+        self._ball = scene.add_icosphere('/push', 0.03, (255, 200, 0), opacity=0.55, visible=False)
+        heed(self._ball.on_drag('left'), 'push', self._push)
+        look = {'shaft_radius': 0.006, 'head_radius': 0.014, 'head_length': 0.04, 'visible': False}
+        self._force = scene.add_arrows('/force', np.zeros((1, 2, 3)), (200, 0, 0), **look)
+        self._tubes.on_click(
+            lambda event: self._pick(robot.muscles[self._owner[event.instance_index]])
+        )
+        self._controls = {'controller': arm, 'hardware_emulator': faults, 'replay': recording}
+        self._controls['pushed'] = self._ball
+
+    def offer(self, nodes: Iterable[str]) -> None:
+        """Show the controls of those nodes that are there."""
+        for node, handle in self._controls.items():
+            handle.visible = node in nodes
+        if self._controls and 'controller' not in nodes:
+            self._gizmo.visible = False
+
+    def follow(self, payload: float, played: Sequence[float] | None) -> None:
+        """Let the controls show what is: sliders the estimate, until a target was given."""
+        if not self._controls:
+            return
+        theta = self._posture.get('estimated')
+        if theta is not None and not self._targeted:
+            for angle, slider in zip(theta, self._sliders):
+                slider.value = float(np.clip(np.round(angle, 2), slider.min, slider.max))
+            self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
+        self._payload.value = round(min(max(payload, 0.0), MOST_PAYLOAD), 1)
+        if played is not None:
+            self._timeline.max = round(max(played[1], 0.1), 1)
+            self._timeline.value = round(min(played), 1)
+
+    def _pick(self, muscle: str) -> None:
+        self._picked = self._muscle.value = muscle
+        self._mark()
+
+    def _push(self, event: Any) -> Array:
+        """Draw the force of a drag and return it [N] (3,)."""
+        ends = np.array([event.start_position, event.end_position])
+        force = PUSH_STIFFNESS * (ends[1] - ends[0])
+        self._pushing = self._force.visible = event.phase != 'end'
+        self._force.points = ends[None].astype(np.float32)
+        size = float(np.linalg.norm(force))
+        return force * min(1.0, MOST_PUSH / max(size, 1e-9)) * self._pushing

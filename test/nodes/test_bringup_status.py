@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the status line says, and the screen that takes its place on a terminal."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from musculoskeletal_ae.nodes.bringup_status import muscle_table, open_screen
+from musculoskeletal_ae.nodes.situation import Situation, figures
+
+
+def said(node: str, message: str = '', **values: str) -> DiagnosticArray:
+    pairs = [KeyValue(key=key.replace('_', ' '), value=value) for key, value in values.items()]
+    return DiagnosticArray(
+        status=[DiagnosticStatus(name=f'{node}: state', message=message, values=pairs)]
+    )
+
+
+def test_before_the_first_sample_it_says_why_the_error_may_rise():
+    told = Situation('/left')
+    assert told.hint() == ''  # nobody learns
+    told.diagnosed(said('/left/learner', samples='0'))
+    assert 'error may rise' in told.hint()
+    told.diagnosed(said('/left/learner', samples='3', checkpoints='2'))
+    assert told.hint() == '' and (told.samples, told.checkpoints) == ('3', '2')
+
+
+def test_what_is_not_known_is_said_to_be_waited_for():
+    assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
+    assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
+    none = figures(True, math.nan, math.nan)
+    assert none == 'error waits for estimated_joint_states  A waits for anomaly'
+
+
+def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
+    told = Situation('/left')
+    told.diagnosed(said('/right/controller', 'stopped: by request'))
+    assert told.trouble() == ''
+    told.diagnosed(said('/left/controller', 'exploring'))
+    told.diagnosed(said('/left/controller', 'stopped: anomaly'))
+    told.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
+    told.detected = True
+    assert told.trouble() == (
+        'ANOMALY: biceps, STOPPED: anomaly (to go on: mend it, estimator/reset, controller/reset, '
+        'controller/explore)'
+    )
+    assert (told.distance, told.limit) == (12.5, 9.0)
+
+
+def test_a_terminal_shows_every_muscle_and_the_trouble_where_rich_is_there(arm26):
+    console = pytest.importorskip('rich.console', reason='rich comes with ./bringup.sh --view')
+    states = np.stack([np.linspace(-0.02, 0.03, 6), np.linspace(30.0, 250.0, 6), np.full(6, 41.0)])
+    screen = console.Console(width=100, record=True, file=io.StringIO())
+    screen.print(muscle_table(arm26, states, ['error 0.1 rad', 'STOPPED']))
+    text = screen.export_text()
+    assert all(name in text for name in arm26.muscles)
+    assert 'STOPPED' in text and '250' in text and '█' in text
+    assert open_screen() is None  # output is kept, not a terminal

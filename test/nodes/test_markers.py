@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What RViz, Foxglove and PlotJuggler get: arms that can be told apart, names, frames."""
+
+from __future__ import annotations
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.markers import Frames
+from musculoskeletal_ae.nodes.shell import Shell
+
+CONFIG = Path(__file__).parents[2] / 'config'
+
+
+def test_estimate_and_hardware_are_drawn_apart_with_names_in_prefixed_frames(
+    graph, arm26, trained_file
+):
+    options = {'robot': 'arm26', 'frame_prefix': 'left/'}
+    graph.host(Estimator, **options, checkpoint=trained_file, mirror_muscles=True)
+    graph.host(HardwareEmulator, **options)
+    arms = ('estimated', 'hardware_emulator')
+    for arm in arms:
+        graph.listen(MarkerArray, f'{arm}/markers')
+    mirrored = graph.listen(JointState, 'muscle_joint_states')
+    read = graph.listen(Float64MultiArray, 'muscle_states')
+    drawn = {}
+    for arm in arms:
+        messages = graph.received[f'{arm}/markers']
+        markers = graph.wait(lambda m=messages: m and m[-1].markers, f'markers of {arm}')
+        assert {marker.header.frame_id for marker in markers} == {f'left/{arm26.root_link}'}
+        assert len({(marker.ns, marker.id) for marker in markers}) == len(markers)
+        names = [m.text for m in markers if m.type == Marker.TEXT_VIEW_FACING]
+        assert tuple(names) == arm26.muscles
+        bone = next(m.color for m in markers if m.ns == 'bones')
+        drawn[arm] = bone.r, bone.g, bone.b, bone.a
+    assert drawn['estimated'][3] < 1.0 == drawn['hardware_emulator'][3]
+    assert drawn['estimated'][:3] != drawn['hardware_emulator'][:3]
+    rows = {(*message.data[: 2 * arm26.muscle_count],) for message in read}
+    mine = graph.wait(
+        lambda: next((m for m in mirrored if (*m.position, *m.effort) in rows), None), 'a mirror'
+    )
+    assert tuple(mine.name) == arm26.muscles
+    assert mine.header.stamp.sec > 0
+
+
+def test_poses_of_all_links_go_to_tf_where_tf2_msgs_is(graph, monkeypatch):
+    shell = graph.host(lambda **options: Shell('estimator', **options), frame_prefix='a/')
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', None)
+    with pytest.raises(MusculoskeletalError, match='tf2_msgs is not installed'):
+        Frames(shell)
+    # The wheels have no tf2_msgs: what would be published is looked at.
+    sent: list[TransformStamped] = []
+    message = types.SimpleNamespace(TFMessage=lambda transforms: transforms)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', types.ModuleType('tf2_msgs'))
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', message)
+    monkeypatch.setattr(
+        shell, 'create_publisher', lambda *_: types.SimpleNamespace(publish=sent.extend)
+    )
+    theta = 0.5 * (shell.robot.lower + shell.robot.upper)
+    Frames(shell).publish(theta)
+    robot = shell.robot
+    assert {t.header.frame_id for t in sent} == {f'a/{robot.root_link}'}
+    poses = {t.child_frame_id: t.transform.translation for t in sent}
+    hand = robot.kinematics.end_effector_pose(theta).translation
+    end = poses[f'a/{robot.description.end_effector}']
+    np.testing.assert_allclose([end.x, end.y, end.z], hand)
+
+
+def test_the_layouts_for_rviz_and_foxglove_show_topics_that_there_are():
+    topics = {'hardware_emulator/markers', 'estimated/markers', 'sim/markers'}
+    rviz = yaml.safe_load((CONFIG / 'rviz.rviz').read_text('utf-8'))['Visualization Manager']
+    shown = {d['Topic']['Value'] for d in rviz['Displays'] if d['Class'].endswith('/MarkerArray')}
+    assert shown == topics
+    foxglove = json.loads((CONFIG / 'foxglove.json').read_text('utf-8'))['configById']
+    assert {topic.lstrip('/') for topic in foxglove['3D!arms']['topics']} == topics

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A headless Chromium, driven by its DevTools protocol: what a visitor sees and clicks."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import connect
+
+NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+OPTIONS = (
+    '--headless=new',
+    '--no-sandbox',
+    '--no-first-run',
+    '--disable-dev-shm-usage',
+    '--disable-background-networking',
+    '--enable-unsafe-swiftshader',
+    '--use-angle=swiftshader',
+    '--remote-debugging-port=0',
+    '--remote-allow-origins=*',
+    '--hide-scrollbars',
+)
+DEADLINE = 120.0  # [s]
+#: every text on the page, shadow trees excepted
+TEXT = 'document.body ? document.body.innerText : ""'
+
+
+def find_chromium() -> str | None:
+    """Return the path of an installed Chromium."""
+    return next(filter(None, map(shutil.which, NAMES)), None)
+
+
+class Browser:
+    """One tab."""
+
+    def __init__(self, profile: Path, url: str, size: tuple[int, int] = (1280, 800)) -> None:
+        """Open a page."""
+        program = find_chromium()
+        assert program is not None
+        window = f'--window-size={size[0]},{size[1]}'
+        self._process = subprocess.Popen(
+            [program, *OPTIONS, window, f'--user-data-dir={profile}', url],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            port_file = profile / 'DevToolsActivePort'
+            self._wait(lambda: port_file.exists() and port_file.read_text().count('\n') == 1)
+            port, path = port_file.read_text().splitlines()
+            self._socket = connect(f'ws://127.0.0.1:{port}{path}', max_size=None)
+            self._numbers, self._session = itertools.count(1), None
+            tab = self._wait(self._find_tab)
+            attached = self.call('Target.attachToTarget', targetId=tab, flatten=True)
+            self._session = attached['sessionId']
+            metrics = {'deviceScaleFactor': 1, 'mobile': False}
+            self.call(
+                'Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics
+            )
+        except BaseException:
+            self._process.kill()
+            raise
+
+    def _find_tab(self) -> str | None:
+        found = self.call('Target.getTargets')['targetInfos']
+        return next((each['targetId'] for each in found if each['type'] == 'page'), None)
+
+    @staticmethod
+    def _wait(condition: Any, what: str = 'the browser') -> Any:
+        end = time.monotonic() + DEADLINE
+        while not (value := condition()):
+            assert time.monotonic() < end, f'waited {DEADLINE:g} s in vain for {what}'
+            time.sleep(0.05)
+        return value
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the DevTools protocol."""
+        message = {'id': next(self._numbers), 'method': method, 'params': parameters}
+        if self._session:
+            message['sessionId'] = self._session
+        self._socket.send(json.dumps(message))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=DEADLINE))
+            if answer.get('id') == message['id']:
+                # While a page is loaded there is nothing to evaluate in.
+                return answer.get('result') or {'result': {}, 'error': answer.get('error')}
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression."""
+        done = self.call('Runtime.evaluate', expression=expression, returnByValue=True)
+        return done['result'].get('value')
+
+    @property
+    def text(self) -> str:
+        """All that can be read on the page."""
+        return self.evaluate(TEXT) or ''
+
+    def wait_for(self, text: str) -> None:
+        """Wait until a text can be read."""
+        self._wait(lambda: text in self.text, f'{text!r} on the page')
+
+    def mouse(self, kind: str, x: float, y: float, pressed: bool = False) -> None:
+        """Move, press or release the left button: mouseMoved, mousePressed, mouseReleased."""
+        button = 'left' if kind != 'mouseMoved' or pressed else 'none'
+        self.call(
+            'Input.dispatchMouseEvent',
+            type=kind,
+            x=x,
+            y=y,
+            button=button,
+            buttons=int(pressed),
+            clickCount=int(kind != 'mouseMoved'),
+        )
+
+    def click(self, x: float, y: float) -> None:
+        """Click the left button."""
+        self.mouse('mouseMoved', x, y)
+        self.mouse('mousePressed', x, y, pressed=True)
+        self.mouse('mouseReleased', x, y)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
+        """Press at the start and move to the end, without a release."""
+        self.mouse('mouseMoved', *start)
+        self.mouse('mousePressed', *start, pressed=True)
+        for i in range(1, steps + 1):
+            at = [a + (b - a) * i / steps for a, b in zip(start, end)]
+            self.mouse('mouseMoved', *at, pressed=True)
+            time.sleep(0.06)
+
+    def centre(self, button: str) -> tuple[float, float]:
+        """Return where the button with a text is."""
+        found = self._wait(
+            lambda: self.evaluate(
+                '(() => { const b = [...document.querySelectorAll("button")].find('
+                f'b => b.innerText.trim() === {json.dumps(button)}); if (!b) return null;'
+                'b.scrollIntoView({block: "center"}); const r = b.getBoundingClientRect();'
+                'return [r.x + r.width / 2, r.y + r.height / 2]; })()'
+            ),
+            f'the button {button}',
+        )
+        return found[0], found[1]
+
+    def close_notifications(self) -> None:
+        """Click away what covers the arm, such as the warning that there is no graphics card."""
+        button = '.mantine-Notification-closeButton'
+        self.evaluate(f'document.querySelectorAll("{button}").forEach(each => each.click())')
+        time.sleep(0.5)
+
+    def screenshot(self, file: Path) -> bytes:
+        """Save what is seen as a PNG."""
+        data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
+        file.write_bytes(data)
+        return data
+
+    def close(self) -> None:
+        """End the browser."""
+        try:
+            self._session = None
+            self.call('Browser.close')
+            self._process.wait(timeout=10)
+        except Exception:  # noqa: BLE001 - however it ends, it ends
+            self._process.kill()
+            self._process.wait()
+        self._socket.close()

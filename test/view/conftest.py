@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A graph per test, as for the nodes."""
+
+from __future__ import annotations
+
+from nodes.conftest import graph
+
+__all__ = ['graph']

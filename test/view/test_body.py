@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page draws stands where the kinematics say, and tells muscles apart."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+trimesh = pytest.importorskip('trimesh', reason='./bringup.sh --view installs what the page needs')
+
+from robots import read_muscles, write_muscles, write_robot  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+from musculoskeletal_ae.robot.robot import Robot  # noqa: E402
+from musculoskeletal_ae.view.body import (  # noqa: E402
+    DASHES,
+    Kind,
+    link_solids,
+    muscle_tubes,
+    pieces,
+)
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('musashi_left_arm')
+
+
+@pytest.fixture
+def theta(robot):
+    return robot.lower + 0.3 * (robot.upper - robot.lower)
+
+
+def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot, theta):
+    pull = np.linspace(0.0, 1.0, robot.muscle_count)
+    tension = robot.tension.bias + pull * (robot.tension.limit - robot.tension.bias)
+    tubes = muscle_tubes(robot, theta, tension, np.zeros(robot.muscle_count, dtype=int))
+    points = robot.routes.points(theta[None])[0]
+    along = Rotation.from_quat(tubes['batched_wxyzs'], scalar_first=True).apply([0.0, 0.0, 1.0])
+    line = points[robot.routes.second] - points[robot.routes.first]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    np.testing.assert_allclose(along, np.repeat(line, DASHES, axis=0), atol=1e-9)
+    middle = 0.5 * (points[robot.routes.first] + points[robot.routes.second])
+    np.testing.assert_allclose(
+        tubes['batched_positions'][DASHES // 2 :: DASHES], middle, atol=1e-12
+    )
+    owner = robot.routes.muscle.repeat(DASHES)
+    radius = [tubes['batched_scales'][owner == m, 0] for m in (0, len(tension) - 1)]
+    assert radius[1][0] > 2.0 * radius[0][0]
+
+
+def test_a_wire_that_wraps_is_drawn_round_and_has_as_many_tubes_where_it_lifts_off(tmp_path):
+    directory = write_robot(tmp_path)
+    document = read_muscles(directory)
+    route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
+    route[1:2] = [{'wrap': 'sphere', 'link': 'upper', 'xyz': [0.0, 0.0, -0.3], 'radius': 0.03}]
+    robot = Robot.load(write_muscles(directory, document))
+    owner, sound = pieces(robot).repeat(DASHES), np.zeros(robot.muscle_count, dtype=int)
+    postures = robot.random_postures(20, np.random.default_rng(3))
+    detours = robot.routes.detours(postures).max(axis=1)
+    assert detours.min() < 1e-9 and detours.max() > 1e-3
+    for posture in postures:
+        tubes = muscle_tubes(robot, posture, np.full(robot.muscle_count, 50.0), sound)
+        assert len(tubes['batched_positions']) == len(owner)
+        drawn = np.bincount(owner, tubes['batched_scales'][:, 2]) / 1.02
+        np.testing.assert_allclose(drawn, robot.routes.absolute_lengths(posture), atol=2e-4)
+        assert np.isfinite(tubes['batched_wxyzs']).all()
+
+
+def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):
+    tension = np.full(robot.muscle_count, 100.0)
+    kinds = np.arange(robot.muscle_count) % 4
+    tubes = muscle_tubes(robot, theta, tension, kinds)
+    kind = kinds[robot.routes.muscle].repeat(DASHES)
+    length = np.linalg.norm(
+        np.diff(robot.routes.points(theta[None])[0], axis=0)[robot.routes.first], axis=1
+    ).repeat(DASHES)
+    filled = tubes['batched_scales'][:, 2] * DASHES / length
+    assert (filled[kind >= Kind.ISOLATED] < 0.7).all() and (
+        filled[kind < Kind.ISOLATED] > 1.0
+    ).all()
+    looks = {tuple(colour) for colour in tubes['batched_colors']}
+    assert len(looks) == 4
+    # Nobody tells colours apart by hue alone: their luminance differs too.
+    light = sorted(np.dot(look, [0.2126, 0.7152, 0.0722]) for look in looks)
+    assert np.diff(light).min() > 15.0
+
+
+def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path):
+    folder = tmp_path / 'arm'
+    shutil.copytree(Robot.load('arm26').description.directory, folder)
+    solids, notes = link_solids(Robot.load(folder))
+    assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down from the joints
+    elbow = Robot.load('arm26').kinematics.placement_translation[2, 2]
+    low, high = solids[0][1].bounds[:, 2]
+    assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    (folder / 'box.stl').write_bytes(box.export(file_type='stl'))
+    os.mkfifo(folder / 'fifo.stl')
+    urdf = (folder / 'robot.urdf').read_text()
+    visual = (
+        '<visual><origin xyz="0 0 -0.1" rpy="0 0 0"/><geometry>'
+        '<mesh filename="{}" scale="0.1 0.1 0.2"/></geometry></visual>'
+    )
+    added = ''.join(visual.format(name) for name in ('box.stl', 'fifo.stl', 'none.stl', 'arm.dae'))
+    name = '<link name="upper_arm">'
+    (folder / 'robot.urdf').write_text(urdf.replace(name, name + added))
+    robot = Robot.load(folder)
+    ((joint, mesh),), notes = link_solids(robot)
+    assert robot.kinematics.model.names[joint] == 'shoulder'
+    np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.05, -0.2], [0.05, 0.05, 0.0]])
+    assert [any(word in note for note in notes) for word in ('no regular', 'No such', '.stl, .obj')]
+    assert len(notes) == 3

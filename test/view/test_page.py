@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph import Process, executable
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+
+from musculoskeletal_ae.nodes.qos import LATCHED
+
+pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from view.browser import Browser, find_chromium
+
+SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
+chromium = pytest.mark.skipif(find_chromium() is None, reason='no chromium is installed')
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(('127.0.0.1', 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def view(graph):
+    """Start the page of arm26 with options; return its port once it answers."""
+
+    def start(*options: str) -> int:
+        port = free_port()
+        command = [*executable('view'), '--robot', 'arm26', '--port', str(port), *options]
+        process = Process('view', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
+        graph.processes.append(process)
+
+        def answers() -> bool:
+            with socket.socket() as probe:
+                return probe.connect_ex(('127.0.0.1', port)) == 0
+
+        graph.wait(answers, 'the page')
+        return port
+
+    return start
+
+
+def visit(port: int, origin: str):
+    import viser
+
+    protocol = f'viser-v{viser.__version__}'
+    return connect(f'ws://localhost:{port}', origin=origin, subprotocols=[protocol], max_size=None)
+
+
+def read(other) -> None:
+    while True:
+        other.recv(timeout=60)
+
+
+@chromium
+def test_a_visitor_sees_the_arm_move_cuts_a_muscle_and_sees_the_alarm(
+    graph, view, trained_file, tmp_path
+):
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    graph.start('hardware_emulator', robot='arm26')
+    graph.start('estimator', robot='arm26', checkpoint=trained_file)
+    graph.start('controller', robot='arm26', checkpoint=trained_file, max_age=10.0)
+    detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
+    targets = graph.listen(JointState, 'target_joint_states')
+    graph.listen(JointState, 'estimated_joint_states')
+    graph.wait(lambda: graph.received['estimated_joint_states'], 'the estimate')
+    port = view()
+    topic = f'{graph.namespace}/anomaly'
+    assert graph.node.count_subscribers(topic) == 0  # nobody looks
+    page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}')
+
+    def see(text: str) -> None:
+        graph.wait(lambda: text in page.text, f'{text!r} on the page')
+
+    try:
+        # Nodes are found one after the other.
+        for text in ('Faults of the', 'error 0.', 'triceps_long', 'Explore', 'Stop', 'payload'):
+            see(text)
+        assert 'Recording' not in page.text  # no bag is played
+        page.close_notifications()
+        before = page.screenshot(SCREENSHOTS / 'loaded.png')
+        page.click(*page.centre('Explore'))
+        see('exploring')
+        start = np.array(graph.received['estimated_joint_states'][-1].position)
+        graph.wait(
+            lambda: (
+                np.abs(graph.received['estimated_joint_states'][-1].position - start).max() > 0.3
+            ),
+            'the arm to move',
+        )
+        page.close_notifications()
+        assert page.screenshot(SCREENSHOTS / 'moving.png') != before
+        assert not targets and not any(message.data for message in detected)
+        page.click(*page.centre('Cut'))
+        see('ANOMALY: ')
+        assert detected[-1].data
+        graph.spin(1.0)
+        page.close_notifications()
+        page.screenshot(SCREENSHOTS / 'cut.png')
+    finally:
+        page.close()
+    graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'nobody to look any more')
+
+
+def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
+    port = view('--read-only')
+    for origin in ('http://evil.example', f'http://evil.example:{port}', 'null'):
+        with visit(port, origin) as other, pytest.raises(ConnectionClosed):
+            read(other)
+    with visit(port, f'http://localhost:{port}') as mine:
+        assert mine.recv(timeout=30)
+    second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
+    output, _ = second.process.communicate(timeout=120)
+    assert second.process.returncode == 1
+    assert f'port {port} of 127.0.0.1 is in use' in output and 'Traceback' not in output
