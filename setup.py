@@ -15,7 +15,7 @@ from setuptools.command.install_scripts import install_scripts
 NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
-TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'train']
+TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
 
 
 def config_files() -> list[tuple[str, list[str]]]:

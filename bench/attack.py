@@ -97,7 +97,7 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
     )
 
 
-def relieved(time: Array, loads: list[tuple[float, Array]], limit: float, muscles: int) -> Array:
+def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Array:
     """Say for commands at `time` [s] (N,) which muscles pulled more than `limit` [N], (N, M)."""
     if not loads:
         return np.zeros((len(time), muscles), dtype=bool)

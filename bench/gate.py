@@ -150,7 +150,7 @@ def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, flo
         longest = max(longest, above.max())
     values = (
         np.abs(np.diff(stream.length, axis=0)).max(),
-        stream.tension.max() / robot.tension.max,
+        (stream.tension / robot.tension.max).max(),
         longest,
         max(0.0, outside_limits(robot, theta).max()),
     )

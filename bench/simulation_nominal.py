@@ -47,7 +47,8 @@ def random_commands(robot: Robot, count: int, seed: int) -> Array:
     commands: list[Array] = []
     while len(commands) < count:
         theta = robot.random_postures(1, rng)[0]
-        desired = rng.uniform(robot.tension.bias, 0.6 * robot.tension.limit)
+        least, most = robot.tension.bias, 0.6 * robot.tension.limit
+        desired = least + rng.uniform() * (most - least)
         try:
             tension = holding_tension(robot, theta, desired)
         except InfeasibleError:

@@ -86,7 +86,7 @@ class CutInTurn:
         slot = min(int((time + 1e-9) // SLOT), len(self.order) - 1)
         muscle, since = self.order[slot], time - self.times[slot]
         if abs(since) < 0.5 * SAMPLE_TIME:
-            self.carried[slot] = arm.tension[muscle] > self._robot.tension.bias + CARRYING
+            self.carried[slot] = arm.tension[muscle] > self._robot.tension.bias[muscle] + CARRYING
             arm.set_ruptured([self._robot.muscles[muscle]])
         elif abs(since - CUT) < 0.5 * SAMPLE_TIME:
             arm.set_ruptured([])

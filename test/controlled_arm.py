@@ -90,7 +90,7 @@ class ControlledArm:
         )
 
     def pays_out(self):
-        bias = self.robot.tension.bias
+        bias = self.robot.tension.bias[0]
         self.graph.wait(lambda: self.tension().max() < bias + 8.0, 'tensions near the bias')
 
     def state(self, node='controller'):

@@ -24,6 +24,7 @@ ARGUMENTS = {
     'check_robot': ['arm26', '--no-plot'],
     'experiment': ['all', '--quick', '--robot', 'arm26', '--out', '{folder}/results'],
     'fit_series_elastic': ['config/testbed/one_muscle.csv', '--no-plot'],
+    'import_robot': ['config/arm26/robot.urdf', '--out', '{folder}/arm'],
     'record': ['-o', '{folder}/bag'],
     'render': ['--out', '{folder}/arm.png'],
     'replay': ['bags/rupture'],

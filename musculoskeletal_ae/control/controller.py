@@ -34,6 +34,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
@@ -131,7 +132,7 @@ class Controller:
         # NaN is not known, and no reason for anything.
         self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
         self._warm = np.median(np.array(self._temperatures), axis=0)
-        over = self.safety.muscles(muscles).tension > self._overloads[:, None]
+        over = self.safety.muscles(muscles).tension > self._overloads
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
     def estimated(self, theta: Array, now: float) -> None:
@@ -231,8 +232,9 @@ class Controller:
         longest = self.settings.overload_time, OVERLOAD_MOMENT
         for since, allowed, most in zip(self._tense_since, longest, self._overloads):
             if now - self._asleep - since.min() > allowed:
-                name = self._robot.muscles[int(since.argmin())]
-                return f'{name}: tension above {most:g} N for {allowed:g} s'
+                m = int(since.argmin())
+                name = self._robot.muscles[m]
+                return f'{name}: tension above {most[m]:g} N for {allowed:g} s'
         return ''
 
     def _overheat(self) -> str:
@@ -276,8 +278,9 @@ class Controller:
         if not self.safety.zeroed:
             warnings.append('length zeros are unknown: the arm only explores, gently')
         if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
-            warnings.append(f'tension above {robot.tension.limit:g} N: {", ".join(tense)}')
-        hot = {n: t for n, t in zip(robot.muscles, self.limit) if t < robot.tension.max}
+            warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')
+        limited = zip(robot.muscles, self.limit, robot.tension.max)
+        hot = {name: limit for name, limit, most in limited if limit < most}
         if hot:
             values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
             warnings.append(f'hot: {", ".join(hot)}')

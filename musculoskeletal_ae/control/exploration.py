@@ -20,6 +20,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
@@ -79,5 +80,6 @@ def holdable_postures(
             return held
     raise RobotDescriptionError(
         f'{robot.description.directory}: only {len(held)} of {TRIES} random postures can be held '
-        f'with tensions in [{robot.tension.bias:g}, {robot.tension.limit:g}] N; run check_robot'
+        f'with tensions in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N; '
+        'run check_robot'
     )

@@ -30,8 +30,8 @@ TRIES = 20  # goals, of which the first is taken that can be held
 SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
 
 
-def gentle_limit(robot: Robot) -> float:
-    """Return the tension [N] that no muscle exceeds while zeros are unknown."""
+def gentle_limit(robot: Robot) -> Array:
+    """Return the tension [N] (M,) that no muscle exceeds while zeros are unknown."""
     return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
 
 

@@ -132,7 +132,7 @@ class SafetyFilter:
             self.command = self._released(self.command, muscles, dt, fresh)
         return self.command
 
-    def most_change(self, kind: str, dt: float) -> float:
+    def most_change(self, kind: str, dt: float) -> Array | float:
         """Return by how much a command may change in dt [s]."""
         rate = self.settings.rate_limit
         return (rate if kind == LENGTH else rate * self._robot.stiffness) * dt

@@ -42,7 +42,7 @@ class StiffnessModel(NamedTuple):
     jacobian: Array  # G [m/rad], (M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
-    module: float  # K_stiff [N/m]
+    module: Array  # K_stiff [N/m], (M,)
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
@@ -51,10 +51,13 @@ class StiffnessModel(NamedTuple):
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
 
-        levels = np.linspace(robot.tension.bias, robot.tension.limit, LEVELS)
-        tensions = np.tile(levels[:, None], robot.muscle_count)
+        ranges = np.stack([robot.tension.bias, robot.tension.limit])
+        tensions: Array = np.linspace(ranges[0], ranges[1], LEVELS)
         lengths = mae.lengths(np.tile(theta, (LEVELS, 1)), tensions)
-        cubic = np.polyfit(levels, -lengths, 3)  # (4, M)
+        cubic = np.empty((4, robot.muscle_count))
+        for low, high in np.unique(ranges, axis=1).T:
+            own = (ranges[0] == low) & (ranges[1] == high)
+            cubic[:, own] = np.polyfit(np.linspace(low, high, LEVELS), -lengths[:, own], 3)
         return cls(
             jacobian=mae.muscle_jacobian(theta, tension),
             hessian=robot_stiffness.muscle_hessian(jacobian, theta, STEP),

@@ -55,6 +55,6 @@ class TorqueControl:
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
         change = tension - self._command
         fastest = robot.stiffness * chosen.rate_limit * dt
-        share = min(1.0, fastest / max(fastest, float(np.abs(change).max()), 1e-9))
+        share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
         self._command = self._command + change * share
         return self._command.copy()

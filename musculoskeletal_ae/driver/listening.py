@@ -57,13 +57,13 @@ class Listening:
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
         theta = robot.random_postures(500, np.random.default_rng(0))
         ones, most = np.ones(robot.muscle_count), robot.tension.max
-        pulls = np.zeros((500, 1)) * ones, np.full((500, 1), most) * ones
+        pulls = np.zeros((500, 1)) * ones, np.tile(most, (500, 1))
         spans = [robot.muscle_lengths(theta, pull) for pull in pulls]
         low, high = np.min(spans, axis=(0, 1)), np.max(spans, axis=(0, 1))
         beyond, (coldest, hottest) = BEYOND[not zeroed], TEMPERATURES
         #: what values are possible, (3, M)
-        self._low = np.stack([low - beyond, -0.02 * most * ones, coldest * ones])
-        self._high = np.stack([high + beyond, 1.1 * most * ones, hottest * ones])
+        self._low = np.stack([low - beyond, -0.02 * most, coldest * ones])
+        self._high = np.stack([high + beyond, 1.1 * most, hottest * ones])
 
     @property
     def count(self) -> int:

@@ -101,8 +101,8 @@ class Verdict:
         """Note one of the FAULTS, of some muscles (none: of all), with what its texts name."""
         check, saw, change = FAULTS[what]
         if muscles:
-            k = np.broadcast_to(self._robot.stiffness, self._robot.muscle_count)[muscles[0]]
-            seen |= {'bias': self._robot.tension.bias, 'k': k}
+            first, robot = muscles[0], self._robot
+            seen |= {'bias': robot.tension.bias[first], 'k': robot.stiffness[first]}
         muscles = muscles or tuple(range(self._robot.muscle_count))
         self._state[list(muscles), CHECKS.index(check)] = WRONG
         self.faults.append(Fault(check, muscles, saw.format(**seen), change.format(**seen)))

@@ -61,8 +61,8 @@ class Winding:
         """Try some muscles (none: all), with at most `highest` [N] asked for."""
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
-        self._highest = max(highest or self._bias + ABOVE_BIAS, self._bias + CLIP[0])
-        self._stiffness: Array = np.broadcast_to(robot.stiffness, robot.muscle_count)
+        self._highest: Array = np.maximum(highest or self._bias + ABOVE_BIAS, self._bias + CLIP[0])
+        self._stiffness = robot.stiffness
         self.verdict = Verdict(robot)
         self.trying = ''  # what is going on, for people
         self.done = False
@@ -145,7 +145,7 @@ class Winding:
         """Ask for a level [N], follow the arm as it gives way, and return what is then read."""
         before = self._mean()
         noise = np.std([states[1, m] for _, states in self._recent])
-        further = (level - self._bias) / self._stiffness[m]
+        further = (level - self._bias[m]) / self._stiffness[m]
         self._target[m] = before.length[m] - further
         start = last = self._now
         while True:
@@ -170,7 +170,7 @@ class Winding:
         robot, verdict, home = self._robot, self.verdict, self._mean()
         half, whole = list[float](), list[float]()  # [s] until it answered
         # The weight of the arm may ask for more than T_bias already.
-        rise = self._highest - self._bias
+        rise = (self._highest - self._bias)[m]
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)
         last = yield from self._wind(m, home.demand[m] + rise, home.length[m], whole)
         pulled, wound = last.tension - home.tension, home.length - last.length
@@ -182,8 +182,8 @@ class Winding:
         if wound[m] < -RESPONSE[1]:
             verdict.failed('rises', m, rise=-1e3 * wound[m])
         verdict.passed('sign', m)
-        clip = robot.tension.max
-        if clip <= self._highest:
+        clip = robot.tension.max[m]
+        if clip <= self._highest[m]:
             past = yield from self._wind(m, clip + CLIP[0], home.length[m], [])
             if past.tension[m] > (1.0 + CLIP[1]) * clip:
                 verdict.failed('clip', m, got=past.tension[m], most=clip)
@@ -201,7 +201,7 @@ class Winding:
         """Judge the law by the highest level that was asked for, and by l_target beyond l."""
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
-        if asked < 0.25 * (self._highest - self._bias):
+        if asked < 0.25 * (self._highest - self._bias)[m]:
             told = f'{self._robot.muscles[m]}: the arm gave way, the law is not judged'
             self.verdict.notes.append(told)
             return
@@ -221,7 +221,7 @@ class Winding:
         if other != m and pulled[other] > RESPONSE[0]:
             self.verdict.failed('other one', m, other=self._robot.muscles[other])
             return
-        self._target[m] = home.length[m] + (self._highest - self._bias) / self._stiffness[m]
+        self._target[m] = home.length[m] + ((self._highest - self._bias) / self._stiffness)[m]
         yield from self._wait(HOLD)
         answered = self._mean().tension[m] - home.tension[m] > RESPONSE[0]
         yield from self._go(m, home.length[m])

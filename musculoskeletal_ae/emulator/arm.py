@@ -74,7 +74,7 @@ class EmulatedArm:
         self._wrench = np.zeros(6)
         self._payload = 0.0
         self._body = self._constants()
-        muscles, joints = robot.muscle_count, robot.joint_count
+        muscles = robot.muscle_count
         self._command = mechanics.Command(
             np.zeros(muscles),
             self.individual.length_bias.copy(),
@@ -94,26 +94,27 @@ class EmulatedArm:
             np.zeros(3),
         )
         self._muscle = mechanics.MuscleState(*(np.zeros(muscles) for _ in range(8)))
-        self._joint = mechanics.JointState(*(np.zeros(joints) for _ in range(4)))
+        self._joint = mechanics.JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self.reset()
 
     def _constants(self) -> mechanics.Body:
         robot, true = self.robot, self.individual
         span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0)))
         span = span - true.length_at_zero
-        stretch = true.elastic.elongation(
-            true.length_at_zero, np.full(robot.muscle_count, robot.tension.max)
-        )
-        in_tree = np.argsort(self._order)
+        stretch = true.elastic.elongation(true.length_at_zero, robot.tension.max)
+        # Joints that follow others have no friction and no stops of their own.
+        friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
+        friction[self._order] = true.joint_friction
+        lower[self._order], upper[self._order] = robot.lower, robot.upper
         return mechanics.Body(
             true.elastic.force,
             true.elastic.rate,
             true.elastic.wire_stretch,
             true.length_at_zero,
             true.cable_friction,
-            true.joint_friction[in_tree],
-            robot.lower[in_tree],
-            robot.upper[in_tree],
+            friction,
+            lower,
+            upper,
             span.min(axis=0) - stretch - 0.05,
             span.max(axis=0) + 0.05,
             robot.stiffness,
@@ -132,7 +133,7 @@ class EmulatedArm:
         posture = np.clip(posture, self.robot.lower, self.robot.upper)
         for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
             state[:] = 0.0
-        self._joint.q[self._order] = posture
+        self._joint.q[:] = self.robot.kinematics.tree_angles(posture)
         self._wrench[:] = 0.0
         bias = self.robot.tension.bias
         self._muscle.sliding[:] = 0.0
@@ -146,7 +147,7 @@ class EmulatedArm:
 
     def _attach(self, which: Bools) -> None:
         """Wind the given muscles so that they carry T_bias in the present posture."""
-        bias = np.full(self.robot.muscle_count, self.robot.tension.bias)
+        bias = self.robot.tension.bias
         length = self.individual.muscle_lengths(self.theta[None], bias)[0]
         self._muscle.length[which] = length[which]
         self._muscle.tension[which] = bias[which]
@@ -227,13 +228,12 @@ class EmulatedArm:
 
     def step(self, duration: float) -> None:
         """Let time pass [s], in whole steps of `mechanics.STEP`."""
-        individual, model, data = self.individual, self._model, self._data
-        joint = self._joint
+        individual, joint = self.individual, self._joint
         for _ in range(round(duration / mechanics.STEP)):
             self._age += mechanics.STEP
             if self._age > self.command_timeout:
                 self._kind = mechanics.SAFE
-            acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
+            acceleration = self._acceleration()
             mechanics.muscle_step(
                 individual.tree,
                 individual.routes,
@@ -248,6 +248,20 @@ class EmulatedArm:
                 self._effector_joint,
                 acceleration,
             )
+
+    def _acceleration(self) -> Array:
+        """Return q̈ of the tree; of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h)."""
+        model, data, joint = self._model, self._data, self._joint
+        gear = self.robot.kinematics.transmission
+        if gear is None:
+            free: Array = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
+            return free
+        upper = np.triu(pin.crba(model, data, joint.q))
+        bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
+        inertia = upper + np.triu(upper, 1).T
+        # Pinocchio's M holds the armature already.
+        coupled = np.linalg.solve(gear.T @ inertia @ gear, gear.T @ (joint.torque - bias))
+        return gear @ coupled
 
     def sense(self) -> Readings:
         """Read all sensors once, with their noise, bias, resolution and faults."""

@@ -12,39 +12,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.robot.wrapping import WrapObjects
 
 THICKEST_BONE = 0.04  # [m] radius of a bone's head
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How much individuals differ, calibrated once (`bench/calibration.py`).
+    """How much individuals differ, calibrated once (`bench/calibration.py`)."""
 
-    Attributes:
-        attachment: Standard deviation of each coordinate of each route point [m].
-        wrap: Quantile, over the joint range, of the straight line's distance from the joint
-            centre that the bone's head reaches; 0 for no wrapping.
-        elastic: Standard deviation of the logarithm of each elastic constant.
-        cable_friction: Mean of the relative tension loss along the route (capstan exponent).
-        joint_friction: Mean Coulomb torque of a joint, as a share of the largest torque that
-            the arm's weight puts on any joint.
-        length_bias: Standard deviation of each length sensor's zero error [m].
-        tension_bias: Standard deviation of each tension sensor's zero error [N].
-        tension_gain: Standard deviation of each tension sensor's relative gain error.
-    """
-
-    attachment: float = 0.0085
+    attachment: float = 0.0085  # standard deviation of each coordinate of each route point [m]
+    #: quantile, over the joint range, of the straight line's distance from the joint centre that
+    #: the bone's head reaches; 0 for no wrapping
     wrap: float = 0.4
-    elastic: float = 0.15
-    cable_friction: float = 0.095
+    elastic: float = 0.15  # standard deviation of the logarithm of each elastic constant
+    cable_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
+    #: mean Coulomb torque of a joint, as a share of the largest torque that the arm's weight puts
+    #: on any joint
     joint_friction: float = 0.02
-    length_bias: float = 0.0005
-    tension_bias: float = 1.0
-    tension_gain: float = 0.01
+    length_bias: float = 0.0005  # standard deviation of each length sensor's zero error [m]
+    tension_bias: float = 1.0  # of each tension sensor's zero error [N]
+    tension_gain: float = 0.01  # of each tension sensor's relative gain error
 
 
 #: No difference at all: the geometric model itself as a body, without friction.
@@ -52,30 +44,15 @@ NOMINAL = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Individual:
-    """True routes, elastic constants, friction and sensor errors of one arm.
-
-    Attributes:
-        elastic: True elastic constants of the M muscles.
-        cable_friction: Capstan exponent of each muscle's route, shape (M,).
-        joint_friction: Coulomb torque of each joint [N·m], shape (D,), order of θ.
-        length_bias: Zero error of the length sensors [m], shape (M,).
-        tension_bias: Zero error of the tension sensors [N], shape (M,).
-        tension_gain: Gain of the tension sensors, shape (M,).
-    """
+    """True routes, elastic constants, friction and sensor errors of one arm."""
 
     def __init__(self, robot: Robot, seed: int, spread: Spread | None = None) -> None:
-        """Draw the individual.
-
-        Args:
-            robot: Geometric model that it differs from.
-            seed: Which individual.
-            spread: How much individuals differ; the calibrated one by default.
-        """
+        """Draw individual `seed`, by the calibrated spread or another."""
         spread = spread or Spread()
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles = robot.muscle_count
         kin = robot.kinematics
-        self._order = kin.order
+        self._kinematics = kin
         self.tree = Tree(
             kin.parent.astype(np.int64),
             kin.placement_rotation,
@@ -85,15 +62,13 @@ class Individual:
         )
         nominal = robot.routes
         shift = rng.normal(0.0, spread.attachment, nominal.point.shape)
-        sphere_joint, radius = _bone_heads(robot, spread.wrap, rng)
         self.routes = WrappedRoutes(
             nominal.joint.astype(np.int64),
             nominal.point + shift,
             nominal.first.astype(np.int64),
             nominal.second.astype(np.int64),
             nominal.muscle.astype(np.int64),
-            sphere_joint,
-            radius,
+            _objects(robot, nominal.point + shift, spread.wrap, seed, rng),
         )
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         nominal_elastic = robot.series_elastic
@@ -102,19 +77,20 @@ class Individual:
             nominal_elastic.rate * factor[1],
             nominal_elastic.wire_stretch * factor[2],
         )
+        #: of muscles (M,) and joints [N·m], (D,) in the order of θ
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         largest = np.abs(kin.holding_torque(robot.random_postures(200, rng))).max()
         self.joint_friction: Array = (
             spread.joint_friction * largest * rng.uniform(0.5, 1.5, robot.joint_count)
         )
+        #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
-        q = np.empty((len(theta), self.tree.parent.shape[0] - 1))
-        q[:, self._order] = theta
+        q = self._kinematics.tree_angles(theta)
         return wrapped_lengths(self.tree, self.routes, len(self.cable_friction), q)
 
     def absolute_lengths(self, theta: Array) -> Array:
@@ -123,7 +99,7 @@ class Individual:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return the true G [m/rad], θ (N, D) gives (N, M, D)."""
-        return self._evaluate(theta)[1][:, :, self._order]
+        return self._kinematics.of_theta(self._evaluate(theta)[1])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
@@ -131,41 +107,56 @@ class Individual:
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
 
-def _bone_heads(robot: Robot, quantile: float, rng: np.random.Generator) -> tuple[Ints, Array]:
-    """Return for each segment the joint whose head it may wrap round, and the head's radius.
+def _objects(
+    robot: Robot, point: Array, quantile: float, seed: int, rng: np.random.Generator
+) -> WrapObjects:
+    """Return what each segment wraps round: as described, a little thicker or thinner, or a head.
 
-    The head sits at the joint centre nearest to the line. It is thick enough to touch the line in
-    a share `quantile` of the postures, but never so thick that the wire could slip over to its
-    other side, and never reaches an attachment.
+    A bone's head sits at the joint centre nearest to the line. It is thick enough to touch the line
+    in a share `quantile` of the postures, but never so thick that the wire could slip over to its
+    other side. Nothing ever reaches an attachment, those of the description not the true `point`.
     """
     kin, routes = robot.kinematics, robot.routes
-    sphere_joint = np.zeros(len(routes.first), dtype=np.int64)
-    radius = np.zeros(len(routes.first))
+    count = len(routes.first)
+    nothing, nowhere = np.zeros((count, 3)), np.full((count, 3), np.nan)
+    objects = WrapObjects(
+        np.zeros(count, np.int64), nothing, 1.0 * nothing, nowhere, np.zeros(count)
+    )
+    if routes.objects is not None:
+        for whole, part in zip(objects, routes.objects, strict=True):
+            whole[routes.wrapping] = part
     if quantile <= 0.0:
-        return sphere_joint, radius
-    postures = robot.random_postures(300, np.random.default_rng(0))
-    poses, points = kin.joint_poses(postures), routes.points(postures)
-    thickness = rng.uniform(0.8, 1.2, len(routes.first))
-    for s, (first, second) in enumerate(zip(routes.first, routes.second, strict=True)):
-        moved = kin.moved_by[routes.joint[first]] ^ kin.moved_by[routes.joint[second]]
-        crossed = [i for i in range(1, len(kin.parent)) if moved[kin.theta_index[i]]]
-        crossed = [i for i in crossed if not kin.prismatic[i]]
+        return objects
+    poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
+    points, true = routes.placed(poses), routes.placed(poses, point)
+    thickness = rng.uniform(0.8, 1.2, count)
+    described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
+    for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
+        if objects.radius[s] > 0.0:
+            turn, origin = (
+                poses.rotation[:, objects.joint[s]],
+                poses.translation[:, objects.joint[s]],
+            )
+            away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]
+            axis = (turn @ objects.axis[s])[:, None]
+            away -= (away * axis).sum(axis=-1, keepdims=True) * axis
+            least = np.linalg.norm(away, axis=-1).min()
+            objects.radius[s] = min(objects.radius[s] * described[s], 0.95 * least)
+            continue
+        moved = kin.moved_by[routes.joint[ends[0]]] ^ kin.moved_by[routes.joint[ends[1]]]
         best = np.inf
-        for joint in crossed:
-            centre = poses.translation[:, joint]
-            start, end = points[:, first] - centre, points[:, second] - centre
+        for joint in range(1, len(kin.parent)):
+            if kin.prismatic[joint] or not moved[kin.theta_index[joint]]:
+                continue
+            start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start
             share = -np.sum(start * line, axis=1) / np.sum(line * line, axis=1)
             share = np.clip(share, 0.0, 1.0)
             distance = np.linalg.norm(start + share[:, None] * line, axis=1)
             if np.median(distance) < best:
                 best = float(np.median(distance))
-                ends = np.minimum(np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1))
-                sphere_joint[s] = joint
-                radius[s] = min(
-                    thickness[s] * np.quantile(distance, quantile),
-                    2.0 * distance.min(),
-                    0.8 * ends.min(),
-                    THICKEST_BONE,
-                )
-    return sphere_joint, radius
+                least = min(np.linalg.norm(e, axis=1).min() for e in (start, end))
+                touching = thickness[s] * np.quantile(distance, quantile)
+                objects.joint[s] = joint
+                objects.radius[s] = min(touching, 2.0 * distance.min(), 0.8 * least, THICKEST_BONE)
+    return objects

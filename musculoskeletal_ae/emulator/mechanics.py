@@ -23,9 +23,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import (
     Tree,
     WrappedRoutes,
+    add_pull,
     add_torque,
     place_points,
-    segment_length,
+    route_segment,
     tree_poses,
 )
 
@@ -63,9 +64,9 @@ class Body(NamedTuple):
     upper: Array
     length_low: Array
     length_high: Array
-    stiffness: float
-    tension_bias: float
-    tension_max: float
+    stiffness: Array
+    tension_bias: Array
+    tension_max: Array
     sensor_gain: Array
     sensor_offset: Array
 
@@ -82,27 +83,16 @@ class Command(NamedTuple):
 
 
 class MuscleState(NamedTuple):
-    """What changes, each of shape (M,); the compiled step writes into it.
+    """What changes, each of shape (M,); the compiled step writes into it."""
 
-    Attributes:
-        length: l at the motor, true [m].
-        tension: T at the motor, true [N].
-        end_tension: T at the elastic unit [N].
-        sliding: Friction state s in [−1, 1].
-        winding: c₁ [°C].
-        housing: c₂ [°C].
-        reference: T_ref of the module [N].
-        ruptured: 1 where the wire is cut.
-    """
-
-    length: Array
-    tension: Array
-    end_tension: Array
-    sliding: Array
-    winding: Array
-    housing: Array
-    reference: Array
-    ruptured: Array
+    length: Array  # l at the motor, true [m]
+    tension: Array  # T at the motor, true [N]
+    end_tension: Array  # T at the elastic unit [N]
+    sliding: Array  # friction state s in [−1, 1]
+    winding: Array  # c₁ [°C]
+    housing: Array  # c₂ [°C]
+    reference: Array  # T_ref of the module [N]
+    ruptured: Array  # 1 where the wire is cut
 
 
 class JointState(NamedTuple):
@@ -149,16 +139,18 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 
 @njit(cache=True)
-def module_reference(kind: int, command: float, length: float, before: float, body: Body) -> float:
-    """Return T_ref [N] of one module that reads `length` [m] and had T_ref `before`."""
+def module_reference(
+    kind: int, command: float, length: float, before: float, body: Body, m: int
+) -> float:
+    """Return T_ref [N] of module m that reads `length` [m] and had T_ref `before`."""
     if kind == FOLLOW_LENGTH:
-        desired = body.tension_bias + max(0.0, body.stiffness * (length - command))
+        desired = body.tension_bias[m] + max(0.0, body.stiffness[m] * (length - command))
     elif kind == FOLLOW_TENSION:
         desired = max(0.0, command)
     else:
         change = STEP * RELEASE_RATE
-        desired = before + min(change, max(-change, body.tension_bias - before))
-    return min(body.tension_max, desired)
+        desired = before + min(change, max(-change, body.tension_bias[m] - before))
+    return min(body.tension_max[m], desired)
 
 
 @njit(cache=True)
@@ -200,35 +192,19 @@ def muscle_step(
     world = scratch.world
     scratch.absolute[:] = 0.0
     for s in range(routes.first.shape[0]):
-        scratch.absolute[routes.muscle[s]] += segment_length(
-            world[routes.first[s]],
-            world[routes.second[s]],
-            scratch.translation[routes.sphere_joint[s]],
-            routes.radius[s],
-            scratch.leave,
-            scratch.arrive,
+        scratch.absolute[routes.muscle[s]] += route_segment(
+            routes, s, scratch.rotation, scratch.translation, world, scratch.leave, scratch.arrive
         )
     _wires_and_modules(body, muscle, kind, command, scratch.absolute)
     joint.torque[:] = 0.0
     _friction_and_stops(body, joint)
     for s in range(routes.first.shape[0]):
-        i, k, ball = routes.first[s], routes.second[s], routes.sphere_joint[s]
-        centre = scratch.translation[ball]
-        segment_length(world[i], world[k], centre, routes.radius[s], scratch.leave, scratch.arrive)
+        leave, arrive, translation = scratch.leave, scratch.arrive, scratch.translation
+        route_segment(routes, s, scratch.rotation, translation, world, leave, arrive)
         pull = muscle.end_tension[routes.muscle[s]]
-        translation, axis = scratch.translation, scratch.axis
-        add_torque(
-            tree, translation, axis, routes.point_joint[i], world[i], scratch.leave, pull,
-            joint.torque,
-        )  # fmt: skip
-        add_torque(
-            tree, translation, axis, routes.point_joint[k], world[k], scratch.arrive, pull,
-            joint.torque,
-        )  # fmt: skip
-        if routes.radius[s] > 0.0:
-            for r in range(3):
-                scratch.leave[r] += scratch.arrive[r]
-            add_torque(tree, translation, axis, ball, centre, scratch.leave, -pull, joint.torque)
+        add_pull(
+            tree, routes, s, translation, scratch.axis, world, leave, arrive, pull, joint.torque
+        )
     _external_wrench(tree, joint, scratch, wrench, effector, effector_joint)
 
 
@@ -241,7 +217,7 @@ def _wires_and_modules(
         before = muscle.length[m]
         reading = before + command.length_error[m] + command.zero[m]
         muscle.reference[m] = module_reference(
-            kind, command.value[m], reading, muscle.reference[m], body
+            kind, command.value[m], reading, muscle.reference[m], body, m
         )
         if muscle.ruptured[m] > 0.0:
             speed = -SPEED_LIMIT

@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle routes that wrap round bones, compiled by numba: the true lengths of the emulated arm.
 
-A segment between two route points may pass a sphere (a bone's head) of radius r at centre c. Where
-the straight line would cut the sphere, the wire leaves along a tangent, follows the great circle
-and arrives along the other tangent:
-
-    length = √(a² − r²) + √(b² − r²) + r (φ − acos(r/a) − acos(r/b))
-
-with a, b the distances of the end points from c and φ the angle between them. Nothing here is
-shared with the geometric model of `robot/routes.py`, which the estimators know.
+A segment between two route points may pass a sphere (a bone's head) that the geometric model of
+`robot/routes.py` does not know; where the description itself wraps it, it wraps here too, round an
+object of its own size. How a wire lies on either, `robot/wrapping.py` says.
 """
 
 from __future__ import annotations
@@ -20,46 +15,28 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segment
 
 
 class Tree(NamedTuple):
-    """Joints in pinocchio's order, joint 0 being the root link.
+    """Joints in pinocchio's order, joint 0 being the root link."""
 
-    Attributes:
-        parent: Shape (J,).
-        rotation: Fixed placement in the parent, shape (J, 3, 3).
-        translation: Fixed placement in the parent [m], shape (J, 3).
-        axis: In the joint's frame, shape (J, 3).
-        prismatic: Shape (J,).
-    """
-
-    parent: Ints
-    rotation: Array
-    translation: Array
-    axis: Array
-    prismatic: Bools
+    parent: Ints  # (J,)
+    rotation: Array  # fixed placement in the parent, (J, 3, 3)
+    translation: Array  # [m], (J, 3)
+    axis: Array  # in the joint's frame, (J, 3)
+    prismatic: Bools  # (J,)
 
 
 class WrappedRoutes(NamedTuple):
-    """True routes: points on joints of the tree, segments between them, a sphere for each segment.
+    """True routes: points on joints of the tree, segments between them."""
 
-    Attributes:
-        point_joint: Tree joint that carries each point, shape (P,).
-        point: In that joint's frame [m], shape (P, 3).
-        first: Point where each segment starts, shape (S,).
-        second: Point where it ends, shape (S,).
-        muscle: Muscle it belongs to, shape (S,).
-        sphere_joint: Tree joint at whose origin the sphere sits, shape (S,).
-        radius: Radius of the sphere, 0 for none [m], shape (S,).
-    """
-
-    point_joint: Ints
-    point: Array
-    first: Ints
-    second: Ints
-    muscle: Ints
-    sphere_joint: Ints
-    radius: Array
+    point_joint: Ints  # tree joint that carries each point, (P,)
+    point: Array  # in that joint's frame [m], (P, 3)
+    first: Ints  # points where each segment starts
+    second: Ints  # and ends, (S,)
+    muscle: Ints  # it belongs to, (S,)
+    objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
 
 
 @njit(cache=True)
@@ -116,50 +93,6 @@ def place_points(routes: WrappedRoutes, rotation: Array, translation: Array, wor
 
 
 @njit(cache=True)
-def segment_length(
-    start: Array, end: Array, centre: Array, radius: float, leave: Array, arrive: Array
-) -> float:
-    """Return the length of one segment and fill the unit pulls at its ends.
-
-    `leave` is the direction in which the wire pulls the start point, `arrive` the end point; the
-    sphere is pushed by −(leave + arrive), through its centre.
-    """
-    line = end - start
-    straight = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2) + 1e-12
-    if radius > 0.0:
-        a, b = start - centre, end - centre
-        da = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
-        db = math.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-        if da > radius and db > radius:
-            cosine = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / (da * db)
-            angle = math.acos(min(1.0, max(-1.0, cosine)))
-            alpha, beta = math.acos(radius / da), math.acos(radius / db)
-            arc = angle - alpha - beta
-            if arc > 0.0:
-                sine = math.sin(angle)
-                # The tangent points lie at alpha from a and beta from b, in the plane of a and b.
-                for r in range(3):
-                    ea, eb = a[r] / da, b[r] / db
-                    if sine > 1e-6:
-                        across_a = (eb - cosine * ea) / sine
-                        across_b = (ea - cosine * eb) / sine
-                    else:
-                        # Through the centre every way round is as short: take one.
-                        k = int(abs(a[0]) > 0.5 * da)
-                        away = -a[k] * a[r] / (da * da) + (1.0 if r == k else 0.0)
-                        across_a = across_b = away / math.sqrt(1.0 - (a[k] / da) ** 2)
-                    leave[r] = -math.sin(alpha) * ea + math.cos(alpha) * across_a
-                    arrive[r] = -math.sin(beta) * eb + math.cos(beta) * across_b
-                tangents = math.sqrt(da * da - radius * radius)
-                tangents += math.sqrt(db * db - radius * radius)
-                return tangents + radius * arc
-    for r in range(3):
-        leave[r] = line[r] / straight
-        arrive[r] = -leave[r]
-    return straight
-
-
-@njit(cache=True)
 def wrapped_lengths(
     tree: Tree, routes: WrappedRoutes, muscles: int, q: Array
 ) -> tuple[Array, Array]:
@@ -175,32 +108,43 @@ def wrapped_lengths(
         tree_poses(tree, q[n], rotation, translation, axis)
         place_points(routes, rotation, translation, world)
         for s in range(routes.first.shape[0]):
-            m, i, k = routes.muscle[s], routes.first[s], routes.second[s]
-            centre = translation[routes.sphere_joint[s]]
-            lengths[n, m] += segment_length(
-                world[i], world[k], centre, routes.radius[s], leave, arrive
-            )
-            row = jacobian[n, m]
-            push = -(leave + arrive)
-            add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, -1.0, row)
-            add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, -1.0, row)
-            if routes.radius[s] > 0.0:
-                joint = routes.sphere_joint[s]
-                add_torque(tree, translation, axis, joint, centre, push, -1.0, row)
+            m = routes.muscle[s]
+            lengths[n, m] += route_segment(routes, s, rotation, translation, world, leave, arrive)
+            add_pull(tree, routes, s, translation, axis, world, leave, arrive, -1.0, jacobian[n, m])
     return lengths, jacobian
 
 
 @njit(cache=True)
+def route_segment(
+    routes: WrappedRoutes, s: int, rotation: Array, translation: Array, world: Array,
+    leave: Array, arrive: Array,
+) -> float:  # fmt: skip
+    """Return the length of segment s, placed by `place_points`, and fill the unit pulls."""
+    start, end = world[routes.first[s]], world[routes.second[s]]
+    return wrapped_segment(routes.objects, s, rotation, translation, start, end, leave, arrive)
+
+
+@njit(cache=True)
+def add_pull(
+    tree: Tree, routes: WrappedRoutes, s: int, translation: Array, axis: Array, world: Array,
+    leave: Array, arrive: Array, pull: float, torque: Array,
+) -> None:  # fmt: skip
+    """Add what a tension `pull` in segment s does to the joints to torque (J−1,)."""
+    i, k = routes.first[s], routes.second[s]
+    add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, pull, torque)
+    add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, pull, torque)
+    if routes.objects.radius[s] > 0.0:
+        # The wire presses on the object in the lines of its straight parts.
+        joint = routes.objects.joint[s]
+        add_torque(tree, translation, axis, joint, world[i], leave, -pull, torque)
+        add_torque(tree, translation, axis, joint, world[k], arrive, -pull, torque)
+
+
+@njit(cache=True)
 def add_torque(
-    tree: Tree,
-    translation: Array,
-    axis: Array,
-    joint: int,
-    point: Array,
-    force: Array,
-    scale: float,
-    torque: Array,
-) -> None:
+    tree: Tree, translation: Array, axis: Array, joint: int, point: Array, force: Array,
+    scale: float, torque: Array,
+) -> None:  # fmt: skip
     """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
     while joint > 0:
         ax, ay, az = axis[joint]

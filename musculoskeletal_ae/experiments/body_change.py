@@ -30,13 +30,13 @@ def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
     robot, true = study.robot, study.arm(seed).individual
     joint, seen = shoulder(robot), study.rests(seed).tension
-    tension = np.linspace(0.0, robot.tension.max, POINTS)
+    tension = np.linspace(0.0, robot.tension.max.max(), POINTS)
     swept = np.zeros((len(SWEEP), robot.joint_count))
     swept[:, joint] = SWEEP
     stretched = np.repeat(tension[:, None], robot.muscle_count, axis=1)
     # Where something was trained: within the joint's limits, and the tensions of the samples.
     inside = (robot.lower[joint] <= SWEEP) & (robot.upper[joint] >= SWEEP)
-    low, high = (seen.min(), seen.max()) if seen.size else (0.0, robot.tension.limit)
+    low, high = (seen.min(), seen.max()) if seen.size else (0.0, robot.tension.limit.max())
     sweeps = {
         'angle': (np.degrees(SWEEP), inside, swept, np.zeros((len(SWEEP), robot.muscle_count))),
         'tension': (

@@ -77,7 +77,7 @@ class GraspAndCut:
             return
         muscle, elapsed = self.order[place], now - self._motion - SLOT * place
         if np.isnan(self.cut[muscle]):
-            carries = arm.tension[muscle] > self._robot.tension.bias + CARRYING
+            carries = arm.tension[muscle] > self._robot.tension.bias[muscle] + CARRYING
             if elapsed >= LATEST_CUT or (carries and elapsed >= self._wait[muscle]):
                 arm.set_ruptured([self._robot.muscles[muscle]])
                 self.cut[muscle], self.carried[muscle] = time, carries
@@ -194,7 +194,7 @@ def slack_auroc(robot: Robot, mae: Mae, taken: Recording, plan: GraspAndCut) -> 
     part = taken.part(slice(plan.loaded.start, plan.loaded.stop, 10))
     slack = []
     for muscle in range(robot.muscle_count):
-        carried = part.tension[:, muscle] > robot.tension.bias + CARRYING
+        carried = part.tension[:, muscle] > robot.tension.bias[muscle] + CARRYING
         off = part.tension[carried]
         off[:, muscle] = 0.0
         slack.append(size(off, part.length[carried]))

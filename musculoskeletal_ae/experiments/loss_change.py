@@ -85,7 +85,7 @@ def measure(study: Study, seed: int) -> Measured:
 def _command(robot: Robot, mae: Mae, theta: Array) -> Array:
     """Return the lengths that hold a posture, by `proposed` on the learned network."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
-    if limits.limit <= limits.bias:
+    if (limits.limit <= limits.bias).any():
         return geometric_command(robot, theta)
     start = least_tension(robot.routes.muscle_jacobian(theta), torque, limits.bias, limits.limit)
     return proposed(robot, mae, theta, torque, start.tension, limits.limit).length

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from musculoskeletal_ae.experiments.recording import Motion
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -93,8 +94,8 @@ def pictures(
             axes.text2D(0.0, 0.5, name, transform=axes.transAxes, rotation=90, va='center')
         note = f'‖T‖ {np.linalg.norm(motion.tension[step]):.0f} N'
         axes.text2D(0.5, 0.02, note, transform=axes.transAxes, ha='center', fontsize=9)
-    low_n, high_n = robot.tension.bias, robot.tension.limit
+    low_n, high_n = shown(robot.tension.bias), shown(robot.tension.limit)
     figure.suptitle(
-        f'{title}\nmuscles: green at {low_n:g} N, red at {high_n:g} N and above', fontsize=11
+        f'{title}\nmuscles: green at {low_n} N, red at {high_n} N and above', fontsize=11
     )
     return figure

@@ -32,8 +32,7 @@ def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
 def slides(robot: Robot, joint: int) -> bool:
     """Return whether a joint is prismatic, so that its θ is in metres."""
     kin = robot.kinematics
-    tree = [i for i in range(1, len(kin.parent)) if kin.theta_index[i] == joint]
-    return bool(kin.prismatic[tree[0]])
+    return bool(kin.prismatic[kin.tree[joint]])
 
 
 def plotted(robot: Robot, joint: int) -> tuple[float, str]:

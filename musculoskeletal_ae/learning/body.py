@@ -32,7 +32,6 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
@@ -54,6 +53,14 @@ class Layout:
         self.friction, self.offset = end + 3, end + 4  # μ; o [m]
         self.size = end + 5 + features
         self.rest = slice(end + 5, self.size)  # v [m]
+
+
+class Poses(NamedTuple):
+    """Of pinocchio's joints in the root link's frame, and what wrapping adds to straight lines."""
+
+    rotation: Array  # (N, J, 3, 3)
+    translation: Array  # [m], (N, J, 3)
+    detour: Array  # of the nominal body [m], (N, M)
 
 
 class CorrectedBody:
@@ -94,11 +101,13 @@ class CorrectedBody:
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
-    def poses(self, theta: Array) -> JointPoses:
+    def poses(self, theta: Array) -> Poses:
         """Return the joint poses of θ (N, D) and, in the last place, of θ = 0."""
-        return self.robot.kinematics.joint_poses(np.vstack([theta, np.zeros(theta.shape[1])]))
+        theta, robot = np.vstack([theta, np.zeros(theta.shape[1])]), self.robot
+        at = robot.kinematics.joint_poses(theta)
+        return Poses(at.rotation, at.translation, robot.routes.detours(theta))
 
-    def _world(self, poses: JointPoses, m: int) -> tuple[Array, Array]:
+    def _world(self, poses: Poses, m: int) -> tuple[Array, Array]:
         """Return the route's points in the root link's frame, and how their links are turned."""
         layout, routes = self.layouts[m], self.robot.routes
         joint = routes.joint[layout.points]
@@ -123,6 +132,7 @@ class CorrectedBody:
         for m, layout in enumerate(self.layouts):
             world, _ = self._world(poses, m)
             absolute = np.linalg.norm(world[:, 1:] - world[:, :-1], axis=-1).sum(axis=1)
+            absolute += poses.detour[:, m]
             absolute, at_zero = absolute[:-1], absolute[-1]
             fixed = absolute - at_zero + self.parameters[m][layout.offset]
             fixed += self._smooth(theta, m) @ self.parameters[m][layout.rest]
@@ -133,7 +143,7 @@ class CorrectedBody:
         return result
 
     def linearised(
-        self, poses: JointPoses, theta: Array, tension: Array, direction: Array, m: int
+        self, poses: Poses, theta: Array, tension: Array, direction: Array, m: int
     ) -> tuple[Array, Array]:
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
@@ -148,7 +158,8 @@ class CorrectedBody:
         pull[:, 1:] += along
         pull[:, :-1] -= along
         by_point = (pull[:, :, None] @ turn).reshape(len(world), -1)
-        absolute, at_zero = norm[:-1].sum(axis=1), norm[-1].sum()
+        whole = norm.sum(axis=1) + poses.detour[:, m]
+        absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)
         end = np.maximum(tension * np.exp(-self.friction(m) * direction), 0.0)
         smooth = self._smooth(theta, m)
@@ -251,7 +262,7 @@ def fit_body(
 
 def _fit_muscle(
     body: CorrectedBody,
-    poses: JointPoses,
+    poses: Poses,
     seen: Observations,
     used: Bools,
     mean: Array,

@@ -57,12 +57,12 @@ def random_states(
     count: int,
     rng: np.random.Generator,
     highest: Array | float,
-    lowest: float = 0.0,
+    lowest: Array | float = 0.0,
     margin: float = 0.0,
 ) -> State:
     """Return random states of the geometric model, T_r uniform from lowest to highest [N].
 
-    The highest tension is one for all or of shape (count, 1); margin is the reach of θ_r beyond
+    The highest tension is one for all, (M,) or (count, M); margin is the reach of θ_r beyond
     each joint limit, as a share of the range.
     """
     theta = robot.random_postures(count, rng, margin)
@@ -77,10 +77,10 @@ def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Return tension.limit (count, 1) [N], or in some rows more, up to tension.max."""
+    """Return tension.limit (count, M) [N], or in some rows more, up to tension.max."""
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
-    return np.where(overloaded, rng.uniform(limit, most, (count, 1)), limit)
+    return np.where(overloaded, limit + (most - limit) * rng.uniform(size=(count, 1)), limit)
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:

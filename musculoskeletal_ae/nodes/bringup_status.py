@@ -116,8 +116,9 @@ def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> An
         table.add_column(title, justify='left' if title in ('muscle', '') else 'right')
     for m, name in enumerate(robot.muscles if states is not None else ()):
         length, tension, temperature = states[:, m]  # type: ignore[index]
-        colour = 'blue' if tension < robot.tension.limit else 'dark_orange'
-        bar = Bar(robot.tension.limit, 0.0, max(tension, 0.0), width=30, color=colour)
+        limit = float(robot.tension.limit[m])
+        colour = 'blue' if tension < limit else 'dark_orange'
+        bar = Bar(limit, 0.0, max(tension, 0.0), width=30, color=colour)
         table.add_row(name, f'{1e3 * length:.0f}', f'{tension:.0f}', bar, f'{temperature:.0f}')
     texts = [Text(printable(lines[0])), Text(printable(lines[1]), style='bold red')]
     return Group(*filter(None, texts), table)

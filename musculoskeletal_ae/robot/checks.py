@@ -31,7 +31,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
-from musculoskeletal_ae.robot.description import RobotDescription
+from musculoskeletal_ae.robot.description import RobotDescription, shown
 from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
@@ -245,7 +245,7 @@ def _holding_faults(
         yield Finding(
             'not_held',
             f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
-            f'weight with T in [{robot.tension.bias:g}, {robot.tension.limit:g}] N, '
+            f'weight with T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N, '
             f'{required}; of the {len(lack)} others torque lacks most at {where}',
             'lengthen the moment arms of the muscles at these joints, raise tension.limit '
             'or lighten the links',

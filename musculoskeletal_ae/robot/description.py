@@ -8,8 +8,10 @@ legal values in the message, so that no later code needs to check again.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,22 +21,49 @@ from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.entries import Entry, refusal
+from musculoskeletal_ae.robot.kinematics import Coupling, resolved
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.robot.urdf import read_urdf
+from musculoskeletal_ae.robot.urdf import read_mimics, read_urdf
 
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
 
-#: points (link, xyz in the link's frame [m]), joined by straight lines
-Route = tuple[tuple[str, Array], ...]
+TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
+
+
+class RoutePoint(NamedTuple):
+    """A point that the wire passes."""
+
+    link: str
+    xyz: Array  # in the link's frame [m], (3,)
+
+
+class Wrap(NamedTuple):
+    """What the wire may wrap round between two points; vectors in the link's frame, (3,)."""
+
+    link: str
+    xyz: Array  # centre [m]
+    radius: float  # [m]
+    axis: Array | None  # unit vector of a cylinder; None: a sphere
+    side: Array | None  # a point on the side that the wire takes [m]; inside: a ring
+
+
+#: points, joined by straight lines or round a wrap that stands between two of them
+Route = tuple[RoutePoint | Wrap, ...]
 
 
 @dataclass(frozen=True)
 class TensionRange:
-    """Muscle tensions of the robot [N]."""
+    """Muscle tensions [N], each of shape (M,)."""
 
-    bias: float = 30.0  # what MSC keeps
-    limit: float = 200.0  # the highest planned
-    max: float = 500.0  # the highest ever
+    bias: Array  # what MSC keeps
+    limit: Array  # the highest planned
+    max: Array  # the highest ever
+
+
+def shown(values: Array) -> str:
+    """Return the one value of all muscles, or the span of their values."""
+    low, high = np.min(values), np.max(values)
+    return f'{low:g}' if low == high else f'{low:g}–{high:g}'
 
 
 @dataclass(frozen=True)
@@ -48,9 +77,22 @@ class RobotDescription:
     muscles: tuple[str, ...]  # in the order of T and l
     routes: tuple[Route, ...]  # one for each muscle
     series_elastic: SeriesElastic
-    stiffness: float  # K_stiff of muscle stiffness control [N/m]
+    stiffness: Array  # K_stiff of muscle stiffness control [N/m], (M,)
     tension: TensionRange
-    end_effector: str  # link that grasps, is pushed and carries the marker
+    end_effectors: tuple[str, ...]  # the first grasps, is pushed and carries the marker
+    couplings: dict[str, Coupling]  # of joints that follow others
+    warnings: tuple[str, ...]  # what was accepted, but deserves a look
+
+    @property
+    def end_effector(self) -> str:
+        """The link that grasps, is pushed and carries the marker."""
+        return self.end_effectors[0]
+
+    @property
+    def held_joints(self) -> tuple[str, ...]:
+        """Movable joints of the URDF that are in neither θ nor a coupling to it: held fixed."""
+        moving = {slave for slave, c in self.couplings.items() if c.master in self.joints}
+        return tuple(n for n in self.model.names[1:] if n not in moving | set(self.joints))
 
     @property
     def root_link(self) -> str:
@@ -69,18 +111,24 @@ def load_description(robot: str | Path) -> RobotDescription:
     urdf = read_text(urdf_file, refusal)
     model = read_urdf(urdf_file, urdf)
     top = Entry(muscle_file, read_yaml(muscle_file, refusal), 'top level', '').mapping(
-        'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector'
-    )
+        'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector',
+        'end_effectors', 'couplings',
+    )  # fmt: skip
     joints = _read_joints(top['joints'], model)
+    couplings = _read_couplings(top, read_mimics(urdf_file, urdf), joints, model)
     default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
     links = [str(frame.name) for frame in _links(model)]
-    names, routes, elastic = [], [], []
+    stiffness = top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0)
+    tension = _read_tension(top.get('tension', {}), TENSION_DEFAULT)
+    names, routes, elastic, module, warnings = [], [], [], [], list[str]()
     for item in top['muscles'].items(1, 'muscles'):
-        entry = item.mapping('name', 'route', 'series_elastic')
+        entry = item.mapping('name', 'route', 'series_elastic', 'stiffness', 'tension')
         names.append(entry['name'].name())
         muscle = entry.called(f'muscle {names[-1]!r}')
-        routes.append(_read_route(muscle['route'], links))
+        routes.append(_read_route(muscle['route'], links, warnings))
         elastic.append(_read_elastic(muscle.get('series_elastic'), default))
+        own = _read_tension(muscle.get('tension', {}), tension)
+        module.append(own | {'K': muscle.get('stiffness', stiffness).number(above=0.0)})
     return RobotDescription(
         directory=directory,
         urdf=urdf,
@@ -88,11 +136,17 @@ def load_description(robot: str | Path) -> RobotDescription:
         joints=joints,
         muscles=top['muscles'].unique(names),
         routes=tuple(routes),
-        series_elastic=SeriesElastic(**{k: np.array([row[k] for row in elastic]) for k in default}),
-        stiffness=top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0),
-        tension=_read_tension(top.get('tension', {})),
-        end_effector=_read_end_effector(top.get('end_effector'), model, joints),
+        series_elastic=SeriesElastic(**_columns(elastic, default)),
+        stiffness=_columns(module, 'K')['K'],
+        tension=TensionRange(**_columns(module, TENSION_DEFAULT)),
+        end_effectors=_read_end_effectors(top, model, joints),
+        couplings=couplings,
+        warnings=tuple(warnings),
     )
+
+
+def _columns(rows: list[dict[str, float]], keys: Iterable[str]) -> dict[str, Array]:
+    return {key: np.array([row[key] for row in rows]) for key in keys}
 
 
 def _links(model: pin.Model) -> list[pin.Frame]:
@@ -101,17 +155,8 @@ def _links(model: pin.Model) -> list[pin.Frame]:
 
 def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
     names = [item.name() for item in entry.items(1, 'names')]
-    movable = list(model.names)[1:]
     for name in entry.unique(names):
-        if name not in movable:
-            legal = ', '.join(movable)
-            raise entry.fail(f'unknown joint {name!r}; movable joints of robot.urdf: {legal}')
-        joint = model.joints[model.getJointId(name)]
-        if joint.shortname() not in kinematics.REVOLUTE + kinematics.PRISMATIC:
-            raise entry.fail(
-                f'joint {name!r} is a {joint.shortname()}; legal: revolute or prismatic joints '
-                'with one degree of freedom and limits (continuous has none)'
-            )
+        joint = _one_axis_joint(entry, name, model)
         lower = model.lowerPositionLimit[joint.idx_q]
         upper = model.upperPositionLimit[joint.idx_q]
         if not -math.inf < lower < upper < math.inf:
@@ -120,6 +165,47 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
                 'expected finite lower < upper'
             )
     return tuple(names)
+
+
+def _one_axis_joint(entry: Entry, name: str, model: pin.Model) -> pin.JointModel:
+    if name not in list(model.names)[1:]:
+        legal = ', '.join(list(model.names)[1:])
+        raise entry.fail(f'unknown joint {name!r}; movable joints of robot.urdf: {legal}')
+    joint = model.joints[model.getJointId(name)]
+    if joint.shortname() not in kinematics.REVOLUTE + kinematics.PRISMATIC:
+        raise entry.fail(
+            f'joint {name!r} is a {joint.shortname()}; legal: revolute or prismatic joints '
+            'with one degree of freedom and limits (continuous has none)'
+        )
+    return joint
+
+
+def _read_couplings(
+    top: Entry, mimics: dict[str, Coupling], joints: tuple[str, ...], model: pin.Model
+) -> dict[str, Coupling]:
+    """Return what each coupled joint follows, a joint that follows none itself."""
+    entry, links, names = top.get('couplings', []), dict(mimics), list[str]()
+    for item in entry.items(0, 'couplings'):
+        given = item.mapping('joint', 'master', 'ratio', 'offset')
+        names.append(given['joint'].name())
+        ratio, offset = given.get('ratio', 1.0).number(), given.get('offset', 0.0).number()
+        links[names[-1]] = Coupling(given['master'].name(), ratio, offset)
+    entry.unique(names)
+    for slave in links:
+        _one_axis_joint(entry, slave, model)
+        if slave in joints:
+            source = 'couplings' if slave in names else 'its <mimic> in robot.urdf'
+            raise entry.fail(
+                f'joint {slave!r} follows {links[slave].master!r} by {source}; '
+                'list only joints that follow none under joints'
+            )
+    try:
+        couplings = resolved(links)
+    except ValueError as error:
+        raise entry.fail(str(error)) from error
+    for coupling in couplings.values():
+        _one_axis_joint(entry, coupling.master, model)
+    return couplings
 
 
 def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
@@ -134,19 +220,55 @@ def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _read_route(entry: Entry, links: list[str]) -> Route:
-    points: list[tuple[str, Array]] = []
+def _read_route(entry: Entry, links: list[str], warnings: list[str]) -> Route:
+    route: list[RoutePoint | Wrap] = []
     for item in entry.items(2, 'points'):
-        point = item.mapping('link', 'xyz')
-        link = _read_link(point['link'], links)
-        xyz = point['xyz'].items(3, 'numbers')
-        if len(xyz) != 3:
-            raise point['xyz'].fail(f'expected 3 numbers, got {len(xyz)}')
-        position = np.array([coordinate.number() for coordinate in xyz])
-        if points and points[-1][0] == link and np.array_equal(points[-1][1], position):
-            raise point.fail('is the same point as the one before it')
-        points.append((link, position))
-    return tuple(points)
+        if isinstance(item.value, dict) and 'wrap' in item.value:
+            route.append(_read_wrap(item, links))
+            if len(route) < 2 or isinstance(route[-2], Wrap):
+                raise item.fail('a wrap stands between two points')
+            continue
+        given = item.mapping('link', 'xyz')
+        point = RoutePoint(_read_link(given['link'], links), _read_vector(given['xyz']))
+        last = route[-1] if route and isinstance(route[-1], RoutePoint) else None
+        if last and last.link == point.link and np.array_equal(last.xyz, point.xyz):
+            warnings.append(f'{item.where} is the same point as the one before it, and left out')
+            continue
+        route.append(point)
+    if isinstance(route[-1], Wrap):
+        raise entry.fail('a wrap stands between two points')
+    if len(route) < 2:
+        raise entry.fail(f'expected at least 2 different points, {len(route)} given')
+    return tuple(route)
+
+
+def _read_wrap(item: Entry, links: list[str]) -> Wrap:
+    kinds = {'sphere': (), 'cylinder': ('axis',)}
+    if (kind := item['wrap'].name()) not in kinds:
+        raise item['wrap'].fail(f'expected {" or ".join(kinds)}, got {kind!r}')
+    given = item.mapping('wrap', 'link', 'xyz', *kinds[kind], 'radius', 'side')
+    axis = side = None
+    if kind == 'cylinder':
+        axis = _read_vector(given['axis'])
+        if (size := float(np.linalg.norm(axis))) < 1e-6:
+            raise given['axis'].fail(f'expected a direction, got {axis.tolist()}')
+        axis = axis / size
+    xyz = _read_vector(given['xyz'])
+    if given.get('side').value is not None:
+        side = _read_vector(given['side'])
+    radius = given['radius'].number(above=0.0)
+    if axis is not None and side is not None:
+        out = side - xyz
+        if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
+            raise given['side'].fail('expected a point beside the axis, got one on it')
+    return Wrap(_read_link(given['link'], links), xyz, radius, axis, side)
+
+
+def _read_vector(entry: Entry) -> Array:
+    xyz = entry.items(3, 'numbers')
+    if len(xyz) != 3:
+        raise entry.fail(f'expected 3 numbers, got {len(xyz)}')
+    return np.array([coordinate.number() for coordinate in xyz])
 
 
 def _read_link(entry: Entry, links: list[str]) -> str:
@@ -156,21 +278,26 @@ def _read_link(entry: Entry, links: list[str]) -> str:
     return name
 
 
-def _read_tension(entry: Entry) -> TensionRange:
-    default = asdict(TensionRange())
+def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     given = entry.mapping(*default)
     bias, limit, most = (given.get(key, default[key]).number(above=0.0) for key in default)
     if not bias < limit <= most:
         raise entry.fail(f'expected bias < limit <= max, got {bias:g}, {limit:g}, {most:g}')
-    return TensionRange(bias, limit, most)
+    return {'bias': bias, 'limit': limit, 'max': most}
 
 
-def _read_end_effector(entry: Entry, model: pin.Model, joints: tuple[str, ...]) -> str:
-    if entry.value is not None:
-        return _read_link(entry, [frame.name for frame in _links(model)])
+def _read_end_effectors(top: Entry, model: pin.Model, joints: tuple[str, ...]) -> tuple[str, ...]:
+    one, several = top.get('end_effector'), top.get('end_effectors')
+    links = [str(frame.name) for frame in _links(model)]
+    if one.value is not None and several.value is not None:
+        raise several.fail('expected end_effector or end_effectors, both are given')
+    if one.value is not None:
+        return (_read_link(one, links),)
+    if several.value is not None:
+        return several.unique([_read_link(item, links) for item in several.items(1, 'links')])
     # The last link of the chain: the one with the most of our joints above it, and of several
     # on the same joint the one listed last.
     depth = [0]
     for i in range(1, model.njoints):
         depth.append(depth[model.parents[i]] + (model.names[i] in joints))
-    return str(max(reversed(_links(model)), key=lambda link: depth[link.parentJoint]).name)
+    return (str(max(reversed(_links(model)), key=lambda link: depth[link.parentJoint]).name),)

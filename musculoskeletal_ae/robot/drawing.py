@@ -42,22 +42,19 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
     Route points [m] (P, 3) are those of the geometric model by default.
     """
-    kin, routes = robot.kinematics, robot.routes
-    if points is None:
-        points = routes.points(theta[None])[0]
+    kin = robot.kinematics
     origins = kin.joint_poses(theta[None]).translation[0]
-    tip = kin.end_effector_pose(theta).translation
     bones = [np.stack([origins[kin.parent[i]], origins[i]]) for i in range(1, len(origins))]
-    last = int(kin.model.frames[kin.end_effector_frame].parentJoint)
-    bones.append(np.stack([origins[last], tip]))
+    for link in robot.description.end_effectors:
+        tip = kin.link_pose(theta, link).translation
+        bones.append(np.stack([origins[kin.placement(link)[0]], tip]))
     lines = [
         Line('bones', bone, BONE_WIDTH, BONE_COLOUR)
         for bone in bones
         if np.linalg.norm(bone[1] - bone[0]) > SHORTEST_BONE
     ]
-    for m, share in enumerate(tension_share(robot, tension).tolist()):
-        own = np.flatnonzero(routes.muscle == m)
-        route = points[np.append(routes.first[own], routes.second[own[-1]])]
+    shares = tension_share(robot, tension).tolist()
+    for share, route in zip(shares, robot.routes.drawn(theta, points), strict=True):
         lines.append(Line('muscles', route, MUSCLE_WIDTH, (share, 1.0 - share, 0.0)))
     return lines
 

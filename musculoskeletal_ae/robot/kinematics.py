@@ -8,11 +8,14 @@ of a joint in its parent is its fixed placement times, by Rodrigues,
     exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
 
 or 1 + θ a for one that slides: a sum of constant matrices, the same operation for every joint.
+
+A coupled joint of the tree turns by q = ratio · θ_master + offset. With A = ∂q/∂θ, what pinocchio
+says of all joints of the tree becomes Aᵀ g, Aᵀ M A and J A.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,21 +35,66 @@ class JointPoses(NamedTuple):
     axis: Array  # (N, J, 3); zero at index 0
 
 
+class Coupling(NamedTuple):
+    """A joint that follows another: q = ratio · θ_master + offset."""
+
+    master: str  # a joint that follows none
+    ratio: float
+    offset: float  # [rad] or [m]
+
+
+def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
+    """Return couplings to joints that follow none; a ValueError names one that follows itself."""
+    result = {}
+    for slave, (master, ratio, offset) in couplings.items():
+        seen = {slave}
+        while master in couplings:
+            if master in seen:
+                told = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
+                raise ValueError(told)
+            seen.add(master)
+            master, gear, shift = couplings[master]
+            ratio, offset = ratio * gear, ratio * shift + offset
+        result[slave] = Coupling(master, ratio, offset)
+    return result
+
+
+def joint_axis(joint: pin.JointModel) -> Array:
+    """Return the axis (3,) of a revolute or prismatic joint."""
+    data = joint.createData()
+    joint.calc(data, np.zeros(joint.idx_q + 1))
+    return np.ravel(data.S).reshape(2, 3)[0 if joint.shortname() in PRISMATIC else 1]
+
+
 class Kinematics:
     """Rigid-body side of a robot: link poses, gravity torque and end-effector Jacobian."""
 
-    def __init__(self, full_model: pin.Model, joints: Sequence[str], end_effector: str) -> None:
-        """Keep D joints of a URDF's model, in the order of θ; lock all others at zero."""
-        locked = [
-            full_model.getJointId(name) for name in full_model.names[1:] if name not in joints
-        ]
-        self.model = pin.buildReducedModel(full_model, locked, pin.neutral(full_model))
+    def __init__(
+        self,
+        full_model: pin.Model,
+        joints: Sequence[str],
+        end_effector: str,
+        couplings: Mapping[str, Coupling] | None = None,
+    ) -> None:
+        """Keep D joints of a URDF's model, in the order of θ, and what follows them.
+
+        All others are locked at zero, or where they are when their master is.
+        """
+        couplings = couplings or {}
+        followers = [name for name, coupling in couplings.items() if coupling.master in joints]
+        kept, still = [*joints, *followers], pin.neutral(full_model)
+        for name, coupling in couplings.items():
+            if name not in followers:
+                still[full_model.joints[full_model.getJointId(name)].idx_q] = coupling.offset
+        locked = [full_model.getJointId(name) for name in full_model.names[1:] if name not in kept]
+        self.model = pin.buildReducedModel(full_model, locked, still)
         self.data = self.model.createData()
         ids = [self.model.getJointId(name) for name in joints]
         #: index into pinocchio's q and v for each entry of θ
         self.order = np.array([self.model.joints[i].idx_q for i in ids])
         self.lower: Array = self.model.lowerPositionLimit[self.order].copy()
         self.upper: Array = self.model.upperPositionLimit[self.order].copy()
+        self._end_effector = end_effector
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
         count = self.model.njoints
         self.parent = np.array(self.model.parents)
@@ -58,31 +106,49 @@ class Kinematics:
         self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])
         self._first, self._second = np.zeros((2, count, 4, 4))
         for i, turn in enumerate(self.placement_rotation[1:], 1):
-            joint = self.model.joints[i].createData()
-            self.model.joints[i].calc(joint, pin.neutral(self.model))
-            axis = np.ravel(joint.S).reshape(2, 3)[0 if self.prismatic[i] else 1]
+            axis = joint_axis(self.model.joints[i])
             self.local_axis[i], cross = axis, pin.skew(axis)
             if self.prismatic[i]:
                 self._first[i, :3, 3] = turn @ axis
             else:
                 self._first[i, :3, :3], self._second[i, :3, :3] = turn @ cross, turn @ cross @ cross
-        #: position in θ of joint i of pinocchio's tree
+        #: joints of pinocchio's tree: those of θ in its order, then the coupled ones
+        self.tree = np.array([*ids, *(self.model.getJointId(name) for name in followers)])
+        #: position in θ of joint i of the tree, and q_i = ratio · θ + offset, each (J,)
         self.theta_index = np.full(count, -1)
+        self.ratio, self.offset = np.ones(count), np.zeros(count)
         self.theta_index[ids] = np.arange(len(ids))
-        #: moved_by[i, k]: joint i of the tree hangs on joint k of θ
-        self.moved_by = np.zeros((count, len(ids)), dtype=bool)
+        for name in followers:
+            i, coupling = self.model.getJointId(name), couplings[name]
+            self.theta_index[i] = list(joints).index(coupling.master)
+            self.ratio[i], self.offset[i] = coupling.ratio, coupling.offset
+        #: A = ∂q/∂θ (J−1, D), rows in the order of the tree; None where every joint is its own
+        self.transmission: Array | None = None
+        if followers:
+            self.transmission = np.zeros((count - 1, len(ids)))
+            self.transmission[np.arange(count - 1), self.theta_index[1:]] = self.ratio[1:]
+        #: hangs_on[i, j]: joint i of the tree is or hangs on joint j of the tree
+        self.hangs_on = np.eye(count, dtype=bool)
         for i in range(1, count):
-            self.moved_by[i] = self.moved_by[self.parent[i]]
-            self.moved_by[i, self.theta_index[i]] = True
+            self.hangs_on[i] |= self.hangs_on[self.parent[i]]
+        #: moved_by[i, k]: joint i of the tree hangs on joint k of θ, or on one that follows it
+        self.moved_by = np.zeros((count, len(ids)), dtype=bool)
+        for j in range(1, count):
+            self.moved_by[:, self.theta_index[j]] |= self.hangs_on[:, j]
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
         """Return the joint of the tree that carries a link's point, and the point in its frame."""
+        joint, placement = self.placement(link)
+        return joint, placement.act(xyz)
+
+    def placement(self, link: str) -> tuple[int, pin.SE3]:
+        """Return the joint of the tree that carries a link, and the link's pose in its frame."""
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
-        return frame.parentJoint, frame.placement.act(xyz)
+        return frame.parentJoint, frame.placement
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
-        angle = theta[:, self.theta_index[1:], None, None]
+        angle = self.tree_angles(theta)[:, :, None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
             slides = self.prismatic[1:, None, None]
@@ -107,25 +173,37 @@ class Kinematics:
         axis = np.einsum('njab,jb->nja', rotation, self.local_axis)
         return JointPoses(rotation, poses[..., :3, 3], axis)
 
-    def _q(self, theta: Array) -> Array:
-        q = np.empty(self.model.nq)
-        q[self.order] = theta
-        return q
+    def tree_angles(self, theta: Array) -> Array:
+        """Return q (..., J−1) of the tree's joints in pinocchio's order; θ (..., D)."""
+        q: Array = theta[..., self.theta_index[1:]]
+        return q if self.transmission is None else self.ratio[1:] * q + self.offset[1:]
+
+    def of_theta(self, values: Array) -> Array:
+        """Return what belongs to θ (..., D) of torques or derivatives for q (..., J−1)."""
+        if self.transmission is None:
+            mine: Array = values[..., self.order]
+            return mine
+        return values @ self.transmission
 
     def holding_torque(self, theta: Array) -> Array:
         """Return g(θ), the joint torque that holds the arm's own weight [N·m], shape (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.holding_torque(row) for row in theta])
-        return pin.computeGeneralizedGravity(self.model, self.data, self._q(theta))[self.order]
+        return self.of_theta(
+            pin.computeGeneralizedGravity(self.model, self.data, self.tree_angles(theta))
+        )
 
     def gravity_gradient(self, theta: Array) -> Array:
         """Return ∂g/∂θ [N·m/rad], shape (D, D), at θ (D,)."""
-        gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, self._q(theta))
-        return gradient[np.ix_(self.order, self.order)]
+        q = self.tree_angles(theta)
+        gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
+        return self.of_theta(self.of_theta(gradient).T).T
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
-        return np.diag(pin.crba(self.model, self.data, self._q(theta)))[self.order]
+        upper = np.triu(pin.crba(self.model, self.data, self.tree_angles(theta)))
+        inertia = upper + np.triu(upper, 1).T
+        return np.diag(self.of_theta(self.of_theta(inertia).T))
 
     def end_effector_jacobian(self, theta: Array) -> Array:
         """Return J (6, D): rows linear [m/rad] then angular, at the end effector's origin.
@@ -133,11 +211,16 @@ class Kinematics:
         Axes are those of the root link, so a wrench F there is the joint torque Jᵀ F.
         """
         axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        q, frame = self._q(theta), self.end_effector_frame
+        q, frame = self.tree_angles(theta), self.end_effector_frame
         jacobian = pin.computeFrameJacobian(self.model, self.data, q, frame, axes)
-        return jacobian.reshape(6, -1)[:, self.order]
+        return self.of_theta(jacobian.reshape(6, -1))
+
+    def link_pose(self, theta: Array, link: str) -> pin.SE3:
+        """Return the pose of a link in the root link's frame."""
+        frame = self.model.getFrameId(link, pin.FrameType.BODY)
+        pin.forwardKinematics(self.model, self.data, self.tree_angles(theta))
+        return pin.updateFramePlacement(self.model, self.data, frame).copy()
 
     def end_effector_pose(self, theta: Array) -> pin.SE3:
         """Return the pose of the end effector in the root link's frame."""
-        pin.forwardKinematics(self.model, self.data, self._q(theta))
-        return pin.updateFramePlacement(self.model, self.data, self.end_effector_frame).copy()
+        return self.link_pose(theta, self._end_effector)

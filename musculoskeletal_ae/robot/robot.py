@@ -27,7 +27,9 @@ class Robot:
         self.tension = description.tension
         self.stiffness = description.stiffness
         self.root_link = description.root_link
-        self.kinematics = Kinematics(description.model, self.joints, description.end_effector)
+        self.kinematics = Kinematics(
+            description.model, self.joints, description.end_effector, description.couplings
+        )
         self.routes = Routes(self.kinematics, description.routes)
         #: joint limits [rad], (D,)
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper

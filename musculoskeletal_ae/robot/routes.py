@@ -1,24 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscle lengths and the muscle Jacobian of straight-line routes.
+"""Muscle lengths and the muscle Jacobian of routes: straight lines, and wires that wrap.
 
     f_geo,abs(θ) = Σ over the route of |p_{i+1}(θ) − p_i(θ)|
     f_geo(θ)     = f_geo,abs(θ) − f_geo,abs(0)
     G(θ)         = ∂f_geo/∂θ
 
 (paper, section "Initial Training": start, relay and end points linearly connected.) G follows from
-the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines between them.
+the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines between them. Of a
+segment that may wrap round a sphere or cylinder (`wrapping`) it is the velocity of the end points
+as seen from that object's link, projected on the directions in which the wire leaves them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 
+if TYPE_CHECKING:
+    from musculoskeletal_ae.robot.wrapping import WrapObjects
+
+ARC = 9  # points of a wrapped wire's arc that are drawn
 # Bounds the memory of one batched evaluation to a few tens of megabytes.
 CHUNK = 4096
 
@@ -37,38 +46,101 @@ def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Ar
 
 
 class Routes:
-    """The routes of M muscles over D joints as functions of θ: P points, S straight segments."""
+    """The routes of M muscles over D joints as functions of θ: P points, S segments."""
 
-    def __init__(
-        self, kinematics: Kinematics, routes: Sequence[Sequence[tuple[str, Array]]]
-    ) -> None:
-        """Attach routes to the tree, for each muscle its points (link, xyz in its frame [m])."""
+    def __init__(self, kinematics: Kinematics, routes: Sequence[Route]) -> None:
+        """Attach the routes of a description to the tree."""
         self._kinematics = kinematics
-        attached = [kinematics.attach(link, xyz) for route in routes for link, xyz in route]
+        pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
+        attached = [kinematics.attach(*point) for points in pieces for point in points]
         #: joint of the tree that carries each point, (P,), and the point in its frame [m], (P, 3)
         self.joint = np.array([joint for joint, _ in attached])
         self.point: Array = np.array([point for _, point in attached], dtype=float)
-        owner = np.repeat(np.arange(len(routes)), [len(route) for route in routes])
+        owner = np.repeat(np.arange(len(pieces)), [len(points) for points in pieces])
         #: points where each segment starts and ends, and its muscle, (S,)
         self.first = np.flatnonzero(owner[:-1] == owner[1:])
         self.second, self.muscle = self.first + 1, owner[self.first]
         self._sum: Array = 1.0 * (np.arange(len(routes))[:, None] == self.muscle)
+        #: segments that may wrap, and round what
+        self.wrapping, self.objects = self._attach_objects(routes)
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
+
+    def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
+        segment, wraps = -1, list[tuple[int, Wrap]]()
+        for route in routes:
+            for item, after in pairwise(route):
+                # A segment is counted where it begins, at a point.
+                segment += isinstance(item, RoutePoint)
+                if isinstance(after, Wrap):
+                    wraps.append((segment, after))
+        if not wraps:
+            return np.zeros(0, dtype=int), None
+        # Only here, so that an arm of straight lines does not wait for numba.
+        from musculoskeletal_ae.robot.wrapping import place_objects
+
+        objects = place_objects(self._kinematics, [wrap for _, wrap in wraps])
+        return np.array([segment for segment, _ in wraps]), objects
+
+    def _wrapped(self, poses: JointPoses, points: Array) -> tuple[Array, Array, Array]:
+        """Return lengths (N, W) and pulls (N, W, 3) of the segments that may wrap."""
+        from musculoskeletal_ae.robot.wrapping import wrapped_segments
+
+        assert self.objects is not None  # asked by all callers
+        start, end = points[:, self.first[self.wrapping]], points[:, self.second[self.wrapping]]
+        turned, moved = (np.ascontiguousarray(part) for part in poses[:2])
+        return wrapped_segments(self.objects, turned, moved, start, end)
+
+    def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
+        """Return each muscle at θ (D,) as a polyline with its arcs, (K, 3) [m]; see `points`."""
+        poses = self._kinematics.joint_poses(theta[None])
+        points = self.placed(poses)[0] if points is None else points
+        arcs = {}
+        if self.objects is not None:
+            from musculoskeletal_ae.robot.wrapping import touched
+
+            at = np.ascontiguousarray(poses.rotation[0]), poses.translation[0].copy()
+            for i, s in enumerate(self.wrapping.tolist()):
+                ends = points[self.first[s]], points[self.second[s]]
+                arcs[s] = touched(self.objects, i, ARC, *at, *ends)
+        lines = []
+        for m in range(len(self._sum)):
+            own = np.flatnonzero(self.muscle == m)
+            parts = [points[self.first[own[:1]]]]
+            for s in own.tolist():
+                parts += [arcs.get(s, points[:0]), points[self.second[s], None]]
+            lines.append(np.concatenate(parts))
+        return lines
 
     def points(self, theta: Array) -> Array:
         """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
-        return self._points(self._kinematics.joint_poses(theta))
+        return self.placed(self._kinematics.joint_poses(theta))
 
-    def _points(self, poses: JointPoses) -> Array:
+    def placed(self, poses: JointPoses, point: Array | None = None) -> Array:
+        """Return route points, or other ones (P, 3) on the same links, for poses, (N, P, 3)."""
         rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
-        return np.einsum('npij,pj->npi', rotation, self.point) + translation
+        point = self.point if point is None else point
+        return np.einsum('npij,pj->npi', rotation, point) + translation
+
+    def _segments(self, theta: Array) -> tuple[Array, Array]:
+        """Return lengths (N, S) of the segments, and of the straight lines between their ends."""
+        poses = self._kinematics.joint_poses(theta)
+        points = self.placed(poses)
+        straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
+        if self.objects is None:
+            return straight, straight
+        lengths = straight.copy()
+        lengths[:, self.wrapping] = self._wrapped(poses, points)[0]
+        return lengths, straight
 
     @_in_chunks
     def absolute_lengths(self, theta: Array) -> Array:
         """Return f_geo,abs(θ) [m]: θ (..., D) gives (..., M)."""
-        points = self.points(theta)
-        segment = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
-        return segment @ self._sum.T
+        return self._segments(theta)[0] @ self._sum.T
+
+    @_in_chunks
+    def detours(self, theta: Array) -> Array:
+        """Return what wrapping adds to straight lines [m]: θ (..., D) gives (..., M)."""
+        return np.subtract(*self._segments(theta)) @ self._sum.T
 
     def relative_lengths(self, theta: Array) -> Array:
         """Return f_geo(θ) [m], zero at θ = 0: θ (..., D) gives (..., M)."""
@@ -79,16 +151,28 @@ class Routes:
         """Return G(θ) [m/rad]: θ (..., D) gives (..., M, D)."""
         kin = self._kinematics
         poses = kin.joint_poses(theta)
-        points = self._points(poses)
+        points = self.placed(poses)
         line = points[:, self.second] - points[:, self.first]
         norm = np.linalg.norm(line, axis=-1, keepdims=True)
         direction = np.divide(line, norm, out=np.zeros_like(line), where=norm > 0.0)
-        jacobian = np.empty((len(theta), len(self._sum), theta.shape[1]))
+        if self.objects is not None:
+            wraps, link = self.wrapping, self.objects.joint
+            _, leave, arrive = self._wrapped(poses, points)
+            ends = self.first[wraps], self.second[wraps]
+            direction[:, wraps] = 0.0
+        jacobian = np.zeros((len(theta), len(self._sum), theta.shape[1]))
         for i in range(1, len(kin.parent)):
             k = kin.theta_index[i]
             axis, origin = poses.axis[:, i, None], poses.translation[:, i, None]
             motion = axis if kin.prismatic[i] else np.cross(axis, points - origin)
-            velocity = motion * kin.moved_by[self.joint, k][:, None]
+            motion = np.broadcast_to(motion, points.shape)
+            hangs = kin.hangs_on[:, i]
+            velocity = motion * hangs[self.joint][:, None]
             rate = velocity[:, self.second] - velocity[:, self.first]
-            jacobian[:, :, k] = np.einsum('nsi,nsi->ns', direction, rate) @ self._sum.T
+            longer = np.einsum('nsi,nsi->ns', direction, rate)
+            if self.objects is not None:
+                for end, pull in zip(ends, (leave, arrive)):
+                    seen = 1.0 * hangs[self.joint[end]] - hangs[link]
+                    longer[:, wraps] -= np.einsum('nsi,nsi,s->ns', pull, motion[:, end], seen)
+            jacobian[:, :, k] += kin.ratio[i] * (longer @ self._sum.T)
         return jacobian

@@ -17,7 +17,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 
 
-def muscle_stiffness(module: float, compliance: Array) -> Array:
+def muscle_stiffness(module: Array, compliance: Array) -> Array:
     """Return k [N/m] of MSC with K_stiff [N/m] and an elastic unit of ∂L_e/∂T [m/N] in series."""
     return 1.0 / (1.0 / module + compliance)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
+from musculoskeletal_ae.robot.kinematics import Coupling
 
 # A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
 MOST_PARTS, DEEPEST = 2000, 50  # links and joints; levels of elements
@@ -32,6 +33,7 @@ NUMBERS = {
     'box': {'size': 3},
     'cylinder': {'radius': 1, 'length': 1},
     'sphere': {'radius': 1},
+    'mimic': {'multiplier': 1, 'offset': 1},
 }
 
 
@@ -41,14 +43,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
     Raises:
         RobotDescriptionError: Naming the file, the link or joint, and what is expected.
     """
-    try:
-        if '<!DOCTYPE' in text:
-            raise ValueError('a URDF has no DOCTYPE')
-        root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
-        if max(_levels(root)) > DEEPEST:
-            raise ValueError(f'more than {DEEPEST} levels')
-    except (ET.ParseError, ValueError) as error:
-        raise RobotDescriptionError(f'{file}: not valid XML: {error}') from error
+    root = parse_xml(file, text)
     parts = [part for part in root if part.tag in ('link', 'joint')]
     if len(parts) > MOST_PARTS:
         raise RobotDescriptionError(f'{file}: more than {MOST_PARTS} links and joints')
@@ -62,6 +57,33 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise RobotDescriptionError(f'{file}: not a valid URDF: {error}') from error
+
+
+def parse_xml(file: Path, text: str) -> ET.Element:
+    """Return the root of an XML text; a RobotDescriptionError says what is wrong with it.
+
+    It must have no DOCTYPE, and so no entities, and not be too deep.
+    """
+    try:
+        if '<!DOCTYPE' in text or '<!ENTITY' in text:
+            raise ValueError('no DOCTYPE is allowed here')
+        root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
+        if max(_levels(root)) > DEEPEST:
+            raise ValueError(f'more than {DEEPEST} levels')
+    except (ET.ParseError, ValueError) as error:
+        raise RobotDescriptionError(f'{file}: not valid XML: {error}') from error
+    return root
+
+
+def read_mimics(file: Path, text: str) -> dict[str, Coupling]:
+    """Return which joints of a URDF that `read_urdf` has read follow others by <mimic>."""
+    mimics = {}
+    for joint in parse_xml(file, text).findall('joint'):
+        mimic = joint.find('mimic')
+        if mimic is not None and joint.get('type') != 'fixed':
+            ratio, offset = (float(mimic.get(*d)) for d in (('multiplier', '1'), ('offset', '0')))
+            mimics[joint.get('name', '')] = Coupling(mimic.get('joint', ''), ratio, offset)
+    return mimics
 
 
 def _levels(root: ET.Element) -> Iterator[int]:

@@ -120,11 +120,11 @@ class QuasiStatics:
         return scaled
 
 
-def follow(command: Array, followed: Array, length: Array, span: float, most: float) -> Array:
+def follow(command: Array, followed: Array, length: Array, span: Array, most: float) -> Array:
     """Return the command as far as modules have wound that wind at most `most` [m] in a step.
 
     Command, how far they had `followed` it a step before, and length are (N, M) [m]; a command
-    adds tension as far as `span` [m] below the length.
+    adds tension as far as `span` [m] (M,) below the length.
     """
     reached = followed + np.minimum(np.maximum(command - followed, -most), most)
     # What lies beyond changes no tension; following it would take as long to come back from.

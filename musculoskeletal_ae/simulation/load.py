@@ -31,8 +31,9 @@ class Load:
         """Read masses, centres of mass and joint axes from pinocchio's model."""
         kin, model = kinematics, kinematics.model
         self._kinematics = kin
-        #: pinocchio's joint of each entry of θ
-        self._tree = np.argsort(kin.theta_index[1:]) + 1
+        #: pinocchio's joint of each entry of θ, then the coupled ones; ∂q/∂θ of them, if there are
+        self._tree = kin.tree
+        self._gear = None if kin.transmission is None else kin.transmission[kin.tree - 1]
         self._slides = kin.prismatic[self._tree]
         # Columns that a pose maps to the joint's axis, its origin and its centre of mass.
         self._columns = np.zeros((len(kin.parent), 4, 3))
@@ -40,14 +41,15 @@ class Load:
         self._columns[:, 3, 1:] = 1.0
         self._columns[:, :3, 2] = [inertia.lever for inertia in model.inertias]
         self._gravity: Array = np.array(model.gravity.linear)
-        carries = kin.moved_by.T.astype(float)  # (D, joints of the tree)
+        carries = kin.hangs_on[:, self._tree].T.astype(float)  # (D or more, joints of the tree)
         self._carried: Array = carries * np.array([inertia.mass for inertia in model.inertias])
         self._carried_mass: Array = self._carried.sum(axis=1)[:, None]
         effector = model.frames[kin.end_effector_frame]
         self._effector_joint = int(effector.parentJoint)
         self._effector = np.append(effector.placement.translation, 1.0)
         self._carries_effector: Array = carries[:, self._effector_joint]
-        before = kin.moved_by[self._tree].T  # before[j, k]: joint k hangs on joint j, or is it
+        # before[j, k]: joint k hangs on joint j, or is it
+        before = kin.hangs_on[np.ix_(self._tree, self._tree)].T
         self._upper: Array = before * ~self._slides[:, None] * 1.0
         self._strict: Array = self._upper * ~np.eye(len(before), dtype=bool)
 
@@ -80,4 +82,7 @@ class Load:
             pull = pull + rotary[:, None] * wrench[:, None, 3:]
         torque = (axis * pull).sum(axis=-1)
         slope = axis @ bend.swapaxes(1, 2)
-        return -torque, -(slope * self._upper + (slope * self._strict).swapaxes(1, 2))
+        gradient = slope * self._upper + (slope * self._strict).swapaxes(1, 2)
+        if self._gear is not None:
+            torque, gradient = torque @ self._gear, self._gear.T @ gradient @ self._gear
+        return -torque, -gradient

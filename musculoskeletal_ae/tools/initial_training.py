@@ -24,6 +24,7 @@ from musculoskeletal_ae.mae.training import (
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train_from_bag import read, train_from_bags
 
@@ -61,10 +62,10 @@ def train(args: Namespace) -> None:
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
     planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, limit))
-    print(table(planned, f'{UNSEEN} unseen states, T in [0, {limit:g}] N'))
-    if most > limit:
+    print(table(planned, f'{UNSEEN} unseen states, T in [0, {shown(limit)}] N'))
+    if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, most, limit))
-        print(table(overload, f'the same, T in [{limit:g}, {most:g}] N (overload)'))
+        print(table(overload, f'the same, T in [{shown(limit)}, {shown(most)}] N (overload)'))
     print(joint_table(robot, planned))
     checkpoint.save(trained.mae, args.out)
     print(f'checkpoint: {args.out}')
@@ -124,16 +125,16 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) ->
     curve.grid(alpha=0.3)
     text.axis('off')
     limit = robot.tension.limit
-    text.set_title(f'Mean norm of the error, {UNSEEN} unseen states, T in [0, {limit:g}] N')
+    text.set_title(f'Mean norm of the error, {UNSEEN} unseen states, T in [0, {shown(limit)}] N')
     cells = [[f'{e.norm:.4f} {e.unit}' for e in errors if e.mask is mask] for mask in ENTERED]
-    shown = text.table(
+    grid = text.table(
         cells,
         rowLabels=list(ENTERED.values()),
         colLabels=[f'→ {SYMBOLS[o[0]]}' for o in OUTPUTS],
         loc='center',
         cellLoc='center',
     )
-    shown.scale(0.8, 2.2)
+    grid.scale(0.8, 2.2)
     for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
         one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
         place = np.arange(len(names))

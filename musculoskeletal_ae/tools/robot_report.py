@@ -17,6 +17,7 @@ from musculoskeletal_ae.robot.checks import (
     RobotCheck,
     check_robot,
 )
+from musculoskeletal_ae.robot.description import RobotDescription, shown
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -30,6 +31,8 @@ def check(args: Namespace) -> int:
         print(moment_arm_table(robot, result))
     picture = None if args.no_plot else args.plot or Path(f'check_{name}.png')
     save_plot(picture, lambda file: plot(robot, result, file))
+    for told in robot.description.warnings:
+        print(f'warning: {told}')
     for warning in result.warnings:
         print(f'warning: {warning.message}; {warning.remedy}')
     for fault in result.faults:
@@ -43,10 +46,11 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     """Return the holding and stiffness part of the report."""
     count, held = len(result.postures), result.held
     need = f'required of both: {100 * REQUIRED_SHARE:.0f} % of postures'
-    tension = f'T in [{robot.tension.bias:g}, {robot.tension.limit:g}] N'
+    tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'
     lines = [
         f'{robot.description.directory}',
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',
+        *joint_notes(robot.description),
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
@@ -69,6 +73,17 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             spread = np.percentile(values, [0, 5, 50, 100])
             lines.append(f'{title:<44}' + ''.join(f'{value:9.1f}' for value in spread))
     return '\n'.join(lines)
+
+
+def joint_notes(description: RobotDescription) -> list[str]:
+    """Return lines that name the joints which are not in θ: coupled ones, and those held fixed."""
+    lines = [
+        f'{joint} = {c.ratio:g} · {c.master}' + (f' {c.offset:+g}' if c.offset else '')
+        for joint, c in description.couplings.items()
+    ]
+    if held := ', '.join(description.held_joints):
+        lines.append(f'held fixed at 0: {held}')
+    return lines
 
 
 def moment_arm_table(robot: Robot, result: RobotCheck) -> str:

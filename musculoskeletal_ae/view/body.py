@@ -23,6 +23,7 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_bytes
 from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.routes import ARC
 
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
@@ -102,12 +103,11 @@ def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
 
 
 def _capsules(robot: Robot) -> list[Solid]:
-    """Return a capsule from every joint to the next, and one to the end effector."""
-    kin = robot.kinematics
-    tip = kin.model.frames[kin.end_effector_frame]
+    """Return a capsule from every joint to the next, and one to each end effector."""
+    kin, solids = robot.kinematics, []
     bones = [*zip(kin.parent[1:], kin.placement_translation[1:])]
-    solids = []
-    for joint, end in [*bones, (tip.parentJoint, tip.placement.translation)]:
+    tips = [kin.placement(link) for link in robot.description.end_effectors]
+    for joint, end in [*bones, *((joint, tip.translation) for joint, tip in tips)]:
         length = float(np.linalg.norm(end))
         if length > drawing.SHORTEST_BONE:
             mesh = trimesh.creation.capsule(length, 0.8 * drawing.BONE_WIDTH, count=[12, 12])
@@ -117,14 +117,25 @@ def _capsules(robot: Robot) -> list[Solid]:
     return solids
 
 
+def pieces(robot: Robot) -> Ints:
+    """Return the muscle of each straight piece that is drawn: those of segments, and of arcs."""
+    routes = robot.routes
+    return np.sort(np.append(routes.muscle, np.repeat(routes.muscle[routes.wrapping], ARC)))
+
+
 def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
     """Return muscles at θ [rad] (D,) and T [N] (M,) as tubes of radius 1 from −½ to ½ along z.
 
-    Positions [m], quaternions wxyz, scales and colours are those of DASHES tubes for each segment.
+    Positions [m], quaternions wxyz, scales and colours are those of DASHES tubes a piece.
     """
-    routes, owner = robot.routes, robot.routes.muscle
-    points = routes.points(theta[None])[0]
-    first, line = points[routes.first], points[routes.second] - points[routes.first]
+    owner = pieces(robot)
+    # As many pieces whether a wire wraps or not: those that it then lacks have no length.
+    drawn = zip(robot.routes.drawn(theta), np.bincount(owner).tolist(), strict=True)
+    lines = [
+        line[np.linspace(0.0, len(line) - 1.0, n + 1).round().astype(int)] for line, n in drawn
+    ]
+    first = np.concatenate([line[:-1] for line in lines])
+    line = np.concatenate([np.diff(line, axis=0) for line in lines])
     length = np.linalg.norm(line, axis=1)
     along = line / np.maximum(length, 1e-9)[:, None]
     # The shortest turn from z: the half-way vector as quaternion; straight down, about x.

@@ -150,8 +150,9 @@ class Page:
             scene.add_label(f'/names/{name}', name, visible=False, anchor='center-left')
             for name in robot.muscles
         ]
-        own = [np.flatnonzero(robot.routes.muscle == m) for m in range(robot.muscle_count)]
-        self._middles = [body.DASHES * each[len(each) // 2] + body.DASHES // 2 for each in own]
+        self._owner = body.pieces(robot).repeat(body.DASHES)
+        own = [np.flatnonzero(self._owner == m) for m in range(robot.muscle_count)]
+        self._middles = [each[len(each) // 2] for each in own]
         floor = (*centre[:2], points[:, 2].min() - 0.15 * reach)
         scene.add_grid('/floor', 4.0 * reach, 4.0 * reach, position=floor, cell_size=0.1)
         # Lights that leave colours what they are.
@@ -324,8 +325,9 @@ class Page:
         heed(self._ball.on_drag('left'), 'push', self._push)
         look = {'shaft_radius': 0.006, 'head_radius': 0.014, 'head_length': 0.04, 'visible': False}
         self._force = scene.add_arrows('/force', np.zeros((1, 2, 3)), (200, 0, 0), **look)
-        owner = robot.routes.muscle.repeat(body.DASHES)
-        self._tubes.on_click(lambda event: self._pick(robot.muscles[owner[event.instance_index]]))
+        self._tubes.on_click(
+            lambda event: self._pick(robot.muscles[self._owner[event.instance_index]])
+        )
         self._controls = {'controller': arm, 'hardware_emulator': faults, 'replay': recording}
         self._controls['pushed'] = self._ball
 

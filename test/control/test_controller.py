@@ -103,7 +103,7 @@ def test_going_over_to_tensions_and_back_changes_no_pull_by_a_step():
     bench.configure(method='tension')
     first = bench.step()[0]
     assert first.kind == TENSION
-    most = ROBOT.stiffness * bench.core.settings.rate_limit * DT
+    most = ROBOT.stiffness[0] * bench.core.settings.rate_limit * DT
     assert np.abs(first.value - bench.tension).max() <= most + 1e-9
     bench.configure(method='proposed')
     first = bench.step()[0]
@@ -327,4 +327,4 @@ def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm(
         bench.target(OTHER)
         bench.step(100)
         assert bench.core.safety.cause == ''
-        assert bench.core.limit.min() == ROBOT.tension.bias
+        assert bench.core.limit.min() == ROBOT.tension.bias[0]

@@ -23,7 +23,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
-COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias, ROBOT.tension.max
+COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias[0], ROBOT.tension.max[0]
 COLD = np.full(COUNT, 25.0)
 LIMIT = np.full(COUNT, MAX)
 DT = 0.01
@@ -155,7 +155,7 @@ def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
     guard.stop('asked')
     sent = [step(guard, None).value[0] for _ in range(60)]
     assert sent[8] == 120.0
-    assert -np.diff(sent).min() <= ROBOT.stiffness * 0.1 * DT + 1e-9
+    assert -np.diff(sent).min() <= ROBOT.stiffness[0] * 0.1 * DT + 1e-9
     assert sent[-1] == BIAS
 
 

@@ -58,7 +58,7 @@ def test_tensions_change_by_the_same_share_no_faster_than_the_limit():
     before = np.full(ROBOT.muscle_count, 150.0)
     for _ in range(50):
         tension = control.step(MAE, THETA, THETA, np.zeros(5), LIMIT, DT)
-        assert np.abs(tension - before).max() <= ROBOT.stiffness * 0.05 * DT + 1e-9
+        assert np.abs(tension - before).max() <= ROBOT.stiffness[0] * 0.05 * DT + 1e-9
         before = tension
 
 

@@ -136,7 +136,7 @@ def test_a_hot_glitch_changes_nothing_and_real_heat_pays_out_within_the_rate_lim
         assert largest_step(before, sent) <= TICK + 1e-9
     bench.temperature = COLD + np.array([60.0, *[0.0] * (ROBOT.muscle_count - 1)])
     assert largest_step(before, bench.step(200)) <= TICK + 1e-9
-    assert bench.core.limit[0] == ROBOT.tension.bias
+    assert bench.core.limit[0] == ROBOT.tension.bias[0]
 
 
 def test_overheating_is_reset_only_when_the_module_is_cool():

@@ -14,9 +14,9 @@ from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
-LOW = replace(ROBOT.description, tension=TensionRange(30.0, 55.0, 60.0))
+LOW = replace(ROBOT.description, tension=TensionRange(*np.outer([30.0, 55.0, 60.0], np.ones(6))))
 M, BICEPS = ROBOT.muscle_count, 4
-BIAS, K = ROBOT.tension.bias, ROBOT.stiffness
+BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
 
 
 def rows_in(order):
@@ -147,7 +147,7 @@ def test_modules_without_thermometers_are_no_fault():
     assert 'nothing protects the motors from heat' in str(verdict)
 
 
-def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max, clip=True, gain=1.0):
+def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max[0], clip=True, gain=1.0):
     def follow(target, rows):
         tension = bias + np.maximum(0.0, stiffness * (rows[0] - target))
         return gain * (np.minimum(tension, most) if clip else tension)
@@ -199,7 +199,7 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
     driver = Driver(robot)
     driver.listen(2.0)
     # The module of the emulator clips by itself.
-    driver.arm._body = driver.arm._body._replace(tension_max=500.0)
+    driver.arm._body = driver.arm._body._replace(tension_max=np.full(M, 500.0))
     driver.in_tension = law(most=60.0, clip=clip)
     verdict = driver.wind((0, BICEPS))
     assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)

@@ -1,49 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The true routes: wrapping against geometry, Jacobian against differences."""
+"""The true routes: Jacobian against differences, individuals against each other."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual, Spread
-from musculoskeletal_ae.emulator.wrapping import segment_length
 from musculoskeletal_ae.robot.robot import Robot
-
-
-def wire(start, end, radius):
-    """Return length and pulls of a wire past a ball at the origin."""
-    leave, arrive = np.zeros(3), np.zeros(3)
-    ends = np.array(start, float), np.array(end, float)
-    return segment_length(*ends, np.zeros(3), radius, leave, arrive), leave, arrive
-
-
-@pytest.mark.parametrize(
-    ('start', 'end', 'expected'),
-    [
-        ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # misses the ball
-        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches it
-        # straight at the centre: two tangents and an arc
-        ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
-    ],
-)
-def test_a_wire_is_straight_or_two_tangents_and_an_arc(start, end, expected):
-    assert wire(start, end, 0.5)[0] == pytest.approx(expected)
-
-
-point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
-
-
-@given(point, point, st.floats(0.001, 0.1))
-def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
-    straight = np.linalg.norm(np.subtract(end, start))
-    value, leave, arrive = wire(start, end, radius)
-    assert value >= straight - 1e-9
-    if straight > 1e-6:
-        assert np.linalg.norm(leave) == pytest.approx(1.0, abs=1e-4)
-        assert np.linalg.norm(arrive) == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])

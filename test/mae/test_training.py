@@ -71,7 +71,7 @@ def test_samples_are_the_geometric_model_to_a_little_beyond_its_limits(robot):
     assert (theta >= robot.lower - margin).all() and (theta <= robot.upper + margin).all()
     assert (theta.min(axis=0) < robot.lower).all() and (theta.max(axis=0) > robot.upper).all()
     assert tension.min() >= 0.0
-    assert robot.tension.limit < tension.max() <= robot.tension.max
+    assert robot.tension.limit[0] < tension.max() <= robot.tension.max[0]
     assert (tension <= robot.tension.limit).all(axis=1).mean() > 0.75
     np.testing.assert_allclose(length, robot.muscle_lengths(theta, tension), atol=1e-12)
 

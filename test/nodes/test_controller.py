@@ -54,8 +54,8 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     arm.goes_to(THERE, within=0.4)
     assert len(arm.sent()) == lengths
     sent = arm.sent('tension')
-    assert sent.min() >= arm.robot.tension.bias
-    assert sent.max() <= arm.robot.tension.limit
+    assert sent.min() >= arm.robot.tension.bias[0]
+    assert sent.max() <= arm.robot.tension.limit[0]
     assert arm.graph.set_parameter('controller', 'method', 'proposed')[0]
     arm.graph.wait(lambda: len(arm.sent()) > lengths + 50, 'length commands')
     arm.goes_to(THERE)

@@ -134,7 +134,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
     _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
-    assert tension.max() <= arm26.tension.max
+    assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
 

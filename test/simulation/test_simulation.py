@@ -149,7 +149,7 @@ def test_it_gives_way_to_the_paper_s_pushes_and_forced_joint_as_the_body_does(ro
 
 def test_without_a_command_every_muscle_is_at_the_bias(robot, body):
     state = Simulation(robot, body).settle()
-    np.testing.assert_array_equal(state.tension, robot.tension.bias)
+    np.testing.assert_array_equal(state.tension, robot.tension.bias[None])
 
 
 def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
@@ -159,14 +159,14 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
                                     np.zeros((500, robot.muscle_count))).min(axis=0)  # fmt: skip
     arms.command = (shortest - 0.1)[None]
     state = arms.settle()
-    assert state.tension.max() == robot.tension.max
+    assert state.tension.max() == robot.tension.max[0]
     assert np.all((state.theta >= robot.lower) & (state.theta <= robot.upper))
     assert set(arms.limits()) & set(robot.muscles)
     arms.command = np.full((1, robot.muscle_count), -1e9)
     assert np.isfinite(arms.settle().theta).all()
     # Nothing has wound up meanwhile: half a second later the tension is gone.
     arms.command = np.full((1, robot.muscle_count), 1e9)
-    assert arms.step(0.5).tension.max() < robot.tension.bias + 1.0
+    assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0
 
 
 def test_a_joint_forced_beyond_its_limits_stops_there_and_says_so(robot, body):

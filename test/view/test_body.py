@@ -11,6 +11,7 @@ import pytest
 
 trimesh = pytest.importorskip('trimesh', reason='./bringup.sh --view installs what the page needs')
 
+from robots import read_muscles, write_muscles, write_robot  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from musculoskeletal_ae.robot.robot import Robot  # noqa: E402
@@ -19,6 +20,7 @@ from musculoskeletal_ae.view.body import (  # noqa: E402
     Kind,
     link_solids,
     muscle_tubes,
+    pieces,
 )
 
 
@@ -33,7 +35,8 @@ def theta(robot):
 
 
 def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot, theta):
-    tension = np.linspace(robot.tension.bias, robot.tension.limit, robot.muscle_count)
+    pull = np.linspace(0.0, 1.0, robot.muscle_count)
+    tension = robot.tension.bias + pull * (robot.tension.limit - robot.tension.bias)
     tubes = muscle_tubes(robot, theta, tension, np.zeros(robot.muscle_count, dtype=int))
     points = robot.routes.points(theta[None])[0]
     along = Rotation.from_quat(tubes['batched_wxyzs'], scalar_first=True).apply([0.0, 0.0, 1.0])
@@ -47,6 +50,24 @@ def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot
     owner = robot.routes.muscle.repeat(DASHES)
     radius = [tubes['batched_scales'][owner == m, 0] for m in (0, len(tension) - 1)]
     assert radius[1][0] > 2.0 * radius[0][0]
+
+
+def test_a_wire_that_wraps_is_drawn_round_and_has_as_many_tubes_where_it_lifts_off(tmp_path):
+    directory = write_robot(tmp_path)
+    document = read_muscles(directory)
+    route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
+    route[1:2] = [{'wrap': 'sphere', 'link': 'upper', 'xyz': [0.0, 0.0, -0.3], 'radius': 0.03}]
+    robot = Robot.load(write_muscles(directory, document))
+    owner, sound = pieces(robot).repeat(DASHES), np.zeros(robot.muscle_count, dtype=int)
+    postures = robot.random_postures(20, np.random.default_rng(3))
+    detours = robot.routes.detours(postures).max(axis=1)
+    assert detours.min() < 1e-9 and detours.max() > 1e-3
+    for posture in postures:
+        tubes = muscle_tubes(robot, posture, np.full(robot.muscle_count, 50.0), sound)
+        assert len(tubes['batched_positions']) == len(owner)
+        drawn = np.bincount(owner, tubes['batched_scales'][:, 2]) / 1.02
+        np.testing.assert_allclose(drawn, robot.routes.absolute_lengths(posture), atol=2e-4)
+        assert np.isfinite(tubes['batched_wxyzs']).all()
 
 
 def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):

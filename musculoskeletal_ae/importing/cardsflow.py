@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CARDSflow robots: `cardsflow.xml` beside `model.urdf` or `model.sdf`; a URDF alone.
+
+CARDSflow measures via points from a link's centre of mass, in the axes of the link; those of the
+link 'world' stand still. SPHERICAL and CYLINDRICAL via points (axis z) are wraps, a MESH is taken
+as the point it names. A URDF alone gives a skeleton of muscles.yaml, one muscle to be replaced.
+"""
+
+from __future__ import annotations
+
+import os
+from itertools import combinations_with_replacement
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
+from musculoskeletal_ae.robot.description import RoutePoint, Wrap
+from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.routes import Routes
+from musculoskeletal_ae.robot.urdf import MOST_PARTS, parse_xml, read_mimics, read_urdf
+
+
+def read_cardsflow(file: Path, root: ET.Element) -> Source:
+    """Read a cardsflow.xml and the model beside it."""
+    for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
+        if os.path.lexists(beside := file.parent / model):
+            source, centres = read(beside, parse_xml(beside, read_text(beside, refuse)))
+            break
+    else:
+        raise refuse(file, 'there is no model.urdf and no model.sdf beside it')
+    centres.setdefault('world', np.zeros(3))
+    for muscle in root.iter('myoMuscle'):
+        name = safe_name(muscle.get('name'), f'muscle_{len(source.routes)}')
+        route: list[RoutePoint | Wrap] = []
+        for part in muscle.findall('link'):
+            if (link := part.get('name', '')) not in centres:
+                raise refuse(file, f'muscle {name}: no link {link!r}; links: {", ".join(centres)}')
+            body = link if link in source.links else source.links[0]
+            for via in part.findall('viaPoint'):
+                where, kind = f'muscle {name}: viaPoint', via.get('type', 'FIXPOINT')
+                at = centres[link] + numbers(via.text, 3, where)
+                if kind in ('SPHERICAL', 'CYLINDRICAL'):
+                    radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
+                    axis = np.eye(3)[2] if kind == 'CYLINDRICAL' else None
+                    route.append(Wrap(body, at, radius, axis, None))
+                    source.note('chosen', f'muscle {name}: it wraps the shorter way round')
+                    continue
+                if kind != 'FIXPOINT':
+                    source.note('approximated', f'muscle {name}: a {kind} via point is a point')
+                route.append(RoutePoint(body, at))
+        if sum(isinstance(item, RoutePoint) for item in route) < 2:
+            source.note('dropped', f'muscle {name}: fewer than 2 points')
+        else:
+            source.routes[name] = tuple(route)
+    if model == 'model.urdf':
+        _measure(source)
+    return source
+
+
+def _measure(source: Source) -> None:
+    """Let a source have the lengths that CARDSflow gives its straight routes."""
+    straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
+    joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
+    routes = Routes(Kinematics(source.model, joints, source.links[0]), list(straight.values()))
+
+    def lengths(values: dict[str, Array]) -> dict[str, Array]:
+        still = np.zeros(len(next(iter(values.values()))))
+        q = np.stack([values.get(name, still) for name in joints], axis=-1)
+        return dict(zip(straight, routes.absolute_lengths(q).T))
+
+    if straight and joints:
+        source.lengths = lengths
+
+
+def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
+    """Read a URDF and invent a muscle, to be replaced, over each joint."""
+    source, _ = _read_urdf(file, root)
+    carried = {source.place(link)[0]: link for link in reversed(source.links)}
+    for i, joint in enumerate(source.model.names[1:], 1):
+        ends = carried[source.model.parents[i]], carried[i]
+        source.routes[f'muscle_of_{joint}'] = tuple(RoutePoint(n, np.zeros(3)) for n in ends)
+        source.note('chosen', f'muscle_of_{joint}, origin to origin: replace it')
+    return source
+
+
+def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
+    """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
+    for joint in root.findall('joint[@type="continuous"]'):
+        joint.set('type', 'revolute')
+        for limit in joint.findall('limit'):
+            joint.remove(limit)
+        ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
+    text = ET.tostring(root, encoding='unicode')
+    source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
+    model = source.model
+    source.links = [str(f.name) for f in model.frames if f.type == pin.FrameType.BODY]
+    low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
+    for name, joint in zip(model.names[1:], model.joints[1:]):
+        if joint.shortname() in KINDS:
+            q = joint.idx_q
+            low[q], high[q] = source.limited(name, source.slides(name), low[q], high[q])
+    model.lowerPositionLimit, model.upperPositionLimit = low, high
+    source.couplings = read_mimics(file, text)
+    origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}
+    centres = {n: '0 0 0' if e is None else e.get('xyz', '0 0 0') for n, e in origins.items()}
+    return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}
+
+
+def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
+    """Return the first model of an SDF as `_read_urdf` does."""
+    model = root.find('.//model')
+    if root.tag != 'sdf' or model is None:
+        raise refuse(file, 'expected an sdf with a model')
+    source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
+
+    def value(element: ET.Element | None, tag: str, count: int = 1, default: str = '0') -> Array:
+        if element is None:
+            return numbers(default, count, tag)
+        return numbers(element.findtext(tag, default), count, f'{tag} of {element.get("name")}')
+
+    def pose(element: ET.Element | None) -> pin.SE3:
+        values = value(element, 'pose', 6, '0 0 0 0 0 0')
+        return pin.SE3(pin.rpy.rpyToMatrix(*values[3:]), values[:3])
+
+    links = {e.get('name', ''): e for e in model.findall('link')}
+    carried_by = {e.findtext('child', '').strip(): e for e in model.findall('joint')}
+    above = {name: e.findtext('parent', '').strip() for name, e in carried_by.items()}
+    order = [name for name in links if above.get(name, 'world') == 'world'][:MOST_PARTS]
+    if len(order) == 1:
+        for name in order:
+            order += [child for child, parent in above.items() if parent == name]
+    if set(order) != set(links) or not above.keys() <= links.keys():
+        lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
+        raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
+    #: by link: number of the joint that carries it, and where that joint stands in the model
+    stands: dict[str, tuple[int, pin.SE3]] = {}
+    for name in order:
+        carrier, at = stands.get(above.get(name, ''), (0, pin.SE3.Identity()))
+        if stands:
+            joint = carried_by[name]
+            label, kind = joint.get('name', ''), joint.get('type', '')
+            here, axis = pose(links[name]) * pose(joint), value(joint, 'axis/xyz', 3, '1 0 0')
+            if joint.findtext('axis/use_parent_model_frame', '0').strip() in ('1', 'true'):
+                axis = here.rotation.T @ axis
+            if kind in ('revolute', 'continuous', 'prismatic'):
+                limit = joint.find('axis/limit') if kind != 'continuous' else None
+                limits = float(value(limit, 'lower')[0]), float(value(limit, 'upper')[0])
+                here_in, slides = at.inverse() * here, kind == 'prismatic'
+                carrier = source.add_joint(label, carrier, here_in, slides, axis, limits)
+                at = here
+            elif kind != 'fixed':
+                source.note('held fixed', f'joint {label}: it is {kind}')
+        stands[name] = carrier, at
+        own = links[name].find('inertial')
+        parts = None if own is None else own.find('inertia')
+        pairs = combinations_with_replacement('xyz', 2)
+        xx, xy, xz, yy, yz, zz = (value(parts, f'i{a}{b}')[0] for a, b in pairs)
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        weight = pose(own).act(pin.Inertia(float(value(own, 'mass')[0]), np.zeros(3), tensor))
+        centres[name] = pose(own).translation
+        source.add_link(name, carrier, at.inverse() * pose(links[name]), weight)
+    return source, centres

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a file of another format to a robot directory: what `import_robot` does and says."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
+from musculoskeletal_ae.importing.mjcf import read_mjcf
+from musculoskeletal_ae.importing.opensim import read_osim
+from musculoskeletal_ae.importing.source import POSTURES, Source, compare, cut, refuse, write
+from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
+from musculoskeletal_ae.robot.kinematics import resolved
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.urdf import parse_xml
+
+LARGEST = 20_000_000  # [bytes] of a model
+#: reader of each format, by the root element of its files
+READERS = {
+    'mujoco': read_mjcf,
+    'cardsflow': read_cardsflow,
+    'OpenSimDocument': read_osim,
+    'robot': read_urdf_skeleton,
+}
+
+
+class Imported(NamedTuple):
+    """A robot that was imported."""
+
+    robot: Robot
+    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed or approximated
+    errors: dict[str, float] | None  # largest length error of each muscle [m]; None: not computed
+
+
+def read_source(file: Path) -> Source:
+    """Read a file of any of the formats, told by its root element.
+
+    A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
+    """
+    root = parse_xml(file, read_text(file, refuse, LARGEST))
+    if root.tag not in READERS:
+        told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
+        raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')
+    try:
+        source = READERS[root.tag](file, root)
+        source.couplings = resolved(source.couplings)
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
+        told = str(e) if isinstance(e, ValueError) else repr(e)
+        raise refuse(file, f'it is not as its format has it: {told}') from e
+    if not source.routes:
+        raise refuse(file, f'it has no muscle with a route; {"; ".join(source.notes[-3:])}')
+    return source
+
+
+def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
+    """Import a file as a robot directory; `chain`: the options of `cut`.
+
+    A RobotDescriptionError says if what was written is no valid robot, as of wrong inertias.
+    """
+    source = read_source(file)
+    cut(source, **chain)
+    if not source.routes:
+        raise refuse(file, f'no muscle is left; {"; ".join(source.notes[-3:])}')
+    write(source, out)
+    robot = Robot.load(out)
+    return Imported(robot, tuple(source.notes), compare(source, robot))
+
+
+def run(args: Namespace) -> int:
+    """Import, and print what a person should know; return the exit status."""
+    chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'base', 'end')}
+    robot, notes, errors = import_robot(args.file, args.out, **chain)
+    for note, count in Counter(notes).items():
+        print(note + (f' ({count} times)' if count > 1 else ''))
+    for warning in robot.description.warnings:
+        print(f'warning: {warning}')
+    print(length_verdict(errors))
+    print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
+    print(check_verdict(check_robot(robot)))
+    return 0
+
+
+def length_verdict(errors: dict[str, float] | None) -> str:
+    """Say how far lengths are from the source's own."""
+    if not errors:
+        return 'lengths: not compared, the source has none of its own here'
+    worst = sorted(errors.items(), key=lambda item: -item[1])[:5]
+    named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
+    told = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
+    told += f', {sum(e <= 1e-3 for e in errors.values())} of {len(errors)} muscles within 1 mm'
+    return told + (f'; worst [mm]: {named}' if named else '')
+
+
+def check_verdict(check: RobotCheck) -> str:
+    """Say in a line what `check_robot` finds."""
+    shares = f'held {100 * check.held.mean():.0f} %, stiff {100 * check.stiff.mean():.0f} %'
+    kinds = Counter(fault.kind for fault in check.faults)
+    told = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
+    return f'check_robot: {f"not sound: {told}" if told else "sound"}; {shares}'

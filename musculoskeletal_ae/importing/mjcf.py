@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""MuJoCo models (MJCF), through the `mujoco` package: what loads there loads here.
+
+Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites. Hinges
+and slides become joints, a body with several of them a chain of massless links; a ball joint three
+hinges. `equality/joint` becomes a coupling, a polynomial the line nearest to it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.importing.source import Source, SourceError, refuse, safe_name
+from musculoskeletal_ae.robot.description import RoutePoint, Wrap
+
+
+def read_mjcf(file: Path, _root: ET.Element) -> Source:
+    """Read an MJCF file; a SourceError says if `mujoco` is not installed, or does not load it."""
+    try:
+        import mujoco
+    except ImportError as error:
+        told = "MJCF is read by MuJoCo's own package: pip install mujoco==3.10.0"
+        raise SourceError(told) from error
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except (ValueError, mujoco.FatalError) as error:
+        raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
+    return _Reader(mujoco, model, file.stem).source
+
+
+class _Reader:
+    def __init__(self, mujoco: Any, model: Any, name: str) -> None:
+        self.mj, self.model, self.source = mujoco, model, Source(safe_name(name, 'robot'))
+        self.source.model.gravity.linear = model.opt.gravity.copy()
+        self.start = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.start)
+        self.balls: dict[int, list[str]] = {}
+        #: joint that follows another (−1: none), by which polynomial
+        self.polynomials: dict[int, tuple[int, Array]] = {}
+        self.tendons: dict[str, int] = {}
+        self._bodies()
+        self._couplings()
+        self._tendons()
+        self.source.lengths = self._lengths
+
+    def name(self, kind: str, i: int) -> str:
+        """Return the name of a thing, or its kind and number."""
+        return safe_name(getattr(self.model, kind)(i).name, f'{kind}_{i}')
+
+    def _bodies(self) -> None:
+        """Add links and joints; at the start a joint stands as its body does, in its anchor."""
+        m, data, at_start = self.model, self.start, {0: (0, pin.SE3.Identity())}
+        for i in range(m.nbody):
+            turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
+            for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
+                if m.jnt_type[j] == self.mj.mjtJoint.mjJNT_FREE:
+                    told = f'free joint {self.name("joint", j)}, where the file puts it'
+                    self.source.note('held fixed', told)
+                    continue
+                before, stand = stand, pin.SE3(turn, data.xanchor[j].copy())
+                carrier = self._joint(j, carrier, before.inverse() * stand)
+            at_start[i] = carrier, stand
+            at = pin.SE3(turn, data.xpos[i].copy())
+            weight = pin.Inertia(float(m.body_mass[i]), np.zeros(3), np.diag(m.body_inertia[i]))
+            centre = at.inverse() * pin.SE3(data.ximat[i].reshape(3, 3), data.xipos[i].copy())
+            link = self.name('body', i), carrier, stand.inverse() * at
+            self.source.add_link(*link, centre.act(weight))
+
+    def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
+        """Add a joint that stands at a pose in the carrier at the start; return its number."""
+        m, source, types, name = self.model, self.source, self.mj.mjtJoint, self.name('joint', j)
+        low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
+        kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
+        axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
+        if kind == types.mjJNT_BALL:
+            source.note('approximated', f'ball joint {name}: three hinges, x then y then z')
+            axes, names, rest, low = list(np.eye(3)), [f'{name}_{c}' for c in 'xyz'], 0.0, -high
+            self.balls[j] = names
+        for part, axis in zip(names, axes):
+            back, still = -axis * rest, np.zeros(3)
+            at = at * (pin.SE3(np.eye(3), back) if slides else pin.SE3(pin.exp3(back), still))
+            carrier = source.add_joint(part, carrier, at, slides, axis, (low, high), rest)
+            at = pin.SE3.Identity()
+        return carrier
+
+    def _couplings(self) -> None:
+        m, source = self.model, self.source
+        for e in np.flatnonzero(m.eq_active0).tolist():
+            if m.eq_type[e] != self.mj.mjtEq.mjEQ_JOINT:
+                source.note('dropped', f'equality {self.name("equality", e)}: not of joints')
+                continue
+            slave, master, terms = int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e][4::-1]
+            self.polynomials[slave] = master, terms.copy()
+            name, zero = self.name('joint', slave), m.qpos0[m.jnt_qposadr[slave]]
+            if master < 0:
+                source.fixed.append(name)
+                source.rest[name] = float(zero + terms[-1])
+                continue
+            start = m.qpos0[m.jnt_qposadr[master]]
+            value = np.poly1d([zero]) + np.poly1d(terms)(np.poly1d([1.0, -start]))
+            source.couple(name, self.name('joint', master), value)
+
+    def _tendons(self) -> None:
+        m, mj, source = self.model, self.mj, self.source
+        driven = defaultdict(list)
+        for a in range(m.nu):
+            if m.actuator_trntype[a] == mj.mjtTrn.mjTRN_TENDON:
+                driven[int(m.actuator_trnid[a][0])].append(self._strength(a))
+            else:
+                source.note('dropped', f'actuator {self.name("actuator", a)}: on no tendon')
+        for t in range(m.ntendon):
+            name, first = self.name('tendon', t), m.tendon_adr[t]
+            if m.wrap_type[first] == mj.mjtWrap.mjWRAP_JOINT:
+                source.note('dropped', f'tendon {name}: a fixed one, which has no route')
+            elif driven and t not in driven:
+                source.note('dropped', f'tendon {name}: no actuator pulls it')
+            else:
+                self.tendons[name] = t
+                self._route(name, range(first, first + m.tendon_num[t]))
+                source.strength[name] = max(driven.get(t, [0.0]))
+
+    def _strength(self, a: int) -> float:
+        m = self.model
+        gain = m.actuator_gainprm[a]
+        if m.actuator_gaintype[a] == self.mj.mjtGain.mjGAIN_MUSCLE:
+            return float(gain[2] if gain[2] > 0.0 else gain[3] / m.actuator_acc0[a])
+        limited = m.actuator_forcelimited[a]
+        return float(np.abs(m.actuator_forcerange[a]).max()) if limited else 0.0
+
+    def _route(self, name: str, wraps: range) -> None:
+        m, types = self.model, self.mj.mjtWrap
+        branches: list[list[RoutePoint | Wrap]] = [[]]
+        for w in wraps:
+            kind, i = m.wrap_type[w], m.wrap_objid[w]
+            if kind == types.mjWRAP_PULLEY:
+                branches.append([])
+            elif kind == types.mjWRAP_SITE:
+                body = self.name('body', m.site_bodyid[i])
+                branches[-1].append(RoutePoint(body, m.site_pos[i].copy()))
+            else:
+                round_axis = kind == types.mjWRAP_CYLINDER
+                branches[-1].append(self._wrap(name, i, int(m.wrap_prm[w]), round_axis))
+        branches = [branch for branch in branches if branch]
+        if len(branches) > 1:
+            told = f'muscle {name}: of {len(branches)} branches over pulleys one is kept'
+            self.source.note('approximated', told)
+        # Of several branches the format keeps one: the one that joints move most.
+        kept = max(branches, key=lambda branch: len({item.link for item in branch}))
+        self.source.routes[name] = tuple(kept)
+
+    def _wrap(self, name: str, geom: int, site: int, round_axis: bool) -> Wrap:
+        m, body, data, side = self.model, int(self.model.geom_bodyid[geom]), self.start, None
+        turn = data.xmat[body].reshape(3, 3)
+        if site >= 0:
+            side = turn.T @ (data.site_xpos[site] - data.xpos[body])
+            if m.site_bodyid[site] != body:
+                told = f'muscle {name}: side site {self.name("site", site)} is on another body'
+                self.source.note('approximated', f'{told}; taken where it is at the start')
+        axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
+        radius = float(m.geom_size[geom][0])
+        return Wrap(self.name('body', body), m.geom_pos[geom].copy(), radius, axis, side)
+
+    def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Return MuJoCo's own lengths."""
+        m, mj, data, start = self.model, self.mj, self.mj.MjData(self.model), self.model.qpos0
+        address = {self.name('joint', j): at for j, at in enumerate(m.jnt_qposadr.tolist())}
+        lengths = []
+        for n in range(len(next(iter(values.values())))):
+            data.qpos[:] = start
+            for name in values.keys() & address:
+                data.qpos[address[name]] = values[name][n]
+            for j, parts in self.balls.items():
+                at = slice(m.jnt_qposadr[j], m.jnt_qposadr[j] + 4)
+                angles = [values[part][n] if part in values else 0.0 for part in parts]
+                turn = Rotation.from_quat(np.roll(start[at], -1)) * Rotation.from_euler(
+                    'XYZ', angles
+                )
+                data.qpos[at] = np.roll(turn.as_quat(), 1)
+            for _ in self.polynomials:  # as often as one may follow another
+                for slave, (master, terms) in self.polynomials.items():
+                    at = m.jnt_qposadr[[slave, master]]
+                    moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0
+                    data.qpos[at[0]] = start[at[0]] + np.polyval(terms, moved)
+            mj.mj_kinematics(m, data)
+            mj.mj_comPos(m, data)
+            mj.mj_tendon(m, data)
+            lengths.append(data.ten_length.copy())
+        return dict(zip(self.tendons, np.array(lengths)[:, list(self.tendons.values())].T))

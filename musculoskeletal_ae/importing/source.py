@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A body read from another format: cut, written as a robot directory, compared with its source."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
+from musculoskeletal_ae.robot.kinematics import PRISMATIC, REVOLUTE, Coupling, joint_axis
+from musculoskeletal_ae.robot.robot import Robot
+
+KINDS = REVOLUTE + PRISMATIC
+POSTURES = 1000  # in which lengths are compared
+STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
+UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
+
+#: absolute lengths [m] (N,) of muscles, for values (N,) of joints that are not at rest
+Lengths = Callable[[dict[str, Array]], dict[str, Array]]
+Function = Callable[[Array], Array]
+
+
+class SourceError(MusculoskeletalError):
+    """A file that cannot be imported, and why."""
+
+
+def refuse(file: Path, problem: str) -> SourceError:
+    """Return the error that says what is wrong with a file."""
+    return SourceError(f'{file}: {problem}')
+
+
+@dataclass
+class Source:
+    """Everything that was read, as a model of pinocchio in which links are frames."""
+
+    name: str
+    model: pin.Model = field(default_factory=pin.Model)
+    links: list[str] = field(default_factory=list)  # the root first
+    rest: dict[str, float] = field(default_factory=dict)  # values of joints that do not rest at 0
+    fixed: list[str] = field(default_factory=list)  # joints that the source holds
+    couplings: dict[str, Coupling] = field(default_factory=dict)
+    routes: dict[str, Route] = field(default_factory=dict)
+    strength: dict[str, float] = field(default_factory=dict)  # highest tension [N], where known
+    notes: list[str] = field(default_factory=list)
+    lengths: Lengths | None = None
+    end_effector: str = ''
+
+    def note(self, kind: str, told: str) -> None:
+        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated'."""
+        self.notes.append(f'{kind}: {told}')
+
+    def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
+        """Return limits of a joint, chosen ones where there are none."""
+        if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
+            return float(low), float(high)
+        end = UNLIMITED[slides]
+        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has none')
+        return -end, end
+
+    def add_joint(
+        self, name: str, parent: int, at: pin.SE3, slides: bool, axis: Array,
+        limits: tuple[float, float], rest: float = 0.0,
+    ) -> int:  # fmt: skip
+        """Add a joint at a pose in the frame of the joint `parent` (0: none); return its index."""
+        kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
+        if (size := np.linalg.norm(axis)) < 1e-9:
+            raise ValueError(f'joint {name}: expected a direction as its axis')
+        low, high = (np.array([limit]) for limit in self.limited(name, slides, *limits))
+        most = np.full(1, 1e3)
+        joint: int = self.model.addJoint(parent, kind(axis / size), at, name, most, most, low, high)
+        self.model.addJointFrame(joint)
+        self.rest[name] = float(rest)
+        return joint
+
+    def add_link(
+        self, name: str, joint: int, at: pin.SE3, inertia: pin.Inertia | None = None
+    ) -> None:
+        """Add a link at a pose in a joint's frame, with its inertia in its own frame."""
+        kind, weight = pin.FrameType.BODY, inertia or pin.Inertia.Zero()
+        self.model.addFrame(pin.Frame(name, joint, 0, at, kind, weight))
+        self.links.append(name)
+
+    def place(self, link: str) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a link, and the link's pose in its frame."""
+        frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
+        return int(frame.parentJoint), frame.placement
+
+    def span(self, joint: str) -> tuple[float, float]:
+        """Return the limits of a joint."""
+        q = self.model.joints[self.model.getJointId(joint)].idx_q
+        return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
+
+    def slides(self, joint: str) -> bool:
+        """Return whether a joint is prismatic."""
+        return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
+
+    def couple(self, slave: str, master: str, function: Function) -> None:
+        """Let a joint follow another by the line nearest to a function, in squares."""
+        x = np.linspace(*self.span(master), 201)
+        y = function(x)
+        slope, offset = (round(float(v), 12) for v in np.polyfit(x, y, 1))
+        self.couplings[slave] = Coupling(master, slope, offset)
+        if (error := float(np.abs(slope * x + offset - y).max())) > 1e-6:
+            told = f'{slave} follows {master} by a line, off by up to {error:.3g}'
+            self.note('approximated', f'joint {told} {"m" if self.slides(slave) else "rad"}')
+
+
+def numbers(text: str | None, count: int, where: str) -> Array:
+    """Return numbers of an XML text; a ValueError says where they are not."""
+    try:
+        values = np.array([float(word) for word in (text or '').split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not (np.abs(values) <= 1e6).all():
+        raise ValueError(f'{where}: expected {count} finite numbers, got {(text or "")[:60]!r}')
+    return values
+
+
+def safe_name(text: str | None, fallback: str) -> str:
+    """Return a name that URDF and YAML take, made of what the source calls it."""
+    return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback
+
+
+def cut(
+    source: Source,
+    joints: Sequence[str] = (),
+    muscles: Sequence[str] = (),
+    base: str = '',
+    end: str = '',
+) -> None:
+    """Cut the source to a chain in place.
+
+    Joints that are not asked for are held fixed and said so; links that neither hang on the base
+    nor are one piece with it go, with the muscles that are fastened to them or move no joint.
+    """
+    model, links = source.model, source.links
+    for option, name in (('--base', base), ('--end', end)):
+        if name and name not in links:
+            raise SourceError(f'{option} {name}: no such link; links: {", ".join(links)}')
+    root = source.place(base)[0] if base else 0
+    inside = [i for i, above in enumerate(model.supports) if root in list(above)]
+    if end and source.place(end)[0] not in inside:
+        raise SourceError(f'--end {end}: it does not hang on --base {base}')
+    source.end_effector = end
+    source.links = [name for name in links if source.place(name)[0] in inside]
+    source.links.sort(key=lambda name: name != base)
+    inner = [model.names[i] for i in inside if i not in (0, root)]
+    movable = [n for n in inner if model.joints[model.getJointId(n)].shortname() in KINDS]
+    couplings = source.couplings
+    free = [name for name in movable if name not in {*couplings, *source.fixed}]
+    wanted = set(joints or free)
+    if missing := sorted(wanted - set(free)):
+        told = 'coupled' if missing[0] in couplings else 'no such joint'
+        raise SourceError(f'--joints {missing[0]}: {told}; joints: {", ".join(free)}')
+    if end:
+        above = {model.names[i] for i in model.supports[source.place(end)[0]]}
+        # A joint whose coupled one is in the chain moves the chain as well.
+        wanted &= above | {c.master for slave, c in couplings.items() if slave in above}
+    source.couplings = {s: c for s, c in couplings.items() if s in movable and c.master in wanted}
+    for slave, c in couplings.items():
+        source.rest[slave] = c.ratio * source.rest.get(c.master, 0.0) + c.offset
+    velocity = np.zeros(model.nv)
+    for name, value in source.rest.items():
+        velocity[model.joints[model.getJointId(name)].idx_v] = value
+    kept = wanted | set(source.couplings)
+    for name in inner:
+        if name not in kept:
+            source.note('held fixed', f'joint {name} at {source.rest.get(name, 0.0):.4g}')
+    locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
+    at_rest = pin.integrate(model, pin.neutral(model), velocity)
+    source.model = pin.buildReducedModel(model, locked, at_rest)
+    if unknown := [name for name in muscles if name not in source.routes]:
+        legal = ', '.join(source.routes)
+        raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal}')
+    for name, route in list(source.routes.items()):
+        lost = [item.link for item in route if item.link not in source.links]
+        if lost:
+            source.note('dropped', f'muscle {name}: fastened to {lost[0]}, which was cut off')
+        elif len({source.place(p.link)[0] for p in route if isinstance(p, RoutePoint)}) < 2:
+            source.note('dropped', f'muscle {name}: it moves no joint')
+        elif not muscles or name in muscles:
+            continue
+        del source.routes[name]
+    if any(source.strength.values()):
+        source.note('chosen', STRENGTH)
+    if not wanted:
+        raise SourceError('no joint is left that moves')
+
+
+def _text(values: Any) -> str:
+    return ' '.join(f'{v:.12g}' for v in np.ravel(values))
+
+
+def urdf(source: Source) -> str:
+    """Return the text of a URDF, without the weight of the root, whose z axis points upwards."""
+    model, root, (_, pose) = source.model, source.links[0], source.place(source.links[0])
+    upright, size = pin.SE3(pose.rotation, np.zeros(3)), np.linalg.norm(model.gravity.linear)
+    if size < 1e-6:
+        source.note('chosen', 'gravity: along −z, the source has none')
+    else:
+        down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
+        upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
+    carriers = {0: root}  # link of each joint
+    if not upright.isIdentity(1e-9):
+        carriers[0] = f'{root}_upright'
+        source.note('chosen', f'link {carriers[0]}: the root, upright; {root} as it rests')
+    for link in source.links:
+        joint, at = source.place(link)
+        if joint and at.isIdentity(1e-9):
+            carriers.setdefault(joint, link)
+    parts = [f'<robot name="{source.name}">', f'  <link name={quoteattr(carriers[0])}/>']
+
+    def attach(name: str, kind: str, link: str, parent: int, at: pin.SE3, more: str = '') -> None:
+        at = at if parent else upright * pose.inverse() * at
+        ends = f'<parent link={quoteattr(carriers[parent])}/><child link={quoteattr(link)}/>'
+        turn = _text(pin.rpy.matrixToRpy(at.rotation))
+        origin = f'<origin xyz="{_text(at.translation)}" rpy="{turn}"/>'
+        parts.append(f'  <joint name={quoteattr(name)} type="{kind}">{ends}{origin}{more}</joint>')
+
+    for i, name in enumerate(model.names[1:], 1):
+        link, own = carriers.setdefault(i, f'{name}_link'), model.inertias[i]
+        pairs = combinations_with_replacement(range(3), 2)
+        tensor = ' '.join(f'i{"xyz"[j]}{"xyz"[k]}="{own.inertia[j, k]:.12g}"' for j, k in pairs)
+        mass = f'<origin xyz="{_text(own.lever)}"/><mass value="{_text(own.mass)}"/>'
+        mass = f'<inertial>{mass}<inertia {tensor}/></inertial>' if own.mass > 0.0 else ''
+        parts.append(f'  <link name={quoteattr(link)}>{mass}</link>')
+        low, high = source.span(name)
+        limits = f'lower="{low:.12g}" upper="{high:.12g}" effort="1000" velocity="10"'
+        more = f'<axis xyz="{_text(joint_axis(model.joints[i]))}"/><limit {limits}/>'
+        kind = 'prismatic' if source.slides(name) else 'revolute'
+        attach(name, kind, link, model.parents[i], model.jointPlacements[i], more)
+    for link in source.links:
+        if link not in carriers.values():
+            parts.append(f'  <link name={quoteattr(link)}/>')
+            attach(f'to_{link}', 'fixed', link, *source.place(link))
+    return '\n'.join([*parts, '</robot>', ''])
+
+
+def _item(item: RoutePoint | Wrap) -> dict[str, Any]:
+    given = {key: value for key, value in item._asdict().items() if value is not None}
+    given = {k: v if isinstance(v, str) else np.round(v, 9).tolist() for k, v in given.items()}
+    if isinstance(item, Wrap):
+        given = {'wrap': 'sphere' if item.axis is None else 'cylinder', **given}
+    return given
+
+
+def write(source: Source, out: Path) -> None:
+    """Write robot.urdf and muscles.yaml into a directory, which must be new or empty."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SourceError(f'{out}: expected a new or empty directory')
+    muscles: list[dict[str, Any]] = []
+    for name, route in source.routes.items():
+        muscles.append({'name': name, 'route': [_item(item) for item in route]})
+        if (force := source.strength.get(name, 0.0)) > 0.0:
+            tension = {'bias': min(30.0, 0.1 * force), 'limit': force, 'max': 1.5 * force}
+            muscles[-1]['tension'] = {k: round(v, 3) for k, v in tension.items()}
+    joints = [name for name in source.model.names[1:] if name not in source.couplings]
+    document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
+    if source.end_effector:
+        document['end_effector'] = source.end_effector
+    if source.couplings:
+        document['couplings'] = [{'joint': s, **c._asdict()} for s, c in source.couplings.items()]
+    text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
+    head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
+    out.mkdir(parents=True, exist_ok=True)
+    (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
+    (out / 'robot.urdf').write_text(body, encoding='utf-8')
+
+
+def compare(source: Source, robot: Robot) -> dict[str, float] | None:
+    """Return each muscle's largest length error [m] over POSTURES, or None without own lengths."""
+    if source.lengths is None:
+        return None
+    theta, kin = robot.random_postures(POSTURES, np.random.default_rng(0)), robot.kinematics
+    ours = dict(zip(robot.muscles, robot.routes.absolute_lengths(theta).T))
+    theirs = source.lengths(dict(zip(kin.model.names[1:], kin.tree_angles(theta).T)))
+    return {name: float(np.abs(ours[name] - theirs[name]).max()) for name in ours if name in theirs}

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A wire between two points that a sphere or a cylinder may stand in the way of.
+
+In the plane of the end points and the centre (sphere) or across the axis (cylinder), the wire goes
+straight, or along a tangent, round by an arc, and off along the other tangent:
+
+    length = √(a² − r²) + √(b² − r²) + r · arc        a, b: distances of the ends from the centre
+
+On a cylinder the wire also advances evenly along the axis: √(length² + Δz²). Without a `side` it
+wraps where the straight line would cut the object, the short way round. With one it passes the
+object on that side; a side *inside* the object makes it a ring that the wire runs through. Which
+tangents, and when, is MuJoCo's choice (its `mju_wrap`), so that its models keep their lengths. At
+the points where the wire lifts off the arc is nil and tangents and straight line are the same, so
+that length and moment arm are continuous. Compiled by numba for one wire: the geometric model
+calls it for many, the emulator in each of its steps.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.robot.description import Wrap
+from musculoskeletal_ae.robot.kinematics import Kinematics
+
+TINY = 1e-12
+Vector = tuple[float, float, float] | Array
+
+
+class WrapObjects(NamedTuple):
+    """One sphere or cylinder for each segment that has one, in the frame of its tree joint."""
+
+    joint: Ints  # (S,)
+    centre: Array  # [m], (S, 3)
+    axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
+    side: Array  # from the centre [m], NaN for none, (S, 3)
+    radius: Array  # [m], 0 for no object, (S,)
+
+
+def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
+    """Return what a description wraps segments round, one each, in the frames of tree joints."""
+    joints, poses = zip(*(kinematics.placement(wrap.link) for wrap in wraps))
+    rows = [
+        (
+            at.act(wrap.xyz),
+            np.zeros(3) if wrap.axis is None else at.rotation @ wrap.axis,
+            np.full(3, np.nan) if wrap.side is None else at.rotation @ (wrap.side - wrap.xyz),
+            wrap.radius,
+        )
+        for at, wrap in zip(poses, wraps)
+    ]
+    return WrapObjects(np.array(joints), *map(np.array, zip(*rows)))
+
+
+@njit(cache=True)
+def _product(a: complex, b: complex) -> complex:
+    """Return a · b in the real part, a × b in the imaginary one."""
+    return a.conjugate() * b
+
+
+@njit(cache=True)
+def _meet(a: complex, b: complex, c: complex, d: complex) -> bool:
+    """Return whether the segments a–b and c–d cross."""
+    determinant = _product(b - a, d - c).imag
+    if abs(determinant) < TINY:
+        return False
+    p = _product(d - c, a - c).imag / determinant
+    q = _product(b - a, a - c).imag / determinant
+    return 0.0 <= p <= 1.0 and 0.0 <= q <= 1.0
+
+
+@njit(cache=True)
+def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, complex, complex]:
+    """Return what `_round` does for a wire that is drawn to a ring's inside.
+
+    Where it touches, both straight parts make the same angle with the radius: with z its sine,
+    asin(r z / a) + asin(r z / b) − 2 asin z + (angle between the ends) = 0.
+    """
+    straight = False, 0.0, 0j, 0j
+    d, far, near = b - a, abs(a), abs(b)
+    if far <= r or near <= r or abs(d) < TINY:
+        return straight
+    share = min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real))
+    cosine = _product(a, b).real / (far * near)
+    if abs(a + share * d) <= r or cosine <= TINY - 1.0:
+        return straight
+    angle = math.acos(min(1.0, cosine))
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        z = 0.5 * (low + high)
+        if math.asin(r * z / far) + math.asin(r * z / near) - 2.0 * math.asin(z) + angle > 0.0:
+            low = z
+        else:
+            high = z
+    turn = math.asin(low) - math.asin(r * low / far)
+    touch = a / far * r * cmath.rect(1.0, math.copysign(turn, _product(a, b).imag))
+    first, second = max(abs(touch - a), TINY), max(abs(touch - b), TINY)
+    return True, first + second, (touch - a) / first, (touch - b) / second
+
+
+@njit(cache=True)
+def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float, complex, complex]:
+    """Return whether it wraps in the plane, its length, and the unit pulls at a and at b.
+
+    The side is a direction, or 0 for none.
+    """
+    straight = False, 0.0, 0j, 0j
+    d, sided = b - a, abs(side) > 0.5
+    if abs(a) < r or abs(b) < r or abs(d) < TINY:
+        return straight
+    nearest = a + min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real)) * d
+    if abs(nearest) > r and (not sided or _product(side, nearest).real >= 0.0):
+        return straight
+    best, result = -1e9, straight
+    for way in (1.0, -1.0):
+        start = cmath.phase(a) + way * math.acos(r / abs(a))
+        end = cmath.phase(b) - way * math.acos(r / abs(b))
+        u, v = cmath.rect(r, start), cmath.rect(r, end)
+        good = _product(u + v, side).real / (abs(u + v) + TINY) if sided else -abs(u - v)
+        crosses = _meet(a, u, b, v)
+        if crosses:
+            good = -1e4
+        if good > best:
+            best, arc = good, (way * (end - start)) % (2.0 * math.pi)
+            # An arc that rounding made just less than nothing is no turn round the object.
+            wraps = not crosses and arc < 2.0 * math.pi - 1e-9
+            length = math.sqrt(abs(a) ** 2 - r * r) + math.sqrt(abs(b) ** 2 - r * r) + r * arc
+            # Where it meets the circle, the wire goes the way it turns.
+            result = wraps, length, way * 1j * u / r, -way * 1j * v / r
+    return result
+
+
+@njit(cache=True)
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
+def _cross(a: Vector, b: Vector) -> Vector:
+    x, y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+    return x, y, a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def _unit(a: Vector) -> Vector:
+    size = max(math.sqrt(_dot(a, a)), TINY)
+    return a[0] / size, a[1] / size, a[2] / size
+
+
+@njit(cache=True)
+def _beside(a: Vector) -> Vector:
+    """Return some unit vector across a unit vector."""
+    return _unit(_cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
+
+
+@njit(cache=True)
+def _placed(rotation: Array, vector: Array) -> Vector:
+    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
+
+
+@njit(cache=True)
+def wrapped_segment(
+    objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array,
+    leave: Array, arrive: Array,
+) -> float:  # fmt: skip
+    """Return the length [m] of segment s from start to end, points in the root link's frame.
+
+    The objects are placed by the poses (J, 3, 3), (J, 3) of the tree's joints. Fills the unit
+    vectors along which the wire pulls its start (`leave`) and its end (`arrive`).
+    """
+    j, radius, line = objects.joint[s], objects.radius[s], _minus(end, start)
+    straight = math.sqrt(_dot(line, line))
+    for k in range(3):
+        leave[k] = line[k] / max(straight, TINY)
+        arrive[k] = -leave[k]
+    if radius <= 0.0:
+        return straight
+    axis, side = _placed(rotation[j], objects.axis[s]), _placed(rotation[j], objects.side[s])
+    centre, sided = _placed(rotation[j], objects.centre[s]), not math.isnan(side[0])
+    a = _minus(_minus(start, translation[j]), centre)
+    b = _minus(_minus(end, translation[j]), centre)
+    if _dot(axis, axis) > 0.5:
+        u = _beside(axis)
+        v = _cross(axis, u)
+    else:
+        u, normal = _unit(a), _cross(a, b)
+        if _dot(normal, normal) < 1e-18 * _dot(a, a) * _dot(b, b):
+            # Through the centre every plane is as good: take that of the side, or any.
+            normal = _cross(a, side) if sided else _beside(u)
+        v = _cross(_unit(normal), u)
+    flat_a, flat_b = complex(_dot(a, u), _dot(a, v)), complex(_dot(b, u), _dot(b, v))
+    if sided and _dot(side, side) < radius * radius:
+        wraps, flat, first, last = _through_ring(flat_a, flat_b, radius)
+    else:
+        way = complex(_dot(side, u), _dot(side, v)) if sided else 0j
+        wraps, flat, first, last = _round(flat_a, flat_b, radius, way / max(abs(way), TINY))
+    if not wraps:
+        return straight
+    rise = _dot(line, axis)
+    length = math.sqrt(flat * flat + rise * rise)
+    for k in range(3):
+        leave[k] = (flat * (first.real * u[k] + first.imag * v[k]) + rise * axis[k]) / length
+        arrive[k] = (flat * (last.real * u[k] + last.imag * v[k]) - rise * axis[k]) / length
+    return length
+
+
+@njit(cache=True)
+def wrapped_segments(
+    objects: WrapObjects, rotation: Array, translation: Array, start: Array, end: Array
+) -> tuple[Array, Array, Array]:
+    """Return lengths (N, S) and pulls at start and end (N, S, 3) of segments, ends (N, S, 3)."""
+    lengths = np.zeros((start.shape[0], start.shape[1]))
+    leave, arrive = np.zeros(start.shape), np.zeros(start.shape)
+    for n in range(start.shape[0]):
+        for s in range(start.shape[1]):
+            lengths[n, s] = wrapped_segment(
+                objects, s, rotation[n], translation[n], start[n, s], end[n, s],
+                leave[n, s], arrive[n, s],
+            )  # fmt: skip
+    return lengths, leave, arrive
+
+
+def touched(
+    objects: WrapObjects, s: int, most: int, rotation: Array, translation: Array,
+    start: Array, end: Array,
+) -> Array:  # fmt: skip
+    """Return points along the arc of one wrapped segment for drawing, (K, 3); none if straight.
+
+    K is `most` on an arc, 1 in a ring.
+    """
+    leave, arrive = np.zeros(3), np.zeros(3)
+    length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
+    if np.linalg.norm(leave + arrive) < 1e-9:
+        return np.zeros((0, 3))
+    j, radius = objects.joint[s], objects.radius[s]
+    if objects.side[s] @ objects.side[s] < radius**2:
+        # A ring: the straight parts meet where the wire touches it.
+        parts = np.linalg.lstsq(np.stack([leave, -arrive], axis=1), end - start, rcond=None)[0]
+        return (start + parts[0] * leave)[None]
+    axis, centre = rotation[j] @ objects.axis[s], translation[j] + rotation[j] @ objects.centre[s]
+    across = np.eye(3) - np.outer(axis, axis)
+    ahead, speed = across @ leave, float(np.linalg.norm(across @ leave))
+    # The straight parts end where they are nearest to the axis.
+    first, last = ((centre - start) @ ahead / speed**2, (centre - end) @ across @ arrive / speed**2)
+    turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, most)[:, None]
+    begin = start + first * leave - centre
+    along = (begin @ axis + turn * radius / speed * (leave @ axis)) * axis
+    points: Array = centre + along + np.cos(turn) * (across @ begin)
+    return points + np.sin(turn) * radius * ahead / speed

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`import_robot`: makes a robot directory out of another project's model."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from musculoskeletal_ae.options import Parser, exit_status, names
+from musculoskeletal_ae.start import load
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Import one model; exit status 0 if what was written loads."""
+    parser = Parser(
+        'import_robot',
+        'Makes a robot directory out of a MuJoCo model (MJCF), a cardsflow.xml beside its '
+        'model.urdf or model.sdf, an OpenSim model (.osim, version 4) or a URDF (a skeleton to '
+        'fill in). Says what it chose, dropped or approximated, and how far lengths are from '
+        "the source's own. Exit status 0: the directory loads.",
+    )
+    parser.add_argument('file', type=Path, metavar='FILE', help='the model')
+    parser.add_out('DIR', 'new or empty directory')
+    for kind in ('joints', 'muscles'):
+        told = f'{kind} to keep'
+        parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=told)
+    parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
+    told = 'end effector; joints beside the way to it are held'
+    parser.add_argument('--end', metavar='LINK', help=told)
+    args = parser.parse_args(argv)
+    return exit_status(lambda: load('musculoskeletal_ae.importing.convert').run(args))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

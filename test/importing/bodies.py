@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small own models of every format that `import_robot` reads."""
+
+from __future__ import annotations
+
+MJCF = """<mujoco model="own">
+  <compiler angle="radian"><lengthrange mode="none"/></compiler>
+  <worldbody>
+    <body name="base" pos="0 0.1 1" euler="0.2 0 0.1">
+      <geom type="sphere" size="0.02" mass="1"/>
+      <site name="o1" pos="0.06 0 0"/> <site name="o2" pos="-0.06 0.01 0"/>
+      <site name="o3" pos="0.01 0.06 0.01"/> <site name="o4" pos="0.01 -0.06 0.01"/>
+      <body name="upper" pos="0 0 -0.02">
+        <joint name="swing" axis="0 1 0" range="-1 1.2" pos="0 0 0.01" ref="0.2" limited="true"/>
+        <joint name="lift" axis="1 0.1 0" range="-0.6 0.6" limited="true"/>
+        <geom name="ball" type="sphere" size="0.03" mass="0.4"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+        <site name="u1" pos="0.04 0 -0.12"/> <site name="u2" pos="-0.04 0 -0.12"/>
+        <site name="u3" pos="0 0.05 -0.12"/> <site name="u4" pos="0 -0.05 -0.12"/>
+        <site name="side" pos="-0.06 0 -0.3"/>
+        <geom name="drum" type="cylinder" size="0.025 0.05" pos="0 0 -0.3" euler="1.57 0 0.1"
+              mass="0.01"/>
+        <body name="lower" pos="0 0 -0.3">
+          <joint name="elbow" axis="0 1 0" range="-1.8 0.2" limited="true"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.015" mass="0.7"/>
+          <site name="l1" pos="0.035 0 -0.08"/> <site name="l2" pos="-0.03 0.01 -0.06"/>
+          <body name="finger" pos="0 0 -0.25">
+            <joint name="curl" axis="0 1 0" range="-2 2" limited="true"/>
+            <geom type="capsule" fromto="0 0 0 0 0 -0.05" size="0.01" mass="0.1"/>
+            <site name="f1" pos="0.015 0 -0.02"/> <site name="f2" pos="-0.015 0 -0.02"/>
+            <site name="hole" pos="0 0 0"/>
+            <geom name="ring" type="sphere" size="0.012" mass="0.001"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="curl" joint2="elbow" polycoef="0.1 0.5 0 0 0"/></equality>
+  <tendon>
+    <spatial name="front"><site site="o1"/><geom geom="ball"/><site site="u1"/></spatial>
+    <spatial name="back"><site site="o2"/><geom geom="ball"/><site site="u2"/></spatial>
+    <spatial name="out"><site site="o3"/><site site="u3"/></spatial>
+    <spatial name="in"><site site="o4"/><site site="u4"/></spatial>
+    <spatial name="bend"><site site="u1"/><site site="l1"/></spatial>
+    <spatial name="stretch">
+      <site site="u2"/><geom geom="drum" sidesite="side"/><site site="l2"/></spatial>
+    <spatial name="curler">
+      <site site="l1"/><geom geom="ring" sidesite="hole"/><site site="f1"/></spatial>
+    <fixed name="none"><joint joint="elbow" coef="1"/></fixed>
+  </tendon>
+  <actuator>
+    <muscle name="m1" tendon="front" force="180"/><muscle name="m2" tendon="back" force="150"/>
+    <muscle name="m3" tendon="out" force="150"/><muscle name="m4" tendon="in" force="150"/>
+    <muscle name="m5" tendon="bend" force="200"/><muscle name="m6" tendon="stretch" force="200"/>
+    <muscle name="m7" tendon="curler" force="50"/><motor name="not" joint="elbow"/>
+  </actuator>
+</mujoco>
+"""
+
+URDF = """<robot name="own">
+  <link name="base"><inertial><origin xyz="0 0.01 0.1"/><mass value="2"/>
+    <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>
+  <link name="arm"><inertial><origin xyz="0.01 0 -0.15" rpy="0.2 0 0"/><mass value="1"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.001"/></inertial></link>
+  <link name="hand"><inertial><origin xyz="0 0 -0.05"/><mass value="0.4"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/>
+    <origin xyz="0 0 0.2" rpy="0.1 0 0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
+    <origin xyz="0 0 -0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/>{mimic}</joint>
+</robot>
+"""
+
+# The same arm: frames of links at their centres of mass, joints given in their child's frame.
+SDF = """<sdf version="1.6"><model name="own">
+  <link name="base"><pose>0 0 0 0 0 0</pose>
+    <inertial><pose>0 0.01 0.1 0 0 0</pose><mass>2</mass><inertia><ixx>0.02</ixx>
+      <iyy>0.02</iyy><izz>0.01</izz></inertia></inertial></link>
+  <link name="arm"><pose>0 0 0.1 0 0 0</pose>
+    <inertial><mass>1</mass><inertia><ixx>0.01</ixx><iyy>0.01</iyy><izz>0.001</izz></inertia>
+    </inertial></link>
+  <joint name="shoulder" type="revolute"><parent>base</parent><child>arm</child>
+    <pose>0 0 0.1 0 0 0</pose>
+    <axis><xyz>0 1 0</xyz><limit><lower>-1</lower><upper>1</upper></limit></axis></joint>
+</model></sdf>
+"""
+
+CARDSFLOW = """<cardsflow>
+  <myoMuscle name="front"><link name="base"><viaPoint type="FIXPOINT">0.05 0 0.1</viaPoint></link>
+    <link name="arm"><viaPoint type="FIXPOINT">0.04 0 0.05</viaPoint></link></myoMuscle>
+  <myoMuscle name="back"><link name="base"><viaPoint type="FIXPOINT">-0.05 0 0.1</viaPoint>
+    <viaPoint type="SPHERICAL" radius="0.02" state="1" revCounter="0">0 -0.01 0.1</viaPoint></link>
+    <link name="arm"><viaPoint type="FIXPOINT">-0.04 0 0.05</viaPoint></link></myoMuscle>
+  <myoMuscle name="still"><link name="world"><viaPoint>0.05 0 0.1</viaPoint></link>
+    <link name="base"><viaPoint>0 0 0</viaPoint></link></myoMuscle>
+</cardsflow>
+"""
+
+_FRAMES = """<socket_parent_frame>up</socket_parent_frame>
+  <socket_child_frame>down</socket_child_frame><frames>
+  <PhysicalOffsetFrame name="up"><socket_parent>{parent}</socket_parent>
+    <translation>{at}</translation><orientation>0.1 0.2 -0.1</orientation></PhysicalOffsetFrame>
+  <PhysicalOffsetFrame name="down"><socket_parent>/bodyset/{child}</socket_parent>
+    <translation>0 0.01 0</translation><orientation>0 0 0.2</orientation></PhysicalOffsetFrame>
+  </frames>"""
+
+
+def _body(name: str, extra: str = '') -> str:
+    return f"""<Body name="{name}"><mass>1</mass><mass_center>0 -0.1 0</mass_center>
+      <inertia>0.01 0.002 0.01 0 0 0</inertia>{extra}</Body>"""
+
+
+def _coordinate(name: str, low: float, high: float, locked: str = 'false') -> str:
+    return f"""<coordinates><Coordinate name="{name}"><default_value>0.1</default_value>
+      <range>{low} {high}</range><locked>{locked}</locked></Coordinate></coordinates>"""
+
+
+def _axis(name: str, axis: str, coordinate: str, function: str) -> str:
+    return f"""<TransformAxis name="{name}"><coordinates>{coordinate}</coordinates>
+      <axis>{axis}</axis>{function}</TransformAxis>"""
+
+
+def _point(kind: str, body: str, inside: str) -> str:
+    return f"""<{kind} name="p"><socket_parent_frame>/bodyset/{body}</socket_parent_frame>
+      {inside}</{kind}>"""
+
+
+def _at(xyz: str) -> str:
+    return f'<location>{xyz}</location>'
+
+
+def _muscle(name: str, points: str, wraps: str = '') -> str:
+    return f"""<Thelen2003Muscle name="{name}"><GeometryPath><PathPointSet><objects>{points}
+      </objects></PathPointSet><PathWrapSet><objects>{wraps}</objects></PathWrapSet></GeometryPath>
+      <max_isometric_force>300</max_isometric_force></Thelen2003Muscle>"""
+
+
+_LINEAR = '<LinearFunction name="function"><coefficients>{} {}</coefficients></LinearFunction>'
+_SPLINE = '<SimmSpline name="function"><x>-1 0 1 2</x><y>{}</y></SimmSpline>'
+_SLIDE = _SPLINE.format('0.001 0 0.001 0.004')
+_WRAP = """<WrapObjectSet><objects><WrapCylinder name="drum"><active>true</active>
+  <xyz_body_rotation>0 0.1 0</xyz_body_rotation><translation>0 -0.3 0</translation>
+  <quadrant>-x</quadrant><radius>0.02</radius><length>0.1</length></WrapCylinder></objects>
+  </WrapObjectSet>"""
+_MOVING = """<socket_x_coordinate>/jointset/elbow/flexion</socket_x_coordinate>
+  <x_location><SimmSpline><x>0 1 2</x><y>0.03 0.031 0.032</y></SimmSpline></x_location>
+  <y_location><Constant><value>-0.05</value></Constant></y_location>
+  <z_location><Constant><value>0</value></Constant></z_location>"""
+_CONDITION = """<socket_coordinate>/jointset/elbow/flexion</socket_coordinate>
+  <range>0.1 2</range><location>0.032 -0.04 0</location>"""
+
+OSIM = f"""<OpenSimDocument Version="40000"><Model name="own"><Ground name="ground"/>
+<BodySet><objects>{_body('humerus', _WRAP)}{_body('ulna')}{_body('hand')}</objects></BodySet>
+<JointSet><objects>
+<CustomJoint name="shoulder">{_FRAMES.format(parent='/ground', child='humerus', at='0 1 0')}
+  {_coordinate('raise', -0.5, 1.5)}<SpatialTransform>
+  {_axis('rotation1', '0 0 1', 'raise', _LINEAR.format(1, 0))}
+  {_axis('rotation2', '0 1 0', 'raise', _LINEAR.format(0.3, 0.1))}
+  {_axis('translation1', '1 0 0', 'raise', _SLIDE)}
+  {_axis('translation2', '0 1 0', '', '<Constant name="function"><value>0.02</value></Constant>')}
+  </SpatialTransform></CustomJoint>
+<PinJoint name="elbow">{_FRAMES.format(parent='/bodyset/humerus', child='ulna', at='0 -0.3 0')}
+  {_coordinate('flexion', 0, 2)}</PinJoint>
+<PinJoint name="wrist">{_FRAMES.format(parent='/bodyset/ulna', child='hand', at='0 -0.25 0')}
+  {_coordinate('bend', -1, 1, 'true')}</PinJoint>
+</objects></JointSet>
+<ForceSet><objects>
+{_muscle('flexor', _point('PathPoint', 'humerus', _at('0.03 -0.1 0')) + _point('PathPoint', 'ulna', _at('0.03 -0.05 0')))}
+{_muscle('extensor', _point('PathPoint', 'humerus', _at('-0.03 -0.2 0')) + _point('PathPoint', 'ulna', _at('-0.03 -0.05 0')), '<PathWrap><wrap_object>drum</wrap_object><range>-1 -1</range></PathWrap>')}
+{_muscle('moving', _point('PathPoint', 'humerus', _at('0.03 -0.15 0')) + _point('ConditionalPathPoint', 'ulna', _CONDITION) + _point('MovingPathPoint', 'ulna', _MOVING))}
+<PointActuator name="push"/>
+</objects></ForceSet></Model></OpenSimDocument>
+"""  # noqa: E501

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every format: lengths against the source's own, cut chains, and files that are damaged."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+
+import bodies
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.convert import import_robot, read_source
+from musculoskeletal_ae.importing.source import SourceError, cut, urdf
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.import_robot import main
+
+PULLEY = '<pulley divisor="2"/>'
+BRANCH = f'{PULLEY}<site site="u2"/><site site="l2"/>{PULLEY}<site site="o3"/>'
+
+
+def put(directory, name, text):
+    directory.mkdir(exist_ok=True)
+    (directory / name).write_text(text, encoding='utf-8')
+    return directory / name
+
+
+@pytest.fixture
+def mjcf(tmp_path):
+    pytest.importorskip('mujoco')
+    return put(tmp_path, 'own.xml', bodies.MJCF)
+
+
+@pytest.fixture
+def cardsflow(tmp_path):
+    put(tmp_path, 'model.urdf', bodies.URDF.format(mimic=''))
+    return put(tmp_path, 'cardsflow.xml', bodies.CARDSFLOW)
+
+
+def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
+    result = import_robot(mjcf, tmp_path / 'out')
+    assert result.robot.joints == ('swing', 'lift', 'elbow')
+    assert max(result.errors.values()) < 1e-6
+    assert len(result.robot.routes.wrapping) == 4
+    assert result.robot.description.couplings['curl'].ratio == pytest.approx(0.5)
+    assert result.robot.tension.limit[0] == pytest.approx(180.0)
+    assert 'dropped: tendon none: a fixed one, which has no route' in result.notes
+    assert 'dropped: actuator not: on no tendon' in result.notes
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told', 'off', 'least'),
+    [
+        ('0.1 0.5 0 0 0', '0.1 0.5 0.1 0 0', 'curl follows elbow by a line', 'curler', 1e-5),
+        ('<site site="o3"/>', BRANCH, 'of 2 branches over pulleys', 'out', 0.01),
+    ],
+)
+def test_what_the_format_cannot_express_is_told_and_measured(
+    mjcf, tmp_path, old, new, told, off, least
+):
+    mjcf.write_text(mjcf.read_text().replace(old, new))
+    result = import_robot(mjcf, tmp_path / 'out')
+    assert any(told in note for note in result.notes)
+    assert result.errors.pop(off) > least
+    assert max(result.errors.values()) < 1e-6
+
+
+def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_path):
+    result = import_robot(cardsflow, tmp_path / 'out')
+    assert result.robot.muscles == ('front', 'back')
+    point = result.robot.description.routes[0][0]
+    np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
+    assert result.errors == pytest.approx({'front': 0.0}, abs=1e-9)  # it has no lengths of wraps
+    assert any('muscle still: it moves no joint' in note for note in result.notes)
+
+
+def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
+    text = re.sub(r' rpy="[^"]*"', '', (tmp_path / 'model.urdf').read_text())
+    put(tmp_path, 'model.urdf', text.replace('0.01 0 -0.15', '0 0 -0.1'))
+    first = import_robot(cardsflow, tmp_path / 'two', end='arm').robot
+    (tmp_path / 'model.urdf').unlink()
+    put(tmp_path, 'model.sdf', bodies.SDF)
+    second = import_robot(cardsflow, tmp_path / 'three').robot
+    assert second.joints == first.joints == ('shoulder',)
+    theta = np.linspace(-1.0, 1.0, 9)[:, None]
+    expected = first.routes.absolute_lengths(theta)
+    np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
+
+
+def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path):
+    mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
+    file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
+    robot = import_robot(file, tmp_path / 'out').robot
+    assert robot.joints == ('shoulder',)
+    assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
+    assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
+
+
+def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
+    result = import_robot(put(tmp_path, 'own.osim', bodies.OSIM), tmp_path / 'out')
+    assert result.robot.joints == ('raise', 'flexion')
+    assert result.errors['flexor'] < 1e-6
+    assert result.errors['extensor'] < 1e-6  # beside its wrap object, which is that of the result
+    assert 1e-4 < result.errors['moving'] < 0.005
+    told = '\n'.join(result.notes)
+    for expected in (
+        'a moving point stands still, off by 1.0 mm',
+        'active in 95 % of flexion is always there',
+        'locked coordinate bend at 0.1',
+        'PointActuator push',
+        'follows raise by a line, off by up to',
+    ):
+        assert expected in told
+    assert {c.master for c in result.robot.description.couplings.values()} == {'raise'}
+    assert result.robot.root_link == 'ground_upright'  # OpenSim's y axis is up
+    pose = result.robot.kinematics.link_pose(np.zeros(2), 'humerus')
+    assert pose.translation[2] > 0.9
+
+
+def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
+    out = tmp_path / 'out'
+    options = ['--base', 'upper', '--end', 'lower', '--out', str(out)]
+    assert main([str(mjcf), *options]) == 0
+    robot, told = Robot.load(out), capsys.readouterr().out
+    assert (robot.root_link, robot.description.end_effector) == ('upper_upright', 'lower')
+    assert robot.joints == ('elbow',)
+    assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
+    assert 'dropped: muscle front: fastened to base, which was cut off' in told
+    assert 'largest length error over 1000 postures: 0.000 mm' in told
+    assert 'check_robot: not sound' in told  # nothing holds it open against its weight
+
+
+def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
+    whole = import_robot(mjcf, tmp_path / 'whole').robot
+    part = import_robot(mjcf, tmp_path / 'part', base='upper').robot
+    rest = np.array([0.2, 0.0])  # where MuJoCo's file puts the joints above
+    for elbow in (-1.0, 0.1):
+        torque = whole.kinematics.holding_torque(np.append(rest, elbow))[2]
+        np.testing.assert_allclose(part.kinematics.holding_torque(np.array([elbow])), torque)
+
+
+def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_path):
+    result = import_robot(mjcf, tmp_path / 'out', joints=['elbow'], muscles=['bend', 'stretch'])
+    assert result.robot.joints == ('elbow',)
+    assert 'held fixed: joint swing at 0.2' in result.notes
+    assert max(result.errors.values()) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ('options', 'told'),
+    [
+        ({'joints': ['knee']}, '--joints knee: no such joint; joints: swing, lift, elbow'),
+        ({'joints': ['curl']}, '--joints curl: coupled'),
+        ({'muscles': ['psoas']}, '--muscles psoas: no such muscle'),
+        ({'base': 'moon'}, '--base moon: no such link; links: world, base'),
+        ({'base': 'lower', 'end': 'upper'}, 'does not hang on --base lower'),
+    ],
+)
+def test_a_wrong_option_names_what_is_legal(mjcf, options, told):
+    with pytest.raises(SourceError, match=re.escape(told)):
+        cut(read_source(mjcf), **options)
+
+
+def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsys):
+    assert main([str(mjcf), '--out', str(tmp_path)]) == 1
+    assert 'expected a new or empty directory' in capsys.readouterr().err
+    other = put(tmp_path, 'other.xml', '<html/>')
+    assert main([str(other), '--out', str(tmp_path / 'out')]) == 1
+    assert 'none of the formats read: mujoco, cardsflow' in capsys.readouterr().err
+    bomb = '<!DOCTYPE x [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><mujoco>&b;</mujoco>'
+    assert main([str(put(tmp_path, 'bomb.xml', bomb)), '--out', str(tmp_path / 'out')]) == 1
+    assert 'no DOCTYPE is allowed' in capsys.readouterr().err
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.sampled_from(['OSIM', 'CARDSFLOW', 'URDF', 'SDF']), st.data())
+def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, format_, data):
+    """Words of a file are replaced or left out, elements cut away."""
+    text = getattr(bodies, format_).format(mimic='<mimic joint="shoulder" multiplier="2"/>')
+    words = re.split(r'(?<=[ >"])|(?=[<"])', text)
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(words) - 1))
+        legal = ['', '1e999', 'nan', '-1', 'x', '<a/>', '0', words[place] * 2]
+        words[place] = data.draw(st.sampled_from(legal))
+    folder = tmp_path_factory.mktemp('damaged')
+    file = put(folder, 'cardsflow.xml', bodies.CARDSFLOW)
+    if format_ == 'CARDSFLOW':
+        put(folder, 'model.urdf', bodies.URDF.format(mimic=''))
+    names = {'CARDSFLOW': file.name, 'URDF': 'model.urdf', 'SDF': 'model.sdf', 'OSIM': 'own.osim'}
+    damaged = put(folder, names[format_], ''.join(words))
+    with suppress(MusculoskeletalError):
+        source = read_source(damaged if format_ == 'OSIM' else file)
+        cut(source)
+        assert urdf(source)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coupled joints, several end effectors, and what each muscle may have of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from robots import read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.tools.robot_report import joint_notes
+
+COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
+
+
+def coupled_arm(directory, **top):
+    write_robot(directory, finger=True, **top)
+    document = read_muscles(directory)
+    document['muscles'][4]['route'].append({'link': 'fingertip', 'xyz': [0.02, 0.01, 0.0]})
+    return write_muscles(directory, document)
+
+
+@pytest.fixture(scope='module')
+def robot(tmp_path_factory):
+    return Robot.load(coupled_arm(tmp_path_factory.mktemp('coupled'), couplings=[COUPLED]))
+
+
+def energy(robot, theta):
+    kin = robot.kinematics
+    return pin.computePotentialEnergy(kin.model, kin.data, kin.tree_angles(theta))
+
+
+def slope(function, theta, step=1e-6):
+    shifts = step * np.eye(len(theta))
+    ends = [function(theta + d) - function(theta - d) for d in shifts]
+    return np.stack(ends, axis=-1) / (2 * step)
+
+
+def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
+    kin = robot.kinematics
+    assert robot.joints == ('bend', 'lift', 'swing')
+    for theta in robot.random_postures(4, np.random.default_rng(0)):
+        assert kin.tree_angles(theta).shape == (4,)
+        gravity = slope(lambda t: np.array(energy(robot, t)), theta)
+        np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
+        gradient = slope(kin.holding_torque, theta)
+        np.testing.assert_allclose(kin.gravity_gradient(theta), gradient, atol=1e-5)
+        load, load_slope = Load(kin)(theta[None])
+        np.testing.assert_allclose(load[0], kin.holding_torque(theta), atol=1e-9)
+        np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)
+        lengths = slope(robot.routes.absolute_lengths, theta)
+        np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), lengths, atol=1e-7)
+        inertia = pin.crba(kin.model, kin.data, kin.tree_angles(theta))
+        whole = kin.transmission.T @ (np.triu(inertia) + np.triu(inertia, 1).T) @ kin.transmission
+        np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
+
+
+def test_the_emulated_joint_follows_its_master(robot):
+    arm = EmulatedArm(robot, 0)
+    before = arm.theta
+    arm.command_length(arm.sense().length - 0.01)
+    arm.step(0.4)
+    assert np.abs(arm.theta - before).max() > 0.01
+    q = robot.kinematics.tree_angles(arm.theta)
+    np.testing.assert_allclose(arm._joint.q, q, atol=1e-9)
+
+
+MIMIC = '<mimic joint="bend" multiplier="-0.5" offset="0.2"/><axis xyz="0 0 1"/>'
+
+
+def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(robot, tmp_path):
+    coupled_arm(tmp_path)
+    plain = Robot.load(tmp_path)
+    assert plain.description.held_joints == ('finger',)
+    assert joint_notes(plain.description) == ['held fixed at 0: finger']
+    urdf = tmp_path / 'robot.urdf'
+    urdf.write_text(urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC))
+    mimic = Robot.load(tmp_path)
+    assert joint_notes(mimic.description) == ['finger = -0.5 · bend +0.2']
+    theta = mimic.random_postures(5, np.random.default_rng(0))
+    expected = robot.routes.absolute_lengths(theta)
+    np.testing.assert_array_equal(mimic.routes.absolute_lengths(theta), expected)
+
+
+BAD = {
+    'follows itself': ([COUPLED, {'joint': 'bend', 'master': 'finger'}], 'follows itself'),
+    'listed as free': ([{'joint': 'bend', 'master': 'lift'}], "joint 'bend' follows 'lift'"),
+    'unknown master': ([{'joint': 'finger', 'master': 'toe'}], "unknown joint 'toe'"),
+    'twice': ([COUPLED, COUPLED], "'finger' is listed twice"),
+    'ratio': ([{**COUPLED, 'ratio': 'x'}], 'ratio: expected a finite number'),
+}
+
+
+@pytest.mark.parametrize('case', BAD)
+def test_a_wrong_coupling_is_refused(tmp_path, case):
+    couplings, told = BAD[case]
+    joints = ['lift', 'swing'] if case == 'follows itself' else ['bend', 'lift', 'swing']
+    with pytest.raises(RobotDescriptionError, match=told):
+        Robot.load(coupled_arm(tmp_path, joints=joints, couplings=couplings))
+
+
+def test_several_end_effectors_are_drawn_and_the_first_one_used(tmp_path):
+    write_robot(tmp_path, end_effectors=['lower', 'tool'])
+    document = read_muscles(tmp_path)
+    with pytest.raises(RobotDescriptionError, match='both are given'):
+        Robot.load(tmp_path)
+    del document['end_effector']
+    robot = Robot.load(write_muscles(tmp_path, document))
+    assert robot.description.end_effectors == ('lower', 'tool')
+    assert robot.description.end_effector == 'lower'
+
+
+def test_a_muscle_has_a_tension_and_stiffness_of_its_own(tmp_path):
+    write_robot(tmp_path, tension={'limit': 300.0})
+    document = read_muscles(tmp_path)
+    document['muscles'][1] |= {'tension': {'bias': 10.0, 'max': 350.0}, 'stiffness': 5000.0}
+    robot = Robot.load(write_muscles(tmp_path, document))
+    assert robot.tension.bias[:3].tolist() == [30.0, 10.0, 30.0]
+    assert robot.tension.limit[:3].tolist() == [300.0, 300.0, 300.0]
+    assert robot.tension.max[:3].tolist() == [500.0, 350.0, 500.0]
+    assert robot.stiffness[:3].tolist() == [10000.0, 5000.0, 10000.0]
+    check = check_robot(robot, 20)
+    assert np.nanmin(check.tension[:, 1]) >= 10.0 - 1e-6
+    arm = EmulatedArm(robot, 0)
+    arm.command_tension(np.full(robot.muscle_count, 1000.0))
+    for _ in range(5):  # within the modules' patience
+        arm.step(0.1)
+        arm.command_tension(np.full(robot.muscle_count, 1000.0))
+    np.testing.assert_allclose(arm._muscle.reference, robot.tension.max)
+    document['muscles'][1]['tension'] = {'bias': 400.0}
+    with pytest.raises(RobotDescriptionError, match="'pull_front_in': tension: expected bias"):
+        Robot.load(write_muscles(tmp_path, document))
+
+
+def test_a_via_point_given_twice_is_accepted_and_told(tmp_path):
+    write_robot(tmp_path)
+    document = read_muscles(tmp_path)
+    route = document['muscles'][0]['route']
+    before = Robot.load(tmp_path)
+    route.insert(1, dict(route[0]))
+    robot = Robot.load(write_muscles(tmp_path, document))
+    (told,) = robot.description.warnings
+    assert 'route[1] is the same point' in told
+    theta = robot.random_postures(3, np.random.default_rng(0))
+    expected = before.routes.absolute_lengths(theta)
+    np.testing.assert_array_equal(robot.routes.absolute_lengths(theta), expected)
+
+
+WRAP = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, 0], 'axis': [0, 0, 1], 'radius': 0.02}
+
+
+@pytest.mark.parametrize(
+    ('place', 'change', 'told'),
+    [
+        (0, {}, 'stands between two points'),
+        (2, {}, 'stands between two points'),
+        (1, {'wrap': 'cone'}, "sphere or cylinder, got 'cone'"),
+        (1, {'wrap': 'sphere'}, "unknown key 'axis'"),
+        (1, {'axis': [0, 0, 0]}, 'expected a direction'),
+        (1, {'radius': 0.0}, '> 0'),
+        (1, {'side': [0, 0, 1]}, 'beside the axis'),
+        (1, {'link': 'foot'}, "unknown link 'foot'"),
+    ],
+)
+def test_a_wrong_wrap_is_refused(tmp_path, place, change, told):
+    document = read_muscles(write_robot(tmp_path))
+    document['muscles'][0]['route'].insert(place, WRAP | change)
+    with pytest.raises(RobotDescriptionError, match=told):
+        Robot.load(write_muscles(tmp_path, document))
