@@ -39,6 +39,7 @@ from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.start import load
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -64,7 +65,7 @@ class View(Node):
         """Serve the page."""
         super().__init__('view', start_parameter_services=False)
         try:
-            from musculoskeletal_ae.view import page
+            page = load('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
         except ImportError as error:
             raise MusculoskeletalError(
                 'the page needs viser: ./bringup.sh --view installs it, or '
