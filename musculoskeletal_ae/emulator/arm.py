@@ -13,6 +13,7 @@ from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.faults import Faults, Readings
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
@@ -83,14 +84,15 @@ class EmulatedArm:
             self.faults.zero,
             self.faults.hot,
         )
-        tree_joints = self.individual.tree.parent.shape[0]
+        tree_joints, segments = len(self.individual.tree.parent), len(self.individual.routes.first)
         self._scratch = mechanics.Scratch(
             np.zeros((tree_joints, 3, 3)),
             np.zeros((tree_joints, 3)),
             np.zeros((tree_joints, 3)),
             np.zeros(self.individual.routes.point.shape),
             np.zeros(muscles),
-            np.zeros(3),
+            np.zeros((segments, 3)),
+            np.zeros((segments, 3)),
             np.zeros(3),
         )
         self._muscle = mechanics.MuscleState(*(np.zeros(muscles) for _ in range(8)))
@@ -256,9 +258,8 @@ class EmulatedArm:
         if gear is None:
             free: Array = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
             return free
-        upper = np.triu(pin.crba(model, data, joint.q))
+        inertia = joint_space_inertia(model, data, joint.q)
         bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
-        inertia = upper + np.triu(upper, 1).T
         # Pinocchio's M holds the armature already.
         coupled = np.linalg.solve(gear.T @ inertia @ gear, gear.T @ (joint.torque - bias))
         return gear @ coupled

@@ -33,8 +33,8 @@ class Kind(NamedTuple):
 
 
 #: sizes of spike and bias by quantity, [m], [N], [°C], of a joint [rad]: default, most
-SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3)}
-SIZES['theta'] = 0.1, 3.2
+SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3),
+         'theta': (0.1, 3.2)}  # fmt: skip
 KINDS = {
     'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
     'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),

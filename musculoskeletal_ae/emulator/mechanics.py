@@ -112,8 +112,9 @@ class Scratch(NamedTuple):
     axis: Array
     world: Array
     absolute: Array
-    leave: Array
+    leave: Array  # unit pulls at the ends of each segment, (S, 3)
     arrive: Array
+    point: Array
 
 
 @njit(cache=True)
@@ -191,20 +192,19 @@ def muscle_step(
     place_points(routes, scratch.rotation, scratch.translation, scratch.world)
     world = scratch.world
     scratch.absolute[:] = 0.0
+    translation, leave, arrive = scratch.translation, scratch.leave, scratch.arrive
     for s in range(routes.first.shape[0]):
         scratch.absolute[routes.muscle[s]] += route_segment(
-            routes, s, scratch.rotation, scratch.translation, world, scratch.leave, scratch.arrive
+            routes, s, scratch.rotation, translation, world, leave[s], arrive[s]
         )
     _wires_and_modules(body, muscle, kind, command, scratch.absolute)
     joint.torque[:] = 0.0
     _friction_and_stops(body, joint)
     for s in range(routes.first.shape[0]):
-        leave, arrive, translation = scratch.leave, scratch.arrive, scratch.translation
-        route_segment(routes, s, scratch.rotation, translation, world, leave, arrive)
-        pull = muscle.end_tension[routes.muscle[s]]
         add_pull(
-            tree, routes, s, translation, scratch.axis, world, leave, arrive, pull, joint.torque
-        )
+            tree, routes, s, translation, scratch.axis, world, leave[s], arrive[s],
+            muscle.end_tension[routes.muscle[s]], joint.torque,
+        )  # fmt: skip
     _external_wrench(tree, joint, scratch, wrench, effector, effector_joint)
 
 
@@ -275,7 +275,7 @@ def _external_wrench(
     effector: Array,
     effector_joint: int,
 ) -> None:
-    point = scratch.leave
+    point = scratch.point
     for r in range(3):
         point[r] = scratch.translation[effector_joint, r]
         for k in range(3):

@@ -64,6 +64,7 @@ class AnomalyDetector:
         self.slack = Slack()
         self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
+        self._farthest = np.inf  # d of its threshold, where it is calibrated
         #: [s] without tension, without winding in; l [m] when tension went, when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
         self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
@@ -75,7 +76,9 @@ class AnomalyDetector:
         if mae.anomaly is not None:
             self._whiten: Array = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
             self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
-        self._statistics = mae.anomaly
+        self._statistics, self._farthest = mae.anomaly, np.inf
+        if mae.anomaly is not None and mae.anomaly.calibrated:
+            self._farthest = mae.anomaly.thresholds.get(DISTANCE, np.inf)
 
     @property
     def calibrated(self) -> bool:
@@ -127,20 +130,16 @@ class AnomalyDetector:
 
     def limit(self, theta: Array) -> float:
         """Return the d that no healthy arm reaches at θ [rad] (D,), ∞ while nothing is known."""
-        if self._statistics is None or not self._statistics.calibrated:
-            return np.inf
-        threshold = self._statistics.thresholds.get(DISTANCE, np.inf)
-        return threshold * float(np.clip(self.unfamiliar(theta), 1.0, WIDEST))
+        return self._farthest * float(np.clip(self.unfamiliar(theta), 1.0, WIDEST))
 
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
     ) -> str:
         limit, value, what, where = self.threshold, anomaly, 'A', ''
         if limit <= 0.0:
-            if self._statistics is None or not self._statistics.calibrated:
+            if not self.calibrated:
                 return ''
-            limit = self._statistics.thresholds.get(DISTANCE, np.inf)
-            value, what = distance, 'd'
+            limit, value, what = self._farthest, distance, 'd'
             if value > limit and not slack.any() and (wider := self.limit(theta)) > limit:
                 limit, where = wider, ' in an unfamiliar posture'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0

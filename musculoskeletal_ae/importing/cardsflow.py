@@ -20,7 +20,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, parse_xml, read_mimics, read_urdf
 
@@ -98,14 +98,14 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     text = ET.tostring(root, encoding='unicode')
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
     model = source.model
-    source.links = [str(f.name) for f in model.frames if f.type == pin.FrameType.BODY]
+    source.links = [str(frame.name) for frame in body_frames(model)]
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for name, joint in zip(model.names[1:], model.joints[1:]):
         if joint.shortname() in KINDS:
             q = joint.idx_q
             low[q], high[q] = source.limited(name, source.slides(name), low[q], high[q])
     model.lowerPositionLimit, model.upperPositionLimit = low, high
-    source.couplings = read_mimics(file, text)
+    source.couplings = read_mimics(root)
     origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}
     centres = {n: '0 0 0' if e is None else e.get('xyz', '0 0 0') for n, e in origins.items()}
     return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}

@@ -18,7 +18,13 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import PRISMATIC, REVOLUTE, Coupling, joint_axis
+from musculoskeletal_ae.robot.kinematics import (
+    PRISMATIC,
+    REVOLUTE,
+    Coupling,
+    joint_axis,
+    link_placement,
+)
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
@@ -93,8 +99,7 @@ class Source:
 
     def place(self, link: str) -> tuple[int, pin.SE3]:
         """Return the joint that carries a link, and the link's pose in its frame."""
-        frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
-        return int(frame.parentJoint), frame.placement
+        return link_placement(self.model, link)
 
     def span(self, joint: str) -> tuple[float, float]:
         """Return the limits of a joint."""

@@ -18,6 +18,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.qos import RELIABLE
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
+from musculoskeletal_ae.robot.kinematics import body_frames
 
 MARKER_RATE = 10.0  # [Hz]
 NAME_HEIGHT = 0.018  # [m]
@@ -84,8 +85,8 @@ class Frames:
         """Publish the poses at θ [rad] (D,)."""
         robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
         joints, transforms = robot.kinematics.transforms(theta[None])[0], []
-        for frame in robot.kinematics.model.frames:
-            if frame.type == pin.FrameType.BODY and frame.name != robot.root_link:
+        for frame in body_frames(robot.kinematics.model):
+            if frame.name != robot.root_link:
                 transform = TransformStamped(child_frame_id=self._prefix + frame.name)
                 transform.header.frame_id, transform.header.stamp = self._node.root_frame, stamp
                 pose = pin.SE3(joints[frame.parentJoint]) * frame.placement

@@ -21,9 +21,9 @@ from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.entries import Entry, refusal
-from musculoskeletal_ae.robot.kinematics import Coupling, resolved
+from musculoskeletal_ae.robot.kinematics import Coupling, body_frames, resolved
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.robot.urdf import read_mimics, read_urdf
+from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
 
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
 
@@ -97,7 +97,7 @@ class RobotDescription:
     @property
     def root_link(self) -> str:
         """Name of the URDF's root link, in whose frame poses and markers are given."""
-        return str(_links(self.model)[0].name)
+        return str(body_frames(self.model)[0].name)
 
 
 def load_description(robot: str | Path) -> RobotDescription:
@@ -115,9 +115,9 @@ def load_description(robot: str | Path) -> RobotDescription:
         'end_effectors', 'couplings',
     )  # fmt: skip
     joints = _read_joints(top['joints'], model)
-    couplings = _read_couplings(top, read_mimics(urdf_file, urdf), joints, model)
+    couplings = _read_couplings(top, read_mimics(parse_xml(urdf_file, urdf)), joints, model)
     default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
-    links = [str(frame.name) for frame in _links(model)]
+    links = [str(frame.name) for frame in body_frames(model)]
     stiffness = top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0)
     tension = _read_tension(top.get('tension', {}), TENSION_DEFAULT)
     names, routes, elastic, module, warnings = [], [], [], [], list[str]()
@@ -147,10 +147,6 @@ def load_description(robot: str | Path) -> RobotDescription:
 
 def _columns(rows: list[dict[str, float]], keys: Iterable[str]) -> dict[str, Array]:
     return {key: np.array([row[key] for row in rows]) for key in keys}
-
-
-def _links(model: pin.Model) -> list[pin.Frame]:
-    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
 
 
 def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
@@ -288,7 +284,7 @@ def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
 
 def _read_end_effectors(top: Entry, model: pin.Model, joints: tuple[str, ...]) -> tuple[str, ...]:
     one, several = top.get('end_effector'), top.get('end_effectors')
-    links = [str(frame.name) for frame in _links(model)]
+    links = [str(frame.name) for frame in body_frames(model)]
     if one.value is not None and several.value is not None:
         raise several.fail('expected end_effector or end_effectors, both are given')
     if one.value is not None:
@@ -300,4 +296,4 @@ def _read_end_effectors(top: Entry, model: pin.Model, joints: tuple[str, ...]) -
     depth = [0]
     for i in range(1, model.njoints):
         depth.append(depth[model.parents[i]] + (model.names[i] in joints))
-    return (str(max(reversed(_links(model)), key=lambda link: depth[link.parentJoint]).name),)
+    return (str(max(reversed(body_frames(model)), key=lambda link: depth[link.parentJoint]).name),)

@@ -59,6 +59,23 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
     return result
 
 
+def body_frames(model: pin.Model) -> list[pin.Frame]:
+    """Return the frames of a model's links."""
+    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
+
+
+def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
+    """Return the joint of the tree that carries a link, and the link's pose in its frame."""
+    frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
+    return int(frame.parentJoint), frame.placement
+
+
+def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
+    """Return M [kg·m² or kg] (J−1, J−1); pinocchio fills its upper half only."""
+    upper = np.triu(pin.crba(model, data, q))
+    return upper + np.triu(upper, 1).T
+
+
 def joint_axis(joint: pin.JointModel) -> Array:
     """Return the axis (3,) of a revolute or prismatic joint."""
     data = joint.createData()
@@ -143,8 +160,7 @@ class Kinematics:
 
     def placement(self, link: str) -> tuple[int, pin.SE3]:
         """Return the joint of the tree that carries a link, and the link's pose in its frame."""
-        frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]
-        return frame.parentJoint, frame.placement
+        return link_placement(self.model, link)
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
@@ -201,8 +217,7 @@ class Kinematics:
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
-        upper = np.triu(pin.crba(self.model, self.data, self.tree_angles(theta)))
-        inertia = upper + np.triu(upper, 1).T
+        inertia = joint_space_inertia(self.model, self.data, self.tree_angles(theta))
         return np.diag(self.of_theta(self.of_theta(inertia).T))
 
     def end_effector_jacobian(self, theta: Array) -> Array:

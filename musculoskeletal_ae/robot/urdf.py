@@ -75,10 +75,10 @@ def parse_xml(file: Path, text: str) -> ET.Element:
     return root
 
 
-def read_mimics(file: Path, text: str) -> dict[str, Coupling]:
+def read_mimics(root: ET.Element) -> dict[str, Coupling]:
     """Return which joints of a URDF that `read_urdf` has read follow others by <mimic>."""
     mimics = {}
-    for joint in parse_xml(file, text).findall('joint'):
+    for joint in root.findall('joint'):
         mimic = joint.find('mimic')
         if mimic is not None and joint.get('type') != 'fixed':
             ratio, offset = (float(mimic.get(*d)) for d in (('multiplier', '1'), ('offset', '0')))

@@ -59,10 +59,10 @@ Solid = tuple[int, trimesh.Trimesh]  # joint of pinocchio's tree, and what moves
 
 def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
     """Return the meshes of a URDF's visuals, or capsules; and why any mesh was left out."""
-    solids, notes, model = [], [], robot.kinematics.model
+    solids, notes = [], []
     root = ET.fromstring(robot.description.urdf)  # noqa: S314 - checked when it was loaded
     for link in root.iter('link'):
-        frame = model.frames[model.getFrameId(link.get('name'), pin.FrameType.BODY)]
+        joint, at = robot.kinematics.placement(link.get('name', ''))
         for visual in link.iterfind('visual'):
             if (element := visual.find('geometry/mesh')) is None:
                 continue
@@ -74,8 +74,8 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
             origin = visual.find('origin')
             numbers = {'xyz': '0 0 0', 'rpy': '0 0 0'} | ({} if origin is None else origin.attrib)
             xyz, rpy = (np.array(numbers[key].split(), dtype=float) for key in ('xyz', 'rpy'))
-            placed = frame.placement * pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
-            solids.append((frame.parentJoint, mesh.apply_transform(placed.homogeneous)))
+            placed = at * pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
+            solids.append((joint, mesh.apply_transform(placed.homogeneous)))
     return solids or _capsules(robot), notes
 
 
