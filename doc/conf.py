@@ -35,21 +35,22 @@ napoleon_use_ivar = True
 suppress_warnings = ['autodoc.mocked_object', 'ref.python', 'myst.xref_missing']
 
 
-def write_reference(app: Sphinx) -> None:
+def write_reference(_: Sphinx) -> None:
     """Write one page for each room of the package, those that nobody builds on excepted."""
     left_out = [str(PACKAGE / room) for room in ('nodes', 'tools', 'view', 'importing')]
     out = str(FOLDER / 'reference')
     apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
 
 
-def as_written(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Keep bars, stars and `code` of a docstring what they are, and indented blocks as equations."""
+def as_written(*event: Any) -> None:
+    """Keep bars, stars and `code` what they are, and indented blocks as equations."""
+    lines: list[str] = event[-1]
     text = re.sub(r'(?<!`)`([^`]+)`(?!`)', r'``\1``\ ', '\n'.join(lines))
     equation = False
     new: list[str] = []
     for line in text.split('\n'):
         begins = line.startswith('    ') and new[-1:] == [''] and not equation
-        equation = begins or equation and (not line or line.startswith(' '))
+        equation = begins or (equation and line[:1] in ('', ' '))
         if begins:
             new += ['::', '']
         new.append(line if equation else re.sub(r'(?<!\*)([|*])(?!\*)', r'\\\1', line))
