@@ -123,7 +123,6 @@ class Parser(argparse.ArgumentParser):
     """A parser whose mistakes are one line and exit status 2."""
 
     def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
-        """Parse the options of the tool `prog`."""
         super().__init__(prog, description=description, epilog=epilog, formatter_class=_Formatter)
 
     def error(self, message: str) -> NoReturn:

@@ -57,7 +57,6 @@ class Doubt:
     """Since when a kind of message cannot be believed. Times are of one steady clock [s]."""
 
     def __init__(self) -> None:
-        """All is well."""
         self._why, self._since = '', math.inf
 
     def note(self, error: MessageError | None, now: float) -> None:

@@ -35,7 +35,6 @@ class SourceOrder:
     """Of the messages of one publisher, those that come twice or late are not used."""
 
     def __init__(self) -> None:
-        """Nothing has come yet."""
         self._last = 0, 0
 
     def is_late(self, time: int, number: int = 0) -> bool:

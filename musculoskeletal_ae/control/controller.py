@@ -51,7 +51,6 @@ class Pace:
     """How fast the messages' clock goes beside the steady one: 1 in real time."""
 
     def __init__(self) -> None:
-        """Take it for real time."""
         self.value = 1.0
 
     def step(self, passed: float, since: float) -> None:

@@ -58,7 +58,6 @@ class AnomalyDetector:
     """
 
     def __init__(self, robot: Robot, threshold: float = 0.0) -> None:
-        """Watch `robot`."""
         self._robot = robot
         self.threshold = threshold
         self.slack = Slack()

@@ -50,7 +50,6 @@ class Estimator:
     """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s]."""
 
     def __init__(self, robot: Robot) -> None:
-        """Wait for a network."""
         self._robot = robot
         self.mae: Mae | None = None  # the network in use
         self.detector = AnomalyDetector(robot)

@@ -13,8 +13,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.nodes.markers import Markers
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line
 from musculoskeletal_ae.validity import read_wrench

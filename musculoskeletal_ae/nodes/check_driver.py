@@ -10,6 +10,7 @@ import math
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import rclpy
@@ -18,8 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.qos import RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.start import load
@@ -42,7 +42,6 @@ class CheckDriver:
     """Listens to one driver, and winds its muscles in."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
-        """Join the graph."""
         self.node: Node = rclpy.create_node('check_driver')
         self.robot, self.options = robot, options
         self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
@@ -177,6 +176,4 @@ def _parse(arguments: list[str]) -> Namespace:
     return options
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Judge a driver."""
-    return run_tool('check_driver', _parse, _check, argv)
+main = partial(run_tool, 'check_driver', _parse, _check)

@@ -26,8 +26,14 @@ from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.markers import Frames, Markers
-from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.messages import (
+    LATCHED,
+    RELIABLE,
+    SENSOR,
+    array_message,
+    joint_message,
+    serve,
+)
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
@@ -40,7 +46,6 @@ class Estimator(Shell):
     """Node shell of the MAE's estimate ② and the anomaly detector."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics; options are those of Node."""
         super().__init__('estimator', **options)
         self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
         self.follow_parameter(

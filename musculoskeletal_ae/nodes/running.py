@@ -21,7 +21,7 @@ from rclpy.exceptions import (
     InvalidParameterValueException,
     InvalidTopicNameException,
 )
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -29,7 +29,6 @@ from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.parameters import OF_RCLPY, check_names, help_text
-from musculoskeletal_ae.nodes.shield import ShieldedExecutor
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.start import load
 
@@ -53,6 +52,36 @@ def parameters_given(arguments: list[str]) -> list[str]:
     """Return the names that `-p NAME:=VALUE` or `-p NODE:NAME:=VALUE` give values."""
     values = [value for flag, value in pairwise(arguments) if flag in ('-p', '--param')]
     return [value.partition(':=')[0].rpartition(':')[2] for value in values]
+
+
+class ShieldedExecutor(SingleThreadedExecutor):
+    """Tells the node what its callbacks let out, rclpy's own for /clock and parameters included."""
+
+    def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Any) -> Any:
+        def escaped(error: Exception) -> None:
+            # The end, asked for by a callback or by a signal while it published, is none.
+            if isinstance(error, ExternalShutdownException) or not self.context.ok():
+                raise error
+            named = getattr(entity, 'topic_name', None) or getattr(entity, 'srv_name', None)
+            node.survive(named or type(entity).__name__, error)
+
+        def take(entity: Any) -> Any:
+            try:
+                work = take_from_wait_list(entity)
+            except Exception as error:  # noqa: BLE001 - else the executor never asks it again
+                return escaped(error)
+            if work is None:
+                return None
+
+            async def shielded() -> None:
+                try:
+                    await work()
+                except Exception as error:  # noqa: BLE001
+                    escaped(error)
+
+            return shielded
+
+        return super()._make_handler(entity, node, take)
 
 
 def run(name: str) -> None:
@@ -128,11 +157,12 @@ def run_tool(
     name: str,
     parse: Callable[[list[str]], Namespace],
     work: Callable[[Namespace, list[str]], int],
-    argv: list[str] | None,
+    argv: list[str] | None = None,
 ) -> int:
     """Parse options, work with them and with all arguments, and return the exit status.
 
-    `argv` are the arguments, those for ROS included; None for those of the process.
+    `argv` are the arguments, those for ROS included; None for those of the process. Status 1 says
+    that something cannot be used, 2 that an option is wrong.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     faulthandler.enable()

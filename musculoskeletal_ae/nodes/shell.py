@@ -38,10 +38,9 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
-from musculoskeletal_ae.nodes.shield import refuse
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
