@@ -3,6 +3,6 @@
 
 `controller` tells the whole story. `methods` holds the equations that make lengths of a posture,
 `stiffness` and `torque` those of two methods of their own. `posture` leads smoothly from goal to
-goal, `feedback` corrects what is left at rest, `exploration` invents the goals, `safety` has the
+goal and corrects what is left at rest, `exploration` invents the goals, `safety` has the
 last word.
 """

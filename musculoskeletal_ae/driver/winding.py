@@ -180,7 +180,7 @@ class Winding:
         verdict.passed('order', m)
         verdict.passed('unit', m)
         if wound[m] < -RESPONSE[1]:
-            verdict.failed('rises', m, rise=-1e3 * wound[m])
+            verdict.failed('sign', m, told=f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in')
         verdict.passed('sign', m)
         clip = robot.tension.max[m]
         if clip <= self._highest[m]:

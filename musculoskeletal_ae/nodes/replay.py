@@ -81,7 +81,10 @@ class Replay(Node):
     def get_ready(self, longest: float) -> None:
         """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
         end = time.monotonic() + longest
-        topics = [*self._publisher.values(), *([self._recorded_time] if self._recorded_time else [])]
+        topics = [
+            *self._publisher.values(),
+            *([self._recorded_time] if self._recorded_time else []),
+        ]
         while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)
