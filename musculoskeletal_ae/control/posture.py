@@ -22,9 +22,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Step
-from musculoskeletal_ae.control.methods import Solution
+from musculoskeletal_ae.control.methods import Solution, stiffness_command
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stiffness import stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot

@@ -25,7 +25,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Slack
 from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.markers import Frames, Markers
+from musculoskeletal_ae.nodes.arm import Frames, Markers
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
     RELIABLE,

@@ -51,8 +51,6 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
 LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
 
-LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
-
 
 class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
@@ -129,11 +127,7 @@ class Shell(Node):
     # -- parameters -----------------------------------------------------------------------------
 
     def parameter(self, name: str) -> Any:
-        """Return a parameter's value; lists as tuples, without empty names.
-
-        Raises:
-            MusculoskeletalError: If the value is not legal.
-        """
+        """Return a parameter's value, if it is legal; lists as tuples, without empty names."""
         return self._checked(name, self.get_parameter(name).value, lambda value: value)
 
     def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
@@ -339,7 +333,7 @@ class Shell(Node):
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         status = DiagnosticStatus(
-            level=LEVELS[report.level],
+            level=getattr(DiagnosticStatus, report.level.upper()),
             name=f'{self.get_fully_qualified_name()}: state',
             message=printable(report.message),
             hardware_id=self.robot.description.directory.name,
