@@ -103,10 +103,7 @@ class Parser(argparse.ArgumentParser):
         sys.exit(2)
 
     def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
-        """Add the robot, by name or directory; without a default it must be given.
-
-        The flag 'robot' makes it positional.
-        """
+        """Add the robot; without a default it must be given, and 'robot' makes it positional."""
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
         kind: dict[str, Any] = {'metavar': 'NAME|DIR', 'required': default is None}
         self.add_argument(

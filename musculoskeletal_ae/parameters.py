@@ -61,11 +61,7 @@ class Parameter:
         return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
-        """Return a value as it is used: lists as tuples, without empty names.
-
-        Raises:
-            MusculoskeletalError: If it is no legal word, or no list of finite numbers.
-        """
+        """Return a value as it is used, if it is legal: lists as tuples, without empty names."""
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
         if self.is_number_list:

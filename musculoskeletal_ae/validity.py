@@ -40,8 +40,8 @@ class SourceOrder:
     def is_late(self, time: int, number: int = 0) -> bool:
         """Say whether a message was sent no later than the last one that was taken.
 
-        It was sent at `time` [ns], 0 where that is not known, as the publisher's `number`th, where
-        that is known: the number goes on when the publisher's clock steps back.
+        At `time` [ns] as the publisher's `number`th, which goes on when its clock steps back; 0
+        where that is not known.
         """
         last_time, last_number = self._last
         return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
@@ -139,10 +139,7 @@ def read_posture(message: Any, joints: Sequence[str]) -> Array:
 
 
 def read_wrench(message: Any, root_link: str) -> Array:
-    """Return force [N] and torque [N·m] (6,) of a WrenchStamped in axes of the root link.
-
-    An empty frame means the root link.
-    """
+    """Return force [N] and torque [N·m] (6,) of a WrenchStamped; no frame means the root link."""
     force, torque = message.wrench.force, message.wrench.torque
     wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     if message.header.frame_id not in ('', root_link):

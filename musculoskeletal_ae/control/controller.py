@@ -151,11 +151,7 @@ class Controller:
             self.stop('anomaly_detected')
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
-        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs.
-
-        Raises:
-            MessageError: If it leaves joints out of whose posture nothing is known yet.
-        """
+        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
         if kept is None and len(joints) < robot.joint_count:

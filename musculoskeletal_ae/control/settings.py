@@ -66,11 +66,7 @@ class Settings:
     )
 
     def desired_stiffness(self, joints: int) -> tuple[float, ...]:
-        """Return `joint_stiffness` for so many joints; nothing, or a single 0, is all as they come.
-
-        Raises:
-            MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
-        """
+        """Return `joint_stiffness` for so many joints; nothing, or one 0, is all as they come."""
         values = self.joint_stiffness
         if values in ((), (0.0,)):
             return (0.0,) * joints

@@ -72,11 +72,6 @@ class Frames:
     """Publishes where links are, where ROS has tf2_msgs: Jazzy does, the wheels do not."""
 
     def __init__(self, node: Shell) -> None:
-        """Advertise /tf.
-
-        Raises:
-            MusculoskeletalError: If tf2_msgs is not installed.
-        """
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:

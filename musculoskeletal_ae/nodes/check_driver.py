@@ -84,7 +84,7 @@ class CheckDriver:
             verdict.notes.append('nobody publishes joint_states, from which the learner learns')
         return verdict
 
-    def wind(self) -> Verdict:
+    def wind(self, verdict: Verdict) -> None:
         """Wind each muscle in a little."""
         if self.node.count_publishers(COMMAND):
             raise MusculoskeletalError(
@@ -92,16 +92,14 @@ class CheckDriver:
                 'else moves the arm'
             )
         muscles = self.robot.muscle_indices(self.options.muscles or [])
-        winding = load('musculoskeletal_ae.driver.winding').Winding(
-            self.robot, muscles, self.options.tension
-        )
+        kind = load('musculoskeletal_ae.driver.winding').Winding
+        winding = kind(verdict, muscles, self.options.tension)
         read = load('musculoskeletal_ae.validity').read_array
-        verdict: Verdict = winding.verdict
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
         self._spin(3.0, lambda: publisher.get_subscription_count() > 0)
         if not publisher.get_subscription_count():
             verdict.failed('deaf', topic=self.command)
-            return verdict
+            return
         last, trying = time.monotonic(), ''
 
         def follow(message: Float64MultiArray) -> None:
@@ -122,7 +120,6 @@ class CheckDriver:
         self._spin(math.inf, lambda: winding.done or time.monotonic() - last > SILENCE)
         if not winding.done:
             verdict.failed('silence', gap=SILENCE)
-        return verdict
 
 
 def _check(options: Namespace, arguments: list[str]) -> int:
@@ -143,7 +140,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
     if options.move and verdict.wrong - {'zero'}:
         _say('not moved: what is wrong already comes first')
     elif options.move:
-        verdict.add(driver.wind())
+        driver.wind(verdict)
         _say(verdict)
     _say('the driver keeps its contract' if not verdict.faults else 'the driver is to be changed')
     return 1 if verdict.faults else 0

@@ -50,10 +50,7 @@ def bytes_message(data: bytes) -> UInt8MultiArray:
 
 
 def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
-    """Offer a Trigger or SetBool service: `work` takes the request and says what it did.
-
-    It raises a `MusculoskeletalError` to refuse.
-    """
+    """Offer a Trigger or SetBool service: `work` says what it did, or raises why it did not."""
 
     def answer(request: Any, response: Any) -> Any:
         try:

@@ -145,10 +145,7 @@ def message_class(type_name: str) -> Any:
 
 
 def start_ros(arguments: list[str]) -> None:
-    """Start ROS with the arguments of the process; signals stay with Python.
-
-    ROS's own handlers take publishers and queues away before the tool has ended its work.
-    """
+    """Start ROS, signals left to Python: ROS's handlers end publishers before the tool's work."""
     with _clear_ros_arguments(arguments):
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
 

@@ -131,10 +131,7 @@ class Shell(Node):
         return self._checked(name, self.get_parameter(name).value, lambda value: value)
 
     def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
-        """Call `setter` with a parameter's value, now and whenever it is set.
-
-        The setter raises a `MusculoskeletalError` or `OSError` to refuse a value.
-        """
+        """Call `setter`, which raises to refuse, with a parameter's value now and when it is set."""
         self._checked(name, self.get_parameter(name).value, setter)
         self._setters[name] = setter
 
@@ -219,10 +216,7 @@ class Shell(Node):
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
-        """Subscribe; a message that breaks a rule, or comes twice or late, is counted and dropped.
-
-        The callback raises a `MusculoskeletalError` to reject the message.
-        """
+        """Subscribe; what comes twice or late, or the callback refuses by raising, is counted."""
         full = self.resolve_topic_name(topic)
         receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
@@ -284,10 +278,7 @@ class Shell(Node):
         return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
-        """Take zeros that the estimator found; `changed` is told whether they are known now.
-
-        And how much less l [m] (M,) is than with those before.
-        """
+        """Take the estimator's zeros; tell whether they are known now, and how much less l is."""
 
         def take(rows: Array) -> None:
             less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
