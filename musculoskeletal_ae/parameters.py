@@ -77,6 +77,14 @@ class Parameter:
         return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
 
 
+def settable(
+    default: Any, meaning: str, unit: str = '', *within: float, legal: tuple[str, ...] = ()
+) -> Any:
+    """Return the dataclass field of a parameter that may be set while a node runs."""
+    low_high = (within[0], within[1]) if within else None
+    return Parameter(default, meaning, unit, low_high, legal, settable=True).field()
+
+
 def parameters_of(settings: type) -> dict[str, Parameter]:
     """Return the parameters of a settings dataclass by name."""
     return {f.name: f.metadata['parameter'] for f in fields(settings)}

@@ -64,20 +64,15 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
         raise MessageError('empty', f'no values, expected {rows * columns}')
     if len(message.data) != rows * columns:
         raise MessageError('wrong length', f'{len(message.data)} values, not {rows * columns}')
-    shape = [columns] if rows == 1 else [rows, columns]
-    sizes = [dim.size for dim in message.layout.dim]
+    given = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
+    legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
     # Without labels or strides the sizes alone say the layout; what is given must match.
-    strides = [dim.stride for dim in message.layout.dim]
-    names = [dim.label for dim in message.layout.dim]
-    legal = [int(np.prod(shape[i:])) for i in range(len(shape))]
-    labels = ('quantity', 'muscle')[-len(shape) :]
-    if sizes and (
-        sizes != shape
-        or any(s not in (0, e) for s, e in zip(strides, legal))
-        or any(n not in ('', e) for n, e in zip(names, labels))
-    ):
-        given = list(zip(names, sizes, strides))
-        raise MessageError('wrong layout', f'{given}; expected {list(zip(labels, shape, legal))}')
+    fits = len(given) == len(legal) and all(
+        label in ('', name) and size == count and stride in (0, step)
+        for (label, size, stride), (name, count, step) in zip(given, legal)
+    )
+    if given and not fits:
+        raise MessageError('wrong layout', f'{given}; expected {legal}')
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.asarray(message.data, dtype=float)

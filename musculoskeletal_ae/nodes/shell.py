@@ -131,7 +131,7 @@ class Shell(Node):
         return self._checked(name, self.get_parameter(name).value, lambda value: value)
 
     def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
-        """Call `setter`, which raises to refuse, with a parameter's value now and when it is set."""
+        """Call `setter`, which raises to refuse, with a parameter's value now and when set."""
         self._checked(name, self.get_parameter(name).value, setter)
         self._setters[name] = setter
 
