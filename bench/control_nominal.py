@@ -184,8 +184,8 @@ def main(argv: list[str] | None = None) -> int:
     """Print the tables."""
     parser = Parser('control_nominal', 'What control does on the nominal body.')
     parser.add_robot()
-    parser.add_checkpoint('network of preset default', required=True)
-    parser.add_checkpoint('network of preset paper', '--paper-checkpoint', required=True)
+    parser.add_argument('--checkpoint', required=True, help='network of preset default')
+    parser.add_argument('--paper-checkpoint', required=True, help='network of preset paper')
     parser.add_quick('few postures')
     args = parser.parse_args(argv)
 

@@ -31,6 +31,7 @@ from typing import Any, NoReturn, TypeVar
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
+from musculoskeletal_ae.start import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
 T = TypeVar('T')
@@ -110,12 +111,6 @@ class Parser(argparse.ArgumentParser):
             flag, default=default, help=text, **(kind if flag.startswith('-') else {})
         )
 
-    def add_checkpoint(
-        self, text: str = 'trained network', flag: str = '--checkpoint', required: bool = False
-    ) -> None:
-        """Add a checkpoint file, None where it is not given."""
-        self.add_argument(flag, type=Path, metavar='FILE', required=required, help=text)
-
     def add_preset(self, text: str = 'network, learning and solver') -> None:
         """Add `--preset`."""
         self.add_argument('--preset', choices=tuple(PRESETS), default='default', help=text)
@@ -163,13 +158,10 @@ def save_plot(file: Path | None, save: Callable[[Path], None]) -> None:
     print(f'plot: {file}')
 
 
-def exit_status(
-    work: Callable[[], int | None], *also: type[Exception], interrupted: int = 130
-) -> int:
+def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:
     """Do a tool's work and return its exit status, without a traceback; None of `work` is 0.
 
-    Errors of this package, of files and of the kinds in `also` are one line and status 1; Ctrl-C
-    gives the status `interrupted`.
+    Errors of this package, of files and of the kinds in `also` are one line and status 1.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:
@@ -178,4 +170,4 @@ def exit_status(
         print(f'error: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return interrupted
+        return INTERRUPTED
