@@ -87,9 +87,15 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def spin(self) -> None:
         """Spin until shutdown."""
-        while self.context.ok() and not self._is_shutdown:
-            if not self._spin_messages():
-                self._spin_rest()
+        with self._held:
+            while self.context.ok() and not self._is_shutdown:
+                if not self._spin_messages():
+                    self._spin_rest()
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Let go of the node's entities, and of this executor's own."""
+        self._wait_set, self._urgent = None, ()
+        return super().shutdown(timeout_sec)
 
     def _spin_messages(self) -> bool:
         """Wait, and run what messages and timers ask for; False if there may be more to do."""
@@ -215,9 +221,9 @@ def run(name: str) -> None:
         module = load(f'musculoskeletal_ae.nodes.{name}')
         rclpy.init()
         node = getattr(module, name.title().replace('_', ''))()
-        executor = LeanExecutor()
-        executor.add_node(node)
-        executor.spin()
+        with LeanExecutor() as executor:
+            executor.add_node(node)
+            executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except MusculoskeletalError as error:
