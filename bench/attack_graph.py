@@ -45,9 +45,8 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import bytes_message
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.nodes.running import message_class
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -19,7 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
-from musculoskeletal_ae.control.stiffness import stiffness_command
+from musculoskeletal_ae.control.methods import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae import checkpoint
@@ -184,8 +184,8 @@ def main(argv: list[str] | None = None) -> int:
     """Print the tables."""
     parser = Parser('control_nominal', 'What control does on the nominal body.')
     parser.add_robot()
-    parser.add_checkpoint('network of preset default', required=True)
-    parser.add_checkpoint('network of preset paper', '--paper-checkpoint', required=True)
+    parser.add_argument('--checkpoint', required=True, help='network of preset default')
+    parser.add_argument('--paper-checkpoint', required=True, help='network of preset paper')
     parser.add_quick('few postures')
     args = parser.parse_args(argv)
 

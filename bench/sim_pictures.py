@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     """Write both pictures."""
     parser = Parser('sim_pictures', 'Pictures of the simulated arm: at rest, and loaded.')
     parser.add_robot()
-    parser.add_checkpoint(required=True)
+    parser.add_argument('--checkpoint', required=True, help='trained network')
     parser.add_out('DIR', default=Path('doc'))
     args = parser.parse_args(argv)
 

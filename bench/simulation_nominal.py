@@ -236,7 +236,7 @@ def main(argv: list[str] | None = None) -> int:
     """Print the measurements for a checkpoint."""
     parser = Parser('simulation_nominal', 'The simulator beside the nominal body.')
     parser.add_robot()
-    parser.add_checkpoint(required=True)
+    parser.add_argument('--checkpoint', required=True, help='trained network')
     parser.add_preset('of the simulator')
     parser.add_quick('fewer commands')
     args = parser.parse_args(argv)

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
-from musculoskeletal_ae.control.methods import first_command, msc_compensation
-from musculoskeletal_ae.control.stiffness import stiffness_command
+from musculoskeletal_ae.control.methods import first_command, msc_compensation, stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states

@@ -157,7 +157,7 @@ def observe() -> int:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import UInt8MultiArray
 
-    from musculoskeletal_ae.nodes.qos import LATCHED
+    from musculoskeletal_ae.nodes.messages import LATCHED
 
     rclpy.init()
     node = rclpy.create_node('observer')

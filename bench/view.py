@@ -24,8 +24,7 @@ import rclpy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
-from musculoskeletal_ae.nodes.qos import RELIABLE
+from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.view import ARM_TOPICS
 from musculoskeletal_ae.robot.robot import Robot
 

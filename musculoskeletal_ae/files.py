@@ -60,11 +60,7 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
 
 
 def read_start(file: Path, largest: int) -> bytes:
-    """Return the first bytes of a regular file; none where there is no such file.
-
-    Raises:
-        OSError: If it cannot be read.
-    """
+    """Return the first bytes of a regular file, none without one; an OSError says why not."""
     if not file.is_file():
         return b''
     with file.open('rb') as stream:
@@ -91,10 +87,7 @@ def read_yaml(file: Path, refuse: Refuse) -> Any:
 def read_csv(
     file: Path, columns: Sequence[str], refuse: Refuse
 ) -> list[tuple[int, str, list[str]]]:
-    """Return (line number, line, cells) below the head of a table, which must name the columns.
-
-    # begins a comment line.
-    """
+    """Return (line number, line, cells) below a table's head, but of lines that begin with #."""
     rows = []
     for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):
         if line.strip() and not line.startswith('#'):

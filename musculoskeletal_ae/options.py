@@ -24,88 +24,61 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
+from musculoskeletal_ae.start import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
+T = TypeVar('T')
+
+
+def _type(convert: Callable[[str], T], legal: Callable[[T], bool], told: str) -> Callable[[str], T]:
+    """Return a type that takes what `convert` makes of a text, where that is legal."""
+
+    def checked(text: str) -> T:
+        with suppress(ValueError):
+            if legal(value := convert(text)):
+                return value
+        raise argparse.ArgumentTypeError(f'{text!r}: expected {told}')
+
+    return checked
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
     """Return a type for whole numbers within [low, high]."""
-
-    def convert(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f'{text!r}: expected {low} to {high}')
-        return value
-
-    return convert
+    return _type(int, lambda value: low <= value <= high, f'{low} to {high}')
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """Return a type for numbers within [low, high]."""
-    return lambda text: _number(text, low, high, f'{text!r}: expected {low:g} to {high:g}')
+    return _type(float, lambda value: low <= value <= high, f'{low:g} to {high:g}')
 
 
-def not_negative(text: str) -> float:
-    """Return a finite number that is not negative."""
-    return _number(text, 0.0, sys.float_info.max, f'{text!r} is not a number of at least 0')
+def _listed(text: str) -> list[str]:
+    return [part.strip() for part in text.split(',')]
 
 
-def positive(text: str) -> float:
-    """Return a positive, finite number."""
-    return _number(text, math.ulp(0.0), sys.float_info.max, f'{text!r} is not a number above 0')
-
-
-def _number(text: str, low: float, high: float, problem: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(problem)
-    return value
-
-
+not_negative = _type(float, lambda value: 0.0 <= value < math.inf, 'a number of at least 0')
+positive = _type(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
 minutes = number(0.2, 600.0)  # of robot time
 seed = whole(0, 2**63 - 1)
-
-
-def seeds(text: str) -> tuple[int, ...]:
-    """Return the different seeds of a list separated by commas."""
-    try:
-        values = tuple(int(part) for part in text.split(','))
-    except ValueError:
-        values = (-1,)
-    if min(values) < 0 or len(set(values)) < len(values):
-        raise argparse.ArgumentTypeError(f'{text!r}: expected different whole numbers, as in 0,1,2')
-    return values
-
-
-def numbers(text: str) -> list[float]:
-    """Return the finite numbers of a list separated by commas."""
-    try:
-        values = [float(part) for part in text.split(',')]
-    except ValueError:
-        values = [math.nan]
-    if not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f'{text!r}: expected numbers, as in 0,-0.5,1')
-    return values
-
-
-def names(text: str) -> list[str]:
-    """Return the different names in a list separated by commas."""
-    listed = [name.strip() for name in text.split(',') if name.strip()]
-    if not listed:
-        raise argparse.ArgumentTypeError('no name is given')
-    return list(dict.fromkeys(listed))
+#: lists separated by commas: different seeds, finite numbers, different names
+seeds = _type(
+    lambda text: tuple(map(int, _listed(text))),
+    lambda values: min(values) >= 0 and len(set(values)) == len(values),
+    'different whole numbers, as in 0,1,2',
+)
+numbers = _type(
+    lambda text: [*map(float, _listed(text))],
+    lambda values: all(map(math.isfinite, values)),
+    'numbers, as in 0,-0.5,1',
+)
+names = _type(lambda text: [*filter(None, dict.fromkeys(_listed(text)))], bool, 'a name')
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -123,7 +96,6 @@ class Parser(argparse.ArgumentParser):
     """A parser whose mistakes are one line and exit status 2."""
 
     def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
-        """Parse the options of the tool `prog`."""
         super().__init__(prog, description=description, epilog=epilog, formatter_class=_Formatter)
 
     def error(self, message: str) -> NoReturn:
@@ -132,21 +104,12 @@ class Parser(argparse.ArgumentParser):
         sys.exit(2)
 
     def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
-        """Add the robot, by name or directory; without a default it must be given.
-
-        The flag 'robot' makes it positional.
-        """
+        """Add the robot; without a default it must be given, and 'robot' makes it positional."""
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
         kind: dict[str, Any] = {'metavar': 'NAME|DIR', 'required': default is None}
         self.add_argument(
             flag, default=default, help=text, **(kind if flag.startswith('-') else {})
         )
-
-    def add_checkpoint(
-        self, text: str = 'trained network', flag: str = '--checkpoint', required: bool = False
-    ) -> None:
-        """Add a checkpoint file, None where it is not given."""
-        self.add_argument(flag, type=Path, metavar='FILE', required=required, help=text)
 
     def add_preset(self, text: str = 'network, learning and solver') -> None:
         """Add `--preset`."""
@@ -195,13 +158,10 @@ def save_plot(file: Path | None, save: Callable[[Path], None]) -> None:
     print(f'plot: {file}')
 
 
-def exit_status(
-    work: Callable[[], int | None], *also: type[Exception], interrupted: int = 130
-) -> int:
+def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:
     """Do a tool's work and return its exit status, without a traceback; None of `work` is 0.
 
-    Errors of this package, of files and of the kinds in `also` are one line and status 1; Ctrl-C
-    gives the status `interrupted`.
+    Errors of this package, of files and of the kinds in `also` are one line and status 1.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:
@@ -210,4 +170,4 @@ def exit_status(
         print(f'error: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return interrupted
+        return INTERRUPTED

@@ -61,11 +61,7 @@ class Parameter:
         return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
-        """Return a value as it is used: lists as tuples, without empty names.
-
-        Raises:
-            MusculoskeletalError: If it is no legal word, or no list of finite numbers.
-        """
+        """Return a value as it is used, if it is legal: lists as tuples, without empty names."""
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
         if self.is_number_list:
@@ -79,6 +75,14 @@ class Parameter:
                 raise MusculoskeletalError(f'{value!r}; legal: {legal}')
             return numbers
         return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
+
+
+def settable(
+    default: Any, meaning: str, unit: str = '', *within: float, legal: tuple[str, ...] = ()
+) -> Any:
+    """Return the dataclass field of a parameter that may be set while a node runs."""
+    low_high = (within[0], within[1]) if within else None
+    return Parameter(default, meaning, unit, low_high, legal, settable=True).field()
 
 
 def parameters_of(settings: type) -> dict[str, Parameter]:

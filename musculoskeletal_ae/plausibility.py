@@ -57,17 +57,18 @@ class Doubt:
     """Since when a kind of message cannot be believed. Times are of one steady clock [s]."""
 
     def __init__(self) -> None:
-        """All is well."""
         self._why, self._since = '', math.inf
 
     def note(self, error: MessageError | None, now: float) -> None:
-        """Take what is wrong with the newest message, if anything."""
+        """Take what is wrong with the newest message, if anything, and raise it."""
         self._since = math.inf if error is None else min(self._since, now)
         self._why = str(error or '')
+        if error:
+            raise error
 
-    def lasting(self, now: float, moment: float = MOMENT) -> str:
+    def lasting(self, now: float) -> str:
         """Return what has been wrong for longer than a moment, or ''."""
-        return self._why if now - self._since > moment else ''
+        return self._why if now - self._since > MOMENT else ''
 
 
 class Plausibility:
@@ -86,27 +87,17 @@ class Plausibility:
     ) -> None:
         """Take T [N], l [m] and temperatures [°C] (M,) as they came; no l while zeros are unknown.
 
-        Raises:
-            MessageError: If no muscle of this arm can say that.
+        A MessageError says that no muscle of this arm can say that.
         """
         wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
         error = self.levels(tension, length, temperature, wound)
         if error is None and length is not None:
             error = self._step(length, now)
         self.muscles.note(error, now)
-        if error:
-            raise error
 
     def check_estimate(self, theta: Array, now: float) -> None:
-        """Take estimated θ [rad] (D,).
-
-        Raises:
-            MessageError: If no joint of this arm can be there.
-        """
-        error = self.outside(theta, ESTIMATE_OUTSIDE)
-        self.estimates.note(error, now)
-        if error:
-            raise error
+        """Take estimated θ [rad] (D,); a MessageError says that no joint can be there."""
+        self.estimates.note(self.outside(theta, ESTIMATE_OUTSIDE), now)
 
     def outside(self, theta: Array, share: float = OUTSIDE) -> MessageError | None:
         """Return what is wrong with a joint further beyond its limits than a share of its range."""

@@ -35,14 +35,13 @@ class SourceOrder:
     """Of the messages of one publisher, those that come twice or late are not used."""
 
     def __init__(self) -> None:
-        """Nothing has come yet."""
         self._last = 0, 0
 
     def is_late(self, time: int, number: int = 0) -> bool:
         """Say whether a message was sent no later than the last one that was taken.
 
-        It was sent at `time` [ns], 0 where that is not known, as the publisher's `number`th, where
-        that is known: the number goes on when the publisher's clock steps back.
+        At `time` [ns] as the publisher's `number`th, which goes on when its clock steps back; 0
+        where that is not known.
         """
         last_time, last_number = self._last
         return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
@@ -65,20 +64,15 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
         raise MessageError('empty', f'no values, expected {rows * columns}')
     if len(message.data) != rows * columns:
         raise MessageError('wrong length', f'{len(message.data)} values, not {rows * columns}')
-    shape = [columns] if rows == 1 else [rows, columns]
-    sizes = [dim.size for dim in message.layout.dim]
+    given = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
+    legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
     # Without labels or strides the sizes alone say the layout; what is given must match.
-    strides = [dim.stride for dim in message.layout.dim]
-    names = [dim.label for dim in message.layout.dim]
-    legal = [int(np.prod(shape[i:])) for i in range(len(shape))]
-    labels = ('quantity', 'muscle')[-len(shape) :]
-    if sizes and (
-        sizes != shape
-        or any(s not in (0, e) for s, e in zip(strides, legal))
-        or any(n not in ('', e) for n, e in zip(names, labels))
-    ):
-        given = list(zip(names, sizes, strides))
-        raise MessageError('wrong layout', f'{given}; expected {list(zip(labels, shape, legal))}')
+    fits = len(given) == len(legal) and all(
+        label in ('', name) and size == count and stride in (0, step)
+        for (label, size, stride), (name, count, step) in zip(given, legal)
+    )
+    if given and not fits:
+        raise MessageError('wrong layout', f'{given}; expected {legal}')
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.asarray(message.data, dtype=float)
@@ -140,10 +134,7 @@ def read_posture(message: Any, joints: Sequence[str]) -> Array:
 
 
 def read_wrench(message: Any, root_link: str) -> Array:
-    """Return force [N] and torque [N·m] (6,) of a WrenchStamped in axes of the root link.
-
-    An empty frame means the root link.
-    """
+    """Return force [N] and torque [N·m] (6,) of a WrenchStamped; no frame means the root link."""
     force, torque = message.wrench.force, message.wrench.torque
     wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     if message.header.frame_id not in ('', root_link):

@@ -69,15 +69,10 @@ class Timeline:
         """Make it this recorded time [ns] now; paused, everything up to it is due."""
         self._recorded, self._steady = recorded, now
 
-    def pause(self, now: float) -> None:
-        """Stand still."""
+    def hold(self, paused: bool, now: float) -> None:
+        """Stand still, or go on from where it stands."""
         self.jump(self.recorded(now), now)
-        self.paused = True
-
-    def resume(self, now: float) -> None:
-        """Go on from where it stands."""
-        self._recorded, self._steady = self.recorded(now), now
-        self.paused = False
+        self.paused = paused
 
     def catch_up(self, recorded: int, now: float) -> None:
         """Go on from `recorded` if it should have been published long ago."""

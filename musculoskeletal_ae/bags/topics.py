@@ -72,12 +72,9 @@ def select(
 ) -> dict[str, str]:
     """Return the name to publish each wanted topic on, by its recorded name.
 
-    Args:
-        bag: An opened bag.
-        wanted: `default` (what hardware, vision, user and controller sent), `all` (every topic of
-            the interface), or relative or recorded names; these may be foreign to the interface.
-        namespace: The one that is meant where the bag has several.
-        keep_names: Publish under the recorded names.
+    Wanted are `default` (what hardware, vision, user and controller sent), `all` (every topic of
+    the interface), or relative or recorded names, which may be foreign to the interface.
+    `namespace` is the one that is meant where the bag has several.
     """
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 directory that can be read to the last second if the writer is killed."""
+"""Writes a rosbag2 directory that can be read to the last second if the writer is killed.
+
+`recover` makes a finished bag of what is then left.
+"""
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 from mcap.records import Schema
@@ -13,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from musculoskeletal_ae.bags import message_types, metadata
 from musculoskeletal_ae.bags.mcap_file import NO_SCHEMA
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
@@ -128,3 +134,60 @@ class BagWriter:
         except OSError as error:
             problem = f'cannot be written: {error.strerror or error}'
             raise BagError(self.directory, problem, 'name another place') from error
+
+
+def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None]:
+    """Write all complete messages of an unfinished bag, directory or .mcap, into a finished one.
+
+    Without a new directory `out`, a directory is replaced, and the original kept beside it as
+    `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`. Returned are the finished bag, its
+    number of messages, and where the original is now if it was moved.
+    """
+    bag, finished = _open(path)
+    if finished and out is None:
+        raise BagError(path, 'the recording is finished', 'there is nothing to recover')
+    if out is not None or not path.is_dir():
+        target = out or path.with_name(f'{path.stem}_recovered')
+        return target, _copy(bag, target), None
+    # The new bag is complete before the old one is touched; its file carries the final name.
+    path = path.resolve()
+    backup, scratch = _free(path, '.unfinished'), _free(path, '.recovering')
+    try:
+        messages = _copy(bag, scratch / path.name)
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    path.rename(backup)
+    (scratch / path.name).rename(path)
+    scratch.rmdir()
+    return path, messages, backup
+
+
+def _open(path: Path) -> tuple[Bag, bool]:
+    """Open what is there, whatever metadata.yaml says; also return whether the bag is finished."""
+    try:
+        bag = Bag.open(path, unfinished=True)
+    except BagError as error:
+        files = sorted(path.glob('*.mcap')) if path.is_dir() else []
+        # metadata.yaml may be what is wrong: the messages are in the mcap file.
+        if len(files) == 1 and error.file == path / metadata.FILE:
+            return Bag.open(files[0], unfinished=True), False
+        raise
+    return bag, not bag.unfinished
+
+
+def _copy(bag: Bag, target: Path) -> int:
+    """Write a bag anew and read it again; return its number of messages."""
+    with BagWriter(target) as writer:
+        numbers = {
+            name: writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
+            for name, topic in bag.topics.items()
+        }
+        for topic, log_time, publish_time, data, *_ in bag.messages():
+            writer.write(numbers[topic], log_time, publish_time, data)
+    return Bag.open(target).message_count
+
+
+def _free(path: Path, suffix: str) -> Path:
+    names = (path.with_name(f'{path.name}{suffix}{n or ""}') for n in count())
+    return next(name for name in names if not name.exists())

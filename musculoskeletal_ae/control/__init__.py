@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a target to a command that the arm can follow safely.
 
-`controller` tells the whole story. `methods` holds the equations that make lengths of a posture,
-`stiffness` and `torque` those of two methods of their own. `posture` leads smoothly from goal to
-goal, `feedback` corrects what is left at rest, `exploration` invents the goals, `safety` has the
+`controller` tells the whole story. `methods` holds the equations that make commands of a posture.
+`posture` leads smoothly from goal to
+goal and corrects what is left at rest, `exploration` invents the goals, `safety` has the
 last word.
 """

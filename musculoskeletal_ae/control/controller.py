@@ -26,10 +26,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.gentle import GentleMotion, gentle_limit
+from musculoskeletal_ae.control.methods import TorqueControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
@@ -51,7 +51,6 @@ class Pace:
     """How fast the messages' clock goes beside the steady one: 1 in real time."""
 
     def __init__(self) -> None:
-        """Take it for real time."""
         self.value = 1.0
 
     def step(self, passed: float, since: float) -> None:
@@ -101,8 +100,7 @@ class Controller:
     def configure(self, settings: Settings) -> None:
         """Take new settings; another method starts from how the muscles pull at that moment.
 
-        Raises:
-            MusculoskeletalError: If the joint stiffness does not fit the robot.
+        A MusculoskeletalError says that the joint stiffness does not fit the robot.
         """
         before, joints = self.settings, self._robot.joint_count
         stiffness = settings.desired_stiffness(joints)
@@ -119,11 +117,7 @@ class Controller:
         self.posture.use(mae)
 
     def muscles(self, muscles: Muscles, now: float) -> None:
-        """Take muscle_states.
-
-        Raises:
-            MessageError: If no muscles of this arm can be so.
-        """
+        """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
         length, tension, temperature = muscles
         # While zeros are unknown a guess may make any length of them, and any posture.
         known = length if self.safety.zeroed else None
@@ -136,11 +130,7 @@ class Controller:
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
     def estimated(self, theta: Array, now: float) -> None:
-        """Take estimated_joint_states [rad], shape (D,).
-
-        Raises:
-            MessageError: If no joints of this arm can be there.
-        """
+        """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
         if not self.safety.zeroed:
             theta = np.clip(theta, self._robot.lower, self._robot.upper)
         self._plausibility.check_estimate(theta, now)
@@ -161,11 +151,7 @@ class Controller:
             self.stop('anomaly_detected')
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
-        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs.
-
-        Raises:
-            MessageError: If it leaves joints out of whose posture nothing is known yet.
-        """
+        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
         if kept is None and len(joints) < robot.joint_count:
@@ -284,12 +270,12 @@ class Controller:
         if hot:
             values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
             warnings.append(f'hot: {", ".join(hot)}')
-        doing = 'no target' if posture.theta is None else 'holding'
-        doing = 'exploring' if posture.exploring else doing
-        if self.safety.cause and self.safety.passing:
-            return Report('warn', f'holding: {self.safety.cause}', values)
-        if self.safety.cause:
-            return Report('error', f'stopped: {self.safety.cause}', values)
+        still = 'no target' if posture.theta is None else 'holding'
+        doing = 'exploring' if posture.exploring else still
+        if cause := self.safety.cause:
+            if self.safety.passing:
+                return Report('warn', f'holding: {cause}', values)
+            return Report('error', f'stopped: {cause}', values)
         if waiting := self.present_cause(now):
             return Report('warn', f'waiting: {waiting}', values)
         if warnings:

@@ -65,10 +65,7 @@ def holdable_postures(
     """Return the first of random θ (D,) that can be held, each with the least T [N] (M,).
 
     They can be held with the nominal G and with every other, given as for `muscle_hessian`; T is
-    that of the last one.
-
-    Raises:
-        RobotDescriptionError: If there are not so many.
+    that of the last one. A RobotDescriptionError says that there are not so many.
     """
     held: list[tuple[Array, Array]] = []
     for theta in postures:

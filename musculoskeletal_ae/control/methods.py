@@ -9,7 +9,7 @@
 
 (paper, section "Control"). MSC holds T = T_bias + max(0, K_stiff (l − l_target)), so l_comp is how
 far the command must lie below the length for the muscle to carry T there. `stiffness` chooses T for
-a joint stiffness (`stiffness.py`), `tension` commands tensions instead of lengths (`torque.py`).
+a joint stiffness (`stiffness_command`), `tension` commands tensions, no lengths (`TorqueControl`).
 
 `proposed` of preset `paper` is as printed: descend from z = ①(θ_target, T_current) on
 
@@ -28,17 +28,35 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
+from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import Exertion, least_tension
+from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
 TENSION_WEIGHT, POSTURE_WEIGHT, TORQUE_WEIGHT = 1.0, 1.0, 0.01  # w₁, w₂, w₃
 SEARCH = StepSearch(largest_step=0.5, candidates=10, epochs=10)
 
 # Solving again with G at the new tension changes it by well under a newton after the second.
 SOLVES = 2
+
+# `stiffness`
+# [N] above T_bias that a push may take from a muscle before it gives way; the widest that is held.
+MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
+ITERATIONS = 6
+# Of the least tension against the stiffness; one within reach is missed by about this share.
+LEAST_TENSION_SHARE = 1e-3
+SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to a corner; K bends down in every tension
+FAR = 1e5  # [N²] turns a quadratic programme into a linear one: its gradient outweighs distance
+LEVELS = 8  # tensions between T_bias and limit at which the elongation is read
+# [rad] for the slope of G; small against the bends of a route, large against errors of the MAE.
+STEP = 0.05
+
+# `tension`
+SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
 
 class JointStiffness(NamedTuple):
@@ -115,3 +133,177 @@ def paper_terms(
         Term(POSTURE_WEIGHT, rows[:joints], theta),
         Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque),
     )
+
+
+class StiffnessModel(NamedTuple):
+    """Joint stiffness around one posture, as the MAE sees it."""
+
+    jacobian: Array  # G [m/rad], (M, D)
+    hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
+    compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
+    module: Array  # K_stiff [N/m], (M,)
+
+    @classmethod
+    def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
+        """Read the model off the MAE at θ (D,) and T (M,)."""
+
+        def jacobian(postures: Array) -> Array:
+            return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
+
+        ranges = np.stack([robot.tension.bias, robot.tension.limit])
+        tensions: Array = np.linspace(ranges[0], ranges[1], LEVELS)
+        lengths = mae.lengths(np.tile(theta, (LEVELS, 1)), tensions)
+        cubic = np.empty((4, robot.muscle_count))
+        for low, high in np.unique(ranges, axis=1).T:
+            own = (ranges[0] == low) & (ranges[1] == high)
+            cubic[:, own] = np.polyfit(np.linspace(low, high, LEVELS), -lengths[:, own], 3)
+        return cls(
+            jacobian=mae.muscle_jacobian(theta, tension),
+            hessian=robot_stiffness.muscle_hessian(jacobian, theta, STEP),
+            compliance=cubic[:3] * np.array([3.0, 2.0, 1.0])[:, None],
+            module=robot.stiffness,
+        )
+
+    def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:
+        """Return k [N/m] and dk/dT [1/m] of every muscle, each of shape (M,)."""
+        square, linear, constant = self.compliance
+        compliance = (square * tension + linear) * tension + constant
+        # A network may err so far that a wire seems to shorten under tension; call it rigid.
+        slope = np.where(compliance > 0.0, 2.0 * square * tension + linear, 0.0)
+        k = robot_stiffness.muscle_stiffness(self.module, np.maximum(compliance, 0.0))
+        return k, -k * k * slope
+
+    def joint_stiffness(self, tension: Array) -> Array:
+        """Return K_θ [N·m/rad] at T (M,), shape (D, D)."""
+        k, _ = self.muscle_stiffness(tension)
+        return robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
+
+    def slope(self, tension: Array) -> Array:
+        """Return ∂K_jj/∂T_i [N·m/rad/N] at T (M,), shape (D, M)."""
+        _, bend = self.muscle_stiffness(tension)
+        return (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
+
+
+def stiffness_command(
+    robot: Robot, mae: Mae, theta: Array, torque: Array, desired: Array, limit: Array | float
+) -> Solution:
+    """Return the command of `stiffness`: joint stiffness as near as possible to the desired one.
+
+        min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
+
+    with K_θ of `robot/stiffness.py`, whose G, ∂²l/∂θ² and L_e(T), which is −l(θ, T) up to a
+    constant, are read by entering the MAE with ① (paper, section "Control", third: variable
+    stiffness). Tensions in the null space of Gᵀ leave the posture and stiffen the elastic units.
+    T_low lies above T_bias, because a muscle that MSC holds at T_bias is stiff in one direction
+    only. K is nearly linear in T: a few quadratic programmes around the last solution suffice.
+
+    Desired are diagonal entries [N·m/rad] (D,); 0 for as it comes, and what lies beyond the
+    reachable range of its joint is taken as the end of that range. Others as for `proposed`.
+    """
+    high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
+    jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
+    for margin in MARGINS:
+        low = np.minimum(robot.tension.bias + margin, high)
+        tension, missing = least_tension(jacobian, torque, low, high)
+        if not missing.any():
+            break
+    model = StiffnessModel.read(robot, mae, theta, tension)
+    # Where every muscle is needed for the torque nothing is left to choose.
+    lowest = highest = np.diag(model.joint_stiffness(tension))
+    for _ in range(SOLVES):
+        programme = TensionProgramme(model.jacobian, torque, low, high)
+        try:
+            start = programme.nearest(tension)
+        except InfeasibleError:
+            break
+        lowest, highest = (
+            np.array([_extreme(model, programme, start, j, sign) for j in range(len(theta))])
+            for sign in (-1.0, 1.0)
+        )
+        within = np.where(desired > 0.0, np.clip(desired, lowest, highest), 0.0)
+        tension = _approach(model, programme, start, within)
+        model = StiffnessModel.read(robot, mae, theta, tension)
+        missing = torque + model.jacobian.T @ tension if missing.any() else missing
+    stiffness = JointStiffness(model.joint_stiffness(tension), lowest, highest)
+    return Solution(first_command(robot, mae, theta, tension), tension, missing, stiffness)
+
+
+def _approach(
+    model: StiffnessModel, programme: TensionProgramme, tension: Array, desired: Array
+) -> Array:
+    """Gauss–Newton on the desired entries; the others are as they come."""
+    chosen, start = desired > 0.0, tension
+    for _ in range(ITERATIONS if chosen.any() else 0):
+        slope = model.slope(tension)[chosen]
+        short = (desired - np.diag(model.joint_stiffness(tension)))[chosen]
+        small = LEAST_TENSION_SHARE * np.square(slope).sum(axis=1).mean()
+        quadratic = slope.T @ slope + small * np.eye(len(tension))
+        tension = programme.minimum(quadratic, slope.T @ (short + slope @ tension) + small * start)
+    return tension
+
+
+def _extreme(
+    model: StiffnessModel, programme: TensionProgramme, tension: Array, joint: int, sign: float
+) -> float:
+    """Climb to the corner that the slope points to, as far as it improves (Frank and Wolfe)."""
+
+    def value(tension: Array) -> float:
+        return sign * float(model.joint_stiffness(tension)[joint, joint])
+
+    best = value(tension)
+    for _ in range(ITERATIONS):
+        slope = sign * model.slope(tension)[joint]
+        corner = programme.nearest(tension + FAR / max(float(np.abs(slope).max()), 1e-12) * slope)
+        steps = [tension + share * (corner - tension) for share in SHARES]
+        values = [value(step) for step in steps]
+        k = int(np.argmax(values))
+        if values[k] <= best + 1e-3 * abs(best):
+            break
+        best, tension = values[k], steps[k]
+    return sign * best
+
+
+class TorqueControl:
+    """Joint torque by muscle tension, moment by moment: the method `tension`.
+
+        τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
+        T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
+
+    with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the
+    estimate, smoothed. With both gains zero the arm's weight is carried and `effort` is exerted,
+    nothing more: such an arm floats and keeps no posture.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._robot, self.settings = robot, settings
+        #: what the tensions of the last step do not deliver [N·m], (D,)
+        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self.start_from(np.full(robot.muscle_count, robot.tension.bias))
+
+    def start_from(self, tension: Array) -> None:
+        """Continue from tensions [N] (M,), at the start, after a stop or another method."""
+        self._command: Array = np.maximum(tension, self._robot.tension.bias)
+        self._smooth: Array | None = None
+
+    def step(
+        self, mae: Mae, theta: Array, target: Array, effort: Array, limit: Array, dt: float
+    ) -> Array:
+        """Return the tensions to command [N], at most `limit` (M,), dt [s] after the last ones.
+
+        θ is estimated, the target and it [rad] (D,); effort is torque beyond the weight [N·m] (D,).
+        """
+        chosen, robot = self.settings, self._robot
+        before = theta if self._smooth is None else self._smooth
+        self._smooth = smooth = before + dt / (dt + SMOOTHING) * (theta - before)
+        velocity = (theta - smooth) / SMOOTHING
+        torque = robot.kinematics.holding_torque(smooth) + effort
+        torque = torque + chosen.position_gain * (target - smooth)
+        torque = torque - chosen.velocity_gain * velocity
+        jacobian = mae.muscle_jacobian(smooth, self._command)
+        tension, self.missing_torque = least_tension(jacobian, torque, robot.tension.bias, limit)
+        # All muscles change by the same share: between two tensions that hold the arm, it is held.
+        change = tension - self._command
+        fastest = robot.stiffness * chosen.rate_limit * dt
+        share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
+        self._command = self._command + change * share
+        return self._command.copy()

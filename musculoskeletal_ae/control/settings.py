@@ -5,72 +5,60 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.parameters import PRESET, Parameter
+from musculoskeletal_ae.parameters import PRESET, settable
 
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
-
-
-def _set(
-    default: Any, meaning: str, unit: str = '', *within: float, legal: tuple[str, ...] = ()
-) -> Any:
-    low_high = (within[0], within[1]) if within else None
-    return Parameter(default, meaning, unit, low_high, legal, settable=True).field()
 
 
 @dataclass(frozen=True)
 class Settings:
     """Settings of control; `Controller.configure` takes changed ones."""
 
-    method: str = _set('proposed', 'how a target posture becomes a command', legal=METHODS)
+    method: str = settable('proposed', 'how a target posture becomes a command', legal=METHODS)
     preset: str = replace(PRESET, settable=True).field()
-    joint_stiffness: tuple[float, ...] = _set(
+    joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
         'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
         'N·m/rad',
         0.0,
         1000.0,
     )
-    first_duration: float = _set(5.0, 'movement duration', 's', 0.1, 60.0)
-    second_duration: float = _set(
+    first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
+    second_duration: float = settable(
         2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
     )
-    constant_tension: float = _set(
+    constant_tension: float = settable(
         0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
-    rate_limit: float = _set(
+    rate_limit: float = settable(
         0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
     )
-    position_gain: float = _set(
+    position_gain: float = settable(
         10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
     )
-    velocity_gain: float = _set(
+    velocity_gain: float = settable(
         0.5, 'damping torque, method `tension` (0: none)', 'N·m·s/rad', 0.0, 20.0
     )
-    feedback_gain: float = _set(
+    feedback_gain: float = settable(
         0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
     )
-    max_age: float = _set(
+    max_age: float = settable(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
     )
-    hold_time: float = _set(
+    hold_time: float = settable(
         0.5, 'how long a stop holds the last command; data back by then resumes', 's', 0.0, 60.0
     )
-    temperature_limit: float = _set(
+    temperature_limit: float = settable(
         85.0, 'a module this hot pulls with T_bias only; 20 °C more stop the arm', '°C', 40.0, 200.0
     )
-    overload_time: float = _set(
+    overload_time: float = settable(
         20.0, 'a tension above tension.limit for this long stops the arm', 's', 0.1, 3600.0
     )
 
     def desired_stiffness(self, joints: int) -> tuple[float, ...]:
-        """Return `joint_stiffness` for so many joints; nothing, or a single 0, is all as they come.
-
-        Raises:
-            MusculoskeletalError: If it is not one finite number of at least 0 for each joint.
-        """
+        """Return `joint_stiffness` for so many joints; nothing, or one 0, is all as they come."""
         values = self.joint_stiffness
         if values in ((), (0.0,)):
             return (0.0,) * joints

@@ -86,14 +86,14 @@ class Verdict:
     """The judgement on one driver."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+        self.robot = robot
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
         self.faults: list[Fault] = []
         self.notes: list[str] = []  # what is no fault, or could not be judged
 
     def passed(self, check: str, *muscles: int) -> None:
         """Note that muscles (none: all) are as they must be, unless they were found wrong."""
-        for m in muscles or range(self._robot.muscle_count):
+        for m in muscles or range(self.robot.muscle_count):
             if self._state[m, CHECKS.index(check)] == OPEN:
                 self._state[m, CHECKS.index(check)] = OK
 
@@ -101,9 +101,9 @@ class Verdict:
         """Note one of the FAULTS, of some muscles (none: of all), with what its texts name."""
         check, saw, change = FAULTS[what]
         if muscles:
-            first, robot = muscles[0], self._robot
+            first, robot = muscles[0], self.robot
             seen |= {'bias': robot.tension.bias[first], 'k': robot.stiffness[first]}
-        muscles = muscles or tuple(range(self._robot.muscle_count))
+        muscles = muscles or tuple(range(self.robot.muscle_count))
         self._state[list(muscles), CHECKS.index(check)] = WRONG
         self.faults.append(Fault(check, muscles, saw.format(**seen), change.format(**seen)))
 
@@ -112,15 +112,8 @@ class Verdict:
         """Which of the CHECKS found a fault."""
         return {fault.check for fault in self.faults}
 
-    def add(self, other: Verdict) -> None:
-        """Take over what another one found."""
-        self.faults += other.faults
-        self.notes += other.notes
-        for at, state in np.ndenumerate(other._state):
-            self._state[at] = max(self._state[at], state, key=[OPEN, OK, WRONG].index)
-
     def __str__(self) -> str:
-        names = self._robot.muscles
+        names = self.robot.muscles
         width = max(map(len, names)) + 2
         rows = zip(('', *names), (CHECKS, *self._state))
         lines = [f'{name:<{width}}' + ''.join(f'{cell:>9}' for cell in row) for name, row in rows]

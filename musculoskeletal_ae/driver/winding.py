@@ -20,7 +20,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
-from musculoskeletal_ae.robot.robot import Robot
 
 ABOVE_BIAS = 40.0  # [N] that the highest tension lies above T_bias, unless said otherwise
 SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s]
@@ -56,14 +55,14 @@ class Winding:
     """Winds muscles in, one command a message, and judges what they do."""
 
     def __init__(
-        self, robot: Robot, muscles: Sequence[int] = (), highest: float | None = None
+        self, verdict: Verdict, muscles: Sequence[int] = (), highest: float | None = None
     ) -> None:
         """Try some muscles (none: all), with at most `highest` [N] asked for."""
+        self.verdict, robot = verdict, verdict.robot
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
         self._highest: Array = np.maximum(highest or self._bias + ABOVE_BIAS, self._bias + CLIP[0])
         self._stiffness = robot.stiffness
-        self.verdict = Verdict(robot)
         self.trying = ''  # what is going on, for people
         self.done = False
         self._now = 0.0
@@ -180,7 +179,7 @@ class Winding:
         verdict.passed('order', m)
         verdict.passed('unit', m)
         if wound[m] < -RESPONSE[1]:
-            verdict.failed('rises', m, rise=-1e3 * wound[m])
+            verdict.failed('sign', m, told=f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in')
         verdict.passed('sign', m)
         clip = robot.tension.max[m]
         if clip <= self._highest[m]:

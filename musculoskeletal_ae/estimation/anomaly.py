@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
@@ -57,11 +57,9 @@ class AnomalyDetector:
     A beyond the threshold is an anomaly; with threshold 0 the calibrated detector decides.
     """
 
-    def __init__(self, robot: Robot, threshold: float = 0.0) -> None:
-        """Watch `robot`."""
+    def __init__(self, robot: Robot, settings: Detection | None = None) -> None:
         self._robot = robot
-        self.threshold = threshold
-        self.slack = Slack()
+        self.settings = settings or Detection()
         self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
         self._farthest = np.inf  # d of its threshold, where it is calibrated
@@ -135,7 +133,7 @@ class AnomalyDetector:
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
     ) -> str:
-        limit, value, what, where = self.threshold, anomaly, 'A', ''
+        limit, value, what, where = self.settings.anomaly_threshold, anomaly, 'A', ''
         if limit <= 0.0:
             if not self.calibrated:
                 return ''
@@ -165,10 +163,10 @@ class AnomalyDetector:
         self._tight = np.where(begins, length, self._tight)
         self._torn = np.where(torn, self._torn + dt, 0.0)
         # It winds as long as every DEAD_TIME brings a new shortest length, by the slowest winch's.
-        winds = begins | (length < self._wound - self.slack.slack_speed * DEAD_TIME)
+        winds = begins | (length < self._wound - self.settings.slack_speed * DEAD_TIME)
         self._wound = np.where(winds, length, self._wound)
         self._stood = np.where(winds | ~torn, 0.0, self._stood + dt)
-        spent = length < self._tight - self.slack.slack_length
+        spent = length < self._tight - self.settings.slack_length
         gone = (self._stood >= DEAD_TIME - dt) | spent
         self._winds_slack = torn & ~gone
         dead = (self._torn >= DEAD_TIME) & gone

@@ -50,7 +50,6 @@ class Estimator:
     """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s]."""
 
     def __init__(self, robot: Robot) -> None:
-        """Wait for a network."""
         self._robot = robot
         self.mae: Mae | None = None  # the network in use
         self.detector = AnomalyDetector(robot)
@@ -91,10 +90,8 @@ class Estimator:
     def zero(self, posture: tuple[float, ...] = ()) -> None:
         """Begin to find the zeros of the length sensors; the arm stands in `posture` [rad] (D,).
 
-        Without one they are found while the arm moves gently.
-
-        Raises:
-            MusculoskeletalError: If there is no network, or no such posture.
+        Without one they are found while the arm moves gently. A MusculoskeletalError says that
+        there is no network, or no such posture.
         """
         if self.mae is None:
             raise MusculoskeletalError('no checkpoint, and zeros are found with a network')
@@ -151,11 +148,7 @@ class Estimator:
         return guess
 
     def see(self, pose: pin.SE3) -> Array:
-        """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame.
-
-        Raises:
-            MessageError: If the arm cannot reach it.
-        """
+        """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame."""
         posture = inverse_kinematics(self._robot, pose, self._theta)
         if posture.distance > MARKER_DISTANCE or posture.angle > MARKER_ANGLE:
             raise MessageError(

@@ -90,11 +90,7 @@ class Gate:
         self._messages.clear()
 
     def check(self, mae: Mae) -> None:
-        """Try a network.
-
-        Raises:
-            GateError: If it does not explain the arm; the one in use stays.
-        """
+        """Try a network; a GateError says that it does not explain the arm."""
         with np.errstate(all='ignore'):
             if faults := [*self._faults(mae)]:
                 raise GateError('; '.join(faults))

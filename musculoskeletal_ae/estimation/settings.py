@@ -5,16 +5,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from musculoskeletal_ae.parameters import Parameter
+from musculoskeletal_ae.parameters import settable
 
 
 @dataclass(frozen=True)
-class Slack:
-    """What a module does that takes up slack wire, so that no tension is no cut muscle yet."""
+class Detection:
+    """What is an anomaly; what winds in slack wire, so that no tension is no cut muscle yet."""
 
-    slack_length: float = Parameter(
-        0.06, 'longest slack that a module may wind in', 'm', (0.0, 1.0), settable=True
-    ).field()
-    slack_speed: float = Parameter(
-        0.005, 'a module that winds in slower stands', 'm/s', (1e-4, 1.0), settable=True
-    ).field()
+    anomaly_threshold: float = settable(
+        0.0,
+        'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
+        'scaled units',
+        0.0,
+        1e6,
+    )
+    slack_length: float = settable(0.06, 'longest slack that a module may wind in', 'm', 0.0, 1.0)
+    slack_speed: float = settable(0.005, 'a module that winds in slower stands', 'm/s', 1e-4, 1.0)

@@ -105,10 +105,10 @@ Fitting = Generator[None, None, Fit]  # yields between short pieces of work
 class Zeroing:
     """Collects moments and finds the zeros a little at every message. Lengths here are readings."""
 
-    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None, seed: int = 0) -> None:
+    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
         """Find zeros with a network; `posture` [rad] (D,) if the arm stands in a known one."""
         self._robot, self._mae, self._posture = robot, mae, posture
-        self._rng = np.random.default_rng([seed, 0x2E])
+        self._rng = np.random.default_rng([0, 0x2E])
         self._direction = FrictionDirection()
         self._window: list[tuple[Array, Array, Array]] = []  # T, l, s
         self._angles: list[Array] = []  # θ in the same time, where measured

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm on the graph, simulated or emulated: its states, its description, its markers."""
+"""An arm on the graph: its states and description, if it is simulated or emulated, and its looks.
+
+For RViz and Foxglove: bones, muscles and names as markers, or poses of all links on /tf. The
+hardware's bones are ivory and solid; green those of the estimate, violet the simulator's.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +11,91 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
+import pinocchio as pin
+from geometry_msgs.msg import Point, TransformStamped, WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import ColorRGBA, Float64MultiArray, String
+from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.nodes.markers import Markers
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.robot.drawing import Line
+from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
+from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_wrench
 
+MARKER_RATE = 10.0  # [Hz]
+NAME_HEIGHT = 0.018  # [m]
+BONES = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
+SOLID = (*BONE_COLOUR, 1.0)
 # After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
 LONGEST_STEP = 0.1  # [s]
+
+
+class Markers:
+    """Publishes ARM/markers while somebody listens."""
+
+    def __init__(self, node: Shell, arm: str, lines: Callable[[], list[Line]]) -> None:
+        """Draw the lines of an arm, none where there is nothing to draw yet."""
+        self._node, self._lines = node, lines
+        self._bones = BONES.get(arm, SOLID)
+        self._publisher = node.create_publisher(MarkerArray, f'{arm}/markers', RELIABLE)
+        node.create_timer(1.0 / MARKER_RATE, self._publish)
+
+    def _publish(self) -> None:
+        if self._publisher.get_subscription_count() == 0 or not (lines := self._lines()):
+            return
+        message, names = MarkerArray(), iter(self._node.robot.muscles)
+        for number, line in enumerate(lines):
+            marker = self._add(message, line.kind, number, Marker.LINE_STRIP)
+            marker.scale.x = line.width
+            look = self._bones if line.kind == 'bones' else (*line.colour, self._bones[3])
+            marker.color = ColorRGBA(**dict(zip('rgba', look)))
+            marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
+            if line.kind == 'muscles':
+                name = self._add(message, 'names', number, Marker.TEXT_VIEW_FACING)
+                name.text, name.scale.z, name.color = next(names), NAME_HEIGHT, marker.color
+                name.pose.position = Point(**dict(zip('xyz', line.points.mean(axis=0).tolist())))
+        self._publisher.publish(message)
+
+    def _add(self, message: MarkerArray, kind: str, number: int, shape: int) -> Marker:
+        marker = Marker(ns=kind, id=number, type=shape)
+        marker.header.frame_id = self._node.root_frame
+        marker.header.stamp = self._node.get_clock().now().to_msg()
+        marker.pose.orientation.w = 1.0
+        message.markers.append(marker)
+        return marker
+
+
+class Frames:
+    """Publishes where links are, where ROS has tf2_msgs: Jazzy does, the wheels do not."""
+
+    def __init__(self, node: Shell) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise MusculoskeletalError(
+                'parameter publish_tf: tf2_msgs is not installed; source ROS 2 Jazzy, or leave it '
+                '"none"'
+            ) from error
+        self._node, self._message = node, TFMessage
+        self._prefix: str = node.parameter('frame_prefix')
+        self._publisher = node.create_publisher(TFMessage, '/tf', RELIABLE)
+
+    def publish(self, theta: Array) -> None:
+        """Publish the poses at θ [rad] (D,)."""
+        robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
+        joints, transforms = robot.kinematics.transforms(theta[None])[0], []
+        for frame in body_frames(robot.kinematics.model):
+            if frame.name != robot.root_link:
+                transform = TransformStamped(child_frame_id=self._prefix + frame.name)
+                transform.header.frame_id, transform.header.stamp = self._node.root_frame, stamp
+                pose = pin.SE3(joints[frame.parentJoint]) * frame.placement
+                p, q = transform.transform.translation, transform.transform.rotation
+                p.x, p.y, p.z, q.x, q.y, q.z, q.w = pin.SE3ToXYZQUAT(pose).tolist()
+                transforms.append(transform)
+        self._publisher.publish(self._message(transforms=transforms))
 
 
 class Arm(Shell):

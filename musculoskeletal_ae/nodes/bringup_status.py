@@ -25,7 +25,7 @@ from std_msgs.msg import Bool, Float64, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.robot.robot import Robot
@@ -35,7 +35,6 @@ class BringupStatus(Shell):
     """Prints estimation error, A, samples learned and number of checkpoints."""
 
     def __init__(self, **options: Any) -> None:
-        """Listen; options are those of Node."""
         super().__init__('bringup_status', **options)
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')

@@ -10,6 +10,7 @@ import math
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import rclpy
@@ -18,8 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.qos import RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.start import load
@@ -42,7 +42,6 @@ class CheckDriver:
     """Listens to one driver, and winds its muscles in."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
-        """Join the graph."""
         self.node: Node = rclpy.create_node('check_driver')
         self.robot, self.options = robot, options
         self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
@@ -85,7 +84,7 @@ class CheckDriver:
             verdict.notes.append('nobody publishes joint_states, from which the learner learns')
         return verdict
 
-    def wind(self) -> Verdict:
+    def wind(self, verdict: Verdict) -> None:
         """Wind each muscle in a little."""
         if self.node.count_publishers(COMMAND):
             raise MusculoskeletalError(
@@ -93,16 +92,14 @@ class CheckDriver:
                 'else moves the arm'
             )
         muscles = self.robot.muscle_indices(self.options.muscles or [])
-        winding = load('musculoskeletal_ae.driver.winding').Winding(
-            self.robot, muscles, self.options.tension
-        )
+        kind = load('musculoskeletal_ae.driver.winding').Winding
+        winding = kind(verdict, muscles, self.options.tension)
         read = load('musculoskeletal_ae.validity').read_array
-        verdict: Verdict = winding.verdict
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
         self._spin(3.0, lambda: publisher.get_subscription_count() > 0)
         if not publisher.get_subscription_count():
             verdict.failed('deaf', topic=self.command)
-            return verdict
+            return
         last, trying = time.monotonic(), ''
 
         def follow(message: Float64MultiArray) -> None:
@@ -123,7 +120,6 @@ class CheckDriver:
         self._spin(math.inf, lambda: winding.done or time.monotonic() - last > SILENCE)
         if not winding.done:
             verdict.failed('silence', gap=SILENCE)
-        return verdict
 
 
 def _check(options: Namespace, arguments: list[str]) -> int:
@@ -144,7 +140,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
     if options.move and verdict.wrong - {'zero'}:
         _say('not moved: what is wrong already comes first')
     elif options.move:
-        verdict.add(driver.wind())
+        driver.wind(verdict)
         _say(verdict)
     _say('the driver keeps its contract' if not verdict.faults else 'the driver is to be changed')
     return 1 if verdict.faults else 0
@@ -177,6 +173,4 @@ def _parse(arguments: list[str]) -> Namespace:
     return options
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Judge a driver."""
-    return run_tool('check_driver', _parse, _check, argv)
+main = partial(run_tool, 'check_driver', _parse, _check)

@@ -23,8 +23,7 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import array_message, serve
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
@@ -36,7 +35,6 @@ class Controller(Shell):
     """Node shell of control."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics and services; options are those of Node."""
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
         self.recording = StopRecording(self.resolve_topic_name)

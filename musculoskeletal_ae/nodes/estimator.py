@@ -22,12 +22,18 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
-from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.markers import Frames, Markers
-from musculoskeletal_ae.nodes.messages import array_message, joint_message, serve
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.arm import Frames, Markers
+from musculoskeletal_ae.nodes.messages import (
+    LATCHED,
+    RELIABLE,
+    SENSOR,
+    array_message,
+    joint_message,
+    serve,
+)
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
@@ -40,12 +46,8 @@ class Estimator(Shell):
     """Node shell of the MAE's estimate ② and the anomaly detector."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics; options are those of Node."""
         super().__init__('estimator', **options)
         self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
-        self.follow_parameter(
-            'anomaly_threshold', partial(setattr, self.core.detector, 'threshold')
-        )
         self.joints = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscles = self.create_publisher(Float64MultiArray, 'estimated_muscle_states', RELIABLE)
         self.anomaly = self.create_publisher(Float64, 'anomaly', RELIABLE)
@@ -60,8 +62,8 @@ class Estimator(Shell):
         if self.unzeroed:  # nobody moves on what sensors say before the network is there
             self.core.zeros = Zeros.unknown(self.robot.muscle_count)
         self.follow_checkpoints(self._use)
-        for name in parameters_of(Slack):
-            self.follow_parameter(name, partial(self._take_slack, name))
+        for name in parameters_of(Detection):
+            self.follow_parameter(name, partial(self._configure, name))
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscle_states(self._estimate, as_read=True)
@@ -91,8 +93,9 @@ class Estimator(Shell):
             self.unzeroed = False
             self.core.zero(self.posture)
 
-    def _take_slack(self, name: str, value: float) -> None:
-        self.core.detector.slack = replace(self.core.detector.slack, **{name: value})
+    def _configure(self, name: str, value: float) -> None:
+        detector = self.core.detector
+        detector.settings = replace(detector.settings, **{name: value})
 
     def _take_posture(self, posture: tuple[float, ...]) -> None:
         posture = () if posture == (0.0,) else posture

@@ -16,8 +16,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
-from musculoskeletal_ae.nodes.messages import serve
-from musculoskeletal_ae.nodes.qos import RELIABLE
+from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 
@@ -26,7 +25,6 @@ class HardwareEmulator(Arm):
     """Node shell of the emulated arm."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics and start the arm; options are those of Node."""
         super().__init__('hardware_emulator', **options)
         self.arm = EmulatedArm(self.robot, self.parameter('seed'))
         # Compiled code is loaded before the first message promises a living arm.

@@ -19,8 +19,7 @@ from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import bytes_message, serve
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
@@ -33,7 +32,6 @@ class Learner(Shell):
     """Node shell of online learning."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics and start the training process; options are those of Node."""
         super().__init__('learner', **options)
         value = self.parameter
         self.core = learner.Learner(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays to ROS messages, which `musculoskeletal_ae.validity` reads; answers to services."""
+"""ROS messages from arrays, which `validity` reads; their quality of service; services."""
 
 from __future__ import annotations
 
@@ -9,12 +9,21 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+# The three qualities of service (doc/interface.md).
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(
+    depth=1, reliability=RELIABLE.reliability, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 
 
 def array_message(values: Array, *labels: str) -> Float64MultiArray:
@@ -41,10 +50,7 @@ def bytes_message(data: bytes) -> UInt8MultiArray:
 
 
 def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
-    """Offer a Trigger or SetBool service: `work` takes the request and says what it did.
-
-    It raises a `MusculoskeletalError` to refuse.
-    """
+    """Offer a Trigger or SetBool service: `work` says what it did, or raises why it did not."""
 
     def answer(request: Any, response: Any) -> Any:
         try:
@@ -54,3 +60,14 @@ def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
         return response
 
     node.create_service(kind, name, answer)
+
+
+def refuse(request: Any, response: Any, reason: str) -> None:
+    """Let the response to a request that could not be worked on say so, where it can."""
+    refused = SetParametersResult(successful=False, reason=reason)
+    if hasattr(response, 'results'):  # of parameters, those done before
+        response.results += [refused] * (len(request.parameters) - len(response.results))
+    elif isinstance(getattr(response, 'result', None), SetParametersResult):
+        response.result = refused
+    elif hasattr(response, 'success'):
+        response.success, response.message = False, reason

@@ -18,7 +18,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
-from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.settings import Settings as LearningSettings
@@ -50,13 +50,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     },
     'estimator': {
         **NETWORK,
-        'anomaly_threshold': Parameter(
-            0.0,
-            'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
-            'scaled units',
-            (0.0, 1e6),
-            settable=True,
-        ),
         'zero_posture': Parameter(
             (0.0,),
             'where the arm stands when estimator/zero is called, one angle for each joint (0 or '
@@ -68,7 +61,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'zero_at_start': Parameter(
             False, 'winches that forget their zeros: find them at the start'
         ),
-        **parameters_of(Slack),
+        **parameters_of(Detection),
         'mirror_muscles': Parameter(
             False, 'publish muscle_joint_states, so that plots know the names of the muscles'
         ),

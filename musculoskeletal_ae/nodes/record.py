@@ -17,9 +17,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from musculoskeletal_ae.bags.metadata import Qos, offered_qos
-from musculoskeletal_ae.bags.recover import recover
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
-from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter
+from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
 from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
 
@@ -36,7 +35,6 @@ class Record(Node):
     """Writes what arrives, serialized as it is."""
 
     def __init__(self, writer: BagWriter, topics: list[str]) -> None:
-        """Subscribe to the topics."""
         super().__init__('record')
         self.writer = writer
         self.received = 0
@@ -134,6 +132,4 @@ def _work(options: Namespace, arguments: list[str]) -> int:
     return 0
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the tool; exit status 0: recorded, also after Ctrl-C, 1: failed, 2: wrong options."""
-    return run_tool('record', parse, _work, argv)
+main = partial(run_tool, 'record', parse, _work)

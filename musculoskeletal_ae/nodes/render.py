@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import rclpy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.qos import SENSOR
+from musculoskeletal_ae.nodes.messages import SENSOR
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
@@ -61,6 +62,4 @@ def _parse(arguments: list[str]) -> Namespace:
     return parser.parse_args(arguments)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Wait for one marker array and draw it."""
-    return run_tool('render', _parse, _render, argv)
+main = partial(run_tool, 'render', _parse, _render)

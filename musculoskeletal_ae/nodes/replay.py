@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,7 @@ from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import array_message, serve
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
@@ -41,23 +40,6 @@ LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of 
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
 # Recorded time between two messages on /clock, but not more often than nodes can bear.
 CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
-
-
-class RecordedClock:
-    """Publishes the recorded time on /clock at a steady rate."""
-
-    def __init__(self, node: Node, rate: float) -> None:
-        """Advertise /clock for a replay at a rate."""
-        self.publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
-        self._period = max(CLOCK_PERIOD / max(rate, 1.0), SHORTEST_CLOCK_PERIOD)
-        self.next_tick = -math.inf  # when the steady clock [s] calls for the next message
-
-    def tick(self, recorded: int, now: float) -> None:
-        """Publish the recorded time [ns] if it is time to."""
-        if now >= self.next_tick:
-            self.next_tick = now + self._period
-            seconds, nanoseconds = divmod(recorded, 1_000_000_000)
-            self.publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
 
 
 class Replay(Node):
@@ -77,8 +59,11 @@ class Replay(Node):
             )
             for recorded, name in names.items()
         }
-        self._recorded_clock = RecordedClock(self, options.rate) if options.clock else None
-        self._next_service = self._next_report = 0.0
+        self._recorded_time = None
+        if options.clock:
+            self._recorded_time = self.create_publisher(Clock, '/clock', QoSProfile(depth=1))
+        self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
+        self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
         self._sought: int | None = None  # where to go on [ns]
         told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
         number = FloatingPointRange(from_value=0.0, to_value=(self._stop - self._start) / 1e9)
@@ -89,24 +74,31 @@ class Replay(Node):
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
-            self._timeline.pause(time.monotonic())
+            self._timeline.hold(True, time.monotonic())
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
 
     def get_ready(self, longest: float) -> None:
         """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
         end = time.monotonic() + longest
-        topics = list(self._publisher.values())
-        if self._recorded_clock:
-            topics.append(self._recorded_clock.publisher)
+        topics = [
+            *self._publisher.values(),
+            *([self._recorded_time] if self._recorded_time else []),
+        ]
         while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)
         for work in (self.pause, self.resume, self.step):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
-    def play(self, progress: tqdm) -> None:
-        """Publish everything once, from start to stop."""
+    def play(self, progress: tqdm, again: bool) -> None:
+        """Publish everything, from start to stop; again and again until the process is ended."""
+        self._lap(progress)
+        while again:
+            self._wait(self._stop + LAP_GAP, progress)
+            self._lap(progress)
+
+    def _lap(self, progress: tqdm) -> None:
         progress.reset()
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
@@ -119,12 +111,6 @@ class Replay(Node):
                 self._timeline.catch_up(message.log_time, time.monotonic())
                 self._tick()
                 self._publisher[message.topic].publish(message.data)
-
-    def play_again_and_again(self, progress: tqdm) -> None:
-        """Publish everything until the process is ended."""
-        while True:
-            self.play(progress)
-            self._wait(self._stop + LAP_GAP, progress)
 
     def acknowledge(self) -> None:
         """Give reliable readers time to get the last messages."""
@@ -141,43 +127,40 @@ class Replay(Node):
                 break
             self._tick()
             wait = min(due, SERVICE_PERIOD)
-            if self._recorded_clock:
-                wait = min(wait, max(self._recorded_clock.next_tick - now, 0.0))
+            if self._recorded_time:
+                wait = min(wait, max(self._next_tick - now, 0.0))
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.spin_once(timeout_sec=wait)
                 if now > self._next_report:
                     self._next_report = now + 1.0
-                    self._report()
-                done = (self._timeline.recorded(time.monotonic()) - self._start) / 1e9
-                progress.update(max(0.0, done - progress.n))
+                    seconds = np.array([self._done(), (self._stop - self._start) / 1e9])
+                    self._told.publish(array_message(seconds, 'position'))
+                progress.update(max(0.0, self._done() - progress.n))
             else:
                 time.sleep(wait)
         return self._sought is None
 
     def _tick(self) -> None:
-        now = time.monotonic()
-        if self._recorded_clock:
-            self._recorded_clock.tick(self._timeline.recorded(now), now)
+        """Publish the recorded time, if it is wanted and due."""
+        if self._recorded_time and (now := time.monotonic()) >= self._next_tick:
+            self._next_tick = now + self._clock_period
+            seconds, nanoseconds = divmod(self._timeline.recorded(now), 1_000_000_000)
+            self._recorded_time.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
 
     def _seek(self, parameters: list[Parameter]) -> None:
         for parameter in parameters:
             if parameter.name == 'position':
                 self._sought = self._start + int(1e9 * parameter.value)
 
-    def _report(self) -> None:
-        at = self._timeline.recorded(time.monotonic()) - self._start
-        seconds = np.array([max(at, 0), self._stop - self._start]) / 1e9
-        self._told.publish(array_message(seconds, 'position'))
-
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""
-        self._timeline.pause(time.monotonic())
+        self._timeline.hold(True, time.monotonic())
         return f'paused at {self._position()}'
 
     def resume(self, _: Trigger.Request) -> str:
         """Go on."""
-        self._timeline.resume(time.monotonic())
+        self._timeline.hold(False, time.monotonic())
         return f'playing at {self._position()}'
 
     def step(self, _: Trigger.Request) -> str:
@@ -187,9 +170,12 @@ class Replay(Node):
         self._timeline.jump(self._next_time, time.monotonic())
         return f'stepped at {self._position()}'
 
+    def _done(self) -> float:
+        """Return how much has been played [s]."""
+        return max(0.0, (self._timeline.recorded(time.monotonic()) - self._start) / 1e9)
+
     def _position(self) -> str:
-        at = (self._timeline.recorded(time.monotonic()) - self._bag.start) / 1e9
-        return f'{max(at, 0.0):.6f} s'
+        return f'{(self._start - self._bag.start) / 1e9 + self._done():.6f} s'
 
 
 def _replay(options: Namespace, arguments: list[str]) -> int:
@@ -206,7 +192,7 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
     with tqdm(total=(stop - start) / 1e9, bar_format=bar, disable=None, leave=False) as progress:
         node.get_ready(options.wait)
-        (node.play_again_and_again if options.loop else node.play)(progress)
+        node.play(progress, options.loop)
     node.acknowledge()
     return 0
 
@@ -265,6 +251,4 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         return 0  # as `ros2 bag play`
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node; exit status 0: played or Ctrl-C, 1: the bag is bad, 2: wrong options."""
-    return run_tool('replay', parse, _work, argv)
+main = partial(run_tool, 'replay', parse, _work)

@@ -38,10 +38,9 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.reception import Reception
-from musculoskeletal_ae.nodes.shield import refuse
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
@@ -51,8 +50,6 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
 LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
-
-LEVELS = {'ok': DiagnosticStatus.OK, 'warn': DiagnosticStatus.WARN, 'error': DiagnosticStatus.ERROR}
 
 
 class Shell(Node):
@@ -130,18 +127,11 @@ class Shell(Node):
     # -- parameters -----------------------------------------------------------------------------
 
     def parameter(self, name: str) -> Any:
-        """Return a parameter's value; lists as tuples, without empty names.
-
-        Raises:
-            MusculoskeletalError: If the value is not legal.
-        """
+        """Return a parameter's value, if it is legal; lists as tuples, without empty names."""
         return self._checked(name, self.get_parameter(name).value, lambda value: value)
 
     def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
-        """Call `setter` with a parameter's value, now and whenever it is set.
-
-        The setter raises a `MusculoskeletalError` or `OSError` to refuse a value.
-        """
+        """Call `setter`, which raises to refuse, with a parameter's value now and when set."""
         self._checked(name, self.get_parameter(name).value, setter)
         self._setters[name] = setter
 
@@ -226,10 +216,7 @@ class Shell(Node):
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
-        """Subscribe; a message that breaks a rule, or comes twice or late, is counted and dropped.
-
-        The callback raises a `MusculoskeletalError` to reject the message.
-        """
+        """Subscribe; what comes twice or late, or the callback refuses by raising, is counted."""
         full = self.resolve_topic_name(topic)
         receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
@@ -291,10 +278,7 @@ class Shell(Node):
         return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
-        """Take zeros that the estimator found; `changed` is told whether they are known now.
-
-        And how much less l [m] (M,) is than with those before.
-        """
+        """Take the estimator's zeros; tell whether they are known now, and how much less l is."""
 
         def take(rows: Array) -> None:
             less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
@@ -340,7 +324,7 @@ class Shell(Node):
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         status = DiagnosticStatus(
-            level=LEVELS[report.level],
+            level=getattr(DiagnosticStatus, report.level.upper()),
             name=f'{self.get_fully_qualified_name()}: state',
             message=printable(report.message),
             hardware_id=self.robot.description.directory.name,

@@ -20,7 +20,7 @@ from std_msgs.msg import Bool
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
@@ -34,7 +34,6 @@ class Sim(Arm):
     """Node shell of the simulation."""
 
     def __init__(self, **options: Any) -> None:
-        """Declare topics; options are those of Node."""
         super().__init__('sim', **options)
         as_robot = self.parameter('as_robot')
         self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)

@@ -20,7 +20,6 @@ class Situation:
     """What the newest diagnostics of one namespace said, and what to do about it."""
 
     def __init__(self, namespace: str) -> None:
-        """Nothing has been said yet."""
         self._here = namespace.rstrip('/')
         self.detected = self.explored = False
         self.samples = self.checkpoints = self.suspect = self.doing = self.stopped = ''

@@ -31,8 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.messages import joint_message
-from musculoskeletal_ae.nodes.qos import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import Situation, figures
@@ -62,7 +61,6 @@ class View(Node):
     """What comes on topics onto the page; what is asked for there to topics and services."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
-        """Serve the page."""
         super().__init__('view', start_parameter_services=False)
         try:
             page = load('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
@@ -277,6 +275,4 @@ def _view(options: Namespace, arguments: list[str]) -> int:
     return 0
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Serve the page until Ctrl-C."""
-    return run_tool('view', _parse, _view, argv)
+main = partial(run_tool, 'view', _parse, _view)

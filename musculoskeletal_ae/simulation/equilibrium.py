@@ -49,7 +49,6 @@ class QuasiStatics:
     """The equations above for one robot and one network."""
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
-        """Read the robot's constants and fit the network's slopes."""
         self._robot, self._mae = robot, mae
         self._load, self._slopes = Load(robot.kinematics), Slopes(robot, mae)
         self._eye = np.eye(robot.joint_count)

@@ -28,7 +28,6 @@ class Load:
     """Torque that holds N arms against gravity and a wrench, and its gradient."""
 
     def __init__(self, kinematics: Kinematics) -> None:
-        """Read masses, centres of mass and joint axes from pinocchio's model."""
         kin, model = kinematics, kinematics.model
         self._kinematics = kin
         #: pinocchio's joint of each entry of θ, then the coupled ones; ∂q/∂θ of them, if there are

@@ -32,7 +32,6 @@ class PaperDescent:
     """The descent above for one robot and one network; arguments as for `QuasiStatics`."""
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
-        """Take a robot and a network."""
         self._robot, self._mae, self._load = robot, mae, Load(robot.kinematics)
 
     def step(

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from argparse import Namespace
 from itertools import product
 from pathlib import Path
@@ -145,7 +144,3 @@ def plot(table: Array, constants: SeriesElastic, residual: Array, file: Path) ->
     rest.axhline(0.0, color='black', linewidth=0.8)
     rest.set(xlabel='tension [N]', ylabel='table − fit [mm]', title='residual')
     figure.savefig(file, dpi=110)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

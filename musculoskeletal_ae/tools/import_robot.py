@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, names
@@ -29,7 +28,3 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--end', metavar='LINK', help=told)
     args = parser.parse_args(argv)
     return exit_status(lambda: load('musculoskeletal_ae.importing.convert').run(args))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status
@@ -28,15 +27,10 @@ def main(argv: list[str] | None = None) -> int:
         ('--hold-out', 'with --from-bag: recordings that are only judged, before and after'),
     ):
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
-    parser.add_checkpoint(
-        'with --from-bag: network to start from (default: train one on the geometric model)'
-    )
+    text = 'with --from-bag: network to start from (default: train one on the geometric model)'
+    parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
     parser.add_quick('a tenth of the training, to try things out')
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint):
         parser.error('--hold-out and --checkpoint go with --from-bag')
     return exit_status(lambda: load('musculoskeletal_ae.tools.initial_training').train(args))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

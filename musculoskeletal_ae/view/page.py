@@ -65,11 +65,7 @@ class Page:
     def __init__(
         self, robot: Robot, host: str, port: int, read_only: bool, act: Callable[..., None]
     ) -> None:
-        """Serve the page on an address; without `read_only`, `act` hears what visitors ask for.
-
-        Raises:
-            MusculoskeletalError: If the port is in use.
-        """
+        """Serve the page on a free port; without `read_only`, `act` hears what visitors ask for."""
         self._robot, self._act, self._host = robot, act, host
         self._visitors: set[int] = set()
         self.looked_at = threading.Event()

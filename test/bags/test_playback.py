@@ -24,18 +24,18 @@ def test_recorded_time_passes_at_the_rate(rate):
 
 def test_paused_time_stands_still_and_goes_on_where_it_stood():
     timeline = Timeline(0, 1.0, now=10.0)
-    timeline.pause(12.0)
+    timeline.hold(True, 12.0)
     assert timeline.recorded(50.0) == 2 * SECOND
     assert timeline.wait(2 * SECOND + 1, 50.0) == math.inf
-    timeline.resume(60.0)
+    timeline.hold(False, 60.0)
     assert timeline.recorded(61.0) == 3 * SECOND
-    timeline.resume(61.0)
+    timeline.hold(False, 61.0)
     assert timeline.recorded(61.0) == 3 * SECOND
 
 
 def test_a_step_makes_everything_up_to_its_time_due():
     timeline = Timeline(0, 1.0, now=0.0)
-    timeline.pause(0.0)
+    timeline.hold(True, 0.0)
     timeline.jump(7, 1.0)
     assert timeline.wait(7, 2.0) == 0.0
     assert timeline.wait(8, 2.0) == math.inf

@@ -6,7 +6,7 @@ from mcap.writer import Writer
 
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.recover import recover
+from musculoskeletal_ae.bags.writer import recover
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 
 

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STATUS = re.compile(

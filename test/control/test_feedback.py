@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.control.feedback import CORRECTION, DEADBAND, RELIEF, SETTLING, RestFeedback
+from musculoskeletal_ae.control.posture import CORRECTION, DEADBAND, RELIEF, SETTLING, RestFeedback
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 

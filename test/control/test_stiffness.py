@@ -8,7 +8,7 @@ import pytest
 from exact_mae import ExactMae
 
 from bench.control_nominal import stiffness_ratios
-from musculoskeletal_ae.control.stiffness import MARGINS, StiffnessModel, stiffness_command
+from musculoskeletal_ae.control.methods import MARGINS, StiffnessModel, stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian

@@ -9,8 +9,8 @@ from exact_mae import ExactMae
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from musculoskeletal_ae.control.methods import TorqueControl
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('musashi_left_arm')

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -74,9 +75,11 @@ class Driver:
         self.arm.set_wrench(np.zeros(6))
         return listening.verdict()
 
-    def wind(self, muscles: tuple[int, ...] = (), highest: float | None = None) -> Verdict:
-        """Return what `Winding` says."""
-        winding = Winding(self.robot, muscles, highest)
+    def wind(
+        self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
+    ) -> Verdict:
+        """Return what `Winding` says, besides what was heard before."""
+        winding = Winding(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
             for rows in self.step():
                 if (target := winding.step(rows, self.now)) is not None:

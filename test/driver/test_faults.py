@@ -222,7 +222,5 @@ def test_faults_of_the_emulated_arm_are_found(fault, checks):
     driver = Driver(ROBOT)
     driver.listen(2.0)
     driver.arm.faults.set([fault])
-    heard = driver.listen()
-    verdict = driver.wind((BICEPS,))
-    verdict.add(heard)
+    verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)

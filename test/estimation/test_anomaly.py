@@ -13,6 +13,7 @@ from musculoskeletal_ae.estimation.anomaly import (
     IN_A_ROW,
     AnomalyDetector,
 )
+from musculoskeletal_ae.estimation.settings import Detection
 
 DT = 0.01
 
@@ -22,7 +23,7 @@ def judge(robot):
     """Return a function that shows a detector with a network a message so many times."""
 
     def make(mae, threshold=0.0):
-        detector = AnomalyDetector(robot, threshold)
+        detector = AnomalyDetector(robot, Detection(threshold))
         detector.use(mae)
 
         def verdicts(message, times=1):

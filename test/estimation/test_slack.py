@@ -11,7 +11,7 @@ import pytest
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, AnomalyDetector
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.settings import Slack
+from musculoskeletal_ae.estimation.settings import Detection
 
 DT = 0.01
 MUSCLE = 2
@@ -24,7 +24,7 @@ def noticed(robot, mae, slack):
     def run(speed, until, longest=20.0, settings=None):
         """Wind in at a speed [m/s] for so far [m], then stand."""
         detector, rng = AnomalyDetector(robot), np.random.default_rng(0)
-        detector.slack = settings or Slack()
+        detector.settings = settings or Detection()
         detector.use(mae)
         state = mae.estimate(*slack)
         for n in range(round(longest / DT)):
@@ -53,14 +53,14 @@ def test_a_slow_winch_may_take_up_slack(noticed, speed):
 
 @pytest.mark.parametrize('speed', [0.009, 0.036, 0.25])
 def test_no_slack_is_longer_than_the_limit(noticed, speed):
-    longest = Slack().slack_length
+    longest = Detection().slack_length
     expected = max(DEAD_TIME, longest / speed)
     assert expected - 2 * DT <= noticed(speed, 1.0) <= expected + DEAD_TIME
 
 
 def test_the_limits_are_parameters(noticed):
-    assert noticed(0.036, 0.2, settings=Slack(slack_length=0.15)) >= 0.15 / 0.036 - DT
-    assert noticed(0.036, 0.2, settings=Slack(slack_speed=0.05)) <= DEAD_TIME + DT
+    assert noticed(0.036, 0.2, settings=Detection(slack_length=0.15)) >= 0.15 / 0.036 - DT
+    assert noticed(0.036, 0.2, settings=Detection(slack_speed=0.05)) <= DEAD_TIME + DT
 
 
 def test_noise_of_the_sensor_is_no_winding(noticed):

@@ -11,8 +11,8 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.initial_training import error, learn, read
 from musculoskeletal_ae.tools.train import main
-from musculoskeletal_ae.tools.train_from_bag import error, learn, read
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 

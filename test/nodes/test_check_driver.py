@@ -113,7 +113,8 @@ def test_ctrl_c_ends_it_without_a_traceback(graph):
 def test_nodes_say_what_they_wait_for(graph):
     estimator = graph.start('estimator', robot='arm26')
     graph.listen(Float64MultiArray, 'muscle_states')
-    graph.spin(4.0)
+    graph.wait(lambda: 'estimator' in graph.node.get_node_names(), 'the estimator')
+    graph.spin(4.0)  # it says so once
     _, output = estimator.end()
     waiting = [line for line in output.splitlines() if 'waiting for' in line]
     assert len(waiting) == 1

@@ -12,8 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool
 
-from musculoskeletal_ae.nodes.messages import bytes_message
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 

@@ -11,8 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.control.controller import LONGEST_STEP
-from musculoskeletal_ae.nodes.messages import bytes_message
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.stop_recording import FILE
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])

@@ -20,9 +20,8 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.messages import array_message, bytes_message
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.qos import LATCHED
 
 
 @pytest.fixture

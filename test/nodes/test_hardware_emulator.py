@@ -13,9 +13,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.qos import LATCHED
 from musculoskeletal_ae.validity import read_array
 
 

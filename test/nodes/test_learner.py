@@ -21,8 +21,7 @@ from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.state import FILE
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import array_message
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 # Faster than on a robot, so that a test takes seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}

@@ -17,9 +17,9 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.arm import Frames
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.markers import Frames
 from musculoskeletal_ae.nodes.shell import Shell
 
 CONFIG = Path(__file__).parents[2] / 'config'

@@ -16,8 +16,7 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import array_message, bytes_message
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.validity import read_array

@@ -22,8 +22,7 @@ from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import array_message, bytes_message, joint_message
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message, joint_message
 from musculoskeletal_ae.nodes.sim import Sim
 
 HERE = np.array([-0.5, -1.2])

@@ -12,7 +12,7 @@ from graph import Process, executable
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
-from musculoskeletal_ae.nodes.qos import LATCHED
+from musculoskeletal_ae.nodes.messages import LATCHED
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 

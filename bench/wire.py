@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The running system at the wire: how late a command is, and what each node costs.
+
+    python -m bench wire [--robots arm26,musashi_left_arm] [--rates 100,200,500] [--seconds 20]
+
+Emulator, estimator, sim, controller and, where it says so, learner, as `bringup.sh` starts them,
+each in a process of its own, with the arm exploring. A message and the command that answers it are
+told by their numbers at the source: latency is from the publishing of muscle_states to that of the
+first muscle_length_command after it. Beside it, what a user would write: one plain rclpy node in
+which torch eager estimates and a tension is turned into a length, no safety, no control.
+
+    late      no command within two periods
+    missed    messages that the emulator should have sent, and that did not come
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, number, whole
+from musculoskeletal_ae.robot.robot import Robot
+
+NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
+WARM_UP = 8.0  # [s] until the first message counts
+TICK = os.sysconf('SC_CLK_TCK')
+PLAIN = """
+import sys, numpy as np, rclpy, torch
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.network import from_mae
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE
+torch.set_num_threads(1)
+mae = checkpoint.load(sys.argv[1])
+network, M, D = from_mae(mae), len(mae.muscles), len(mae.joints)
+class Plain(Node):
+    def __init__(self):
+        super().__init__('plain')
+        self.out = self.create_publisher(Float64MultiArray, 'muscle_length_command', 10)
+        self.create_subscription(Float64MultiArray, 'muscle_states', self.take, 10)
+    def take(self, message):
+        l, T, _ = np.asarray(message.data).reshape(3, M)
+        row = torch.zeros(1, D + 2 * M)
+        row[0, D:D + M] = torch.as_tensor(T * TENSION_SCALE)
+        row[0, D + M:] = torch.as_tensor(l * LENGTH_SCALE)
+        with torch.no_grad():
+            out = network.decoder(network.encode(row, torch.tensor([1])))
+        goal = l - np.maximum(T - 30.0, 0.0) / 1e4 + 0.0 * float(out[0, 0])
+        self.out.publish(Float64MultiArray(data=goal.tolist()))
+rclpy.init(); rclpy.spin(Plain())
+"""
+
+
+def cpu(pid: int) -> float:
+    """Return the processor time of a process and of its children, alive or gone [s]."""
+    total = 0.0
+    for child in Path(f'/proc/{pid}/task/{pid}/children').read_text('ascii').split():
+        total += cpu(int(child))
+    fields = Path(f'/proc/{pid}/stat').read_text('ascii').rpartition(')')[2].split()
+    return total + sum(map(int, fields[11:15])) / TICK
+
+
+class System:
+    """Nodes in processes of their own."""
+
+    def __init__(self, robot: str, network: Path, rate: float, learn: bool, plain: bool) -> None:
+        """Start them."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import qos_profile_sensor_data
+        from std_msgs.msg import Float64MultiArray
+
+        folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
+        given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in (*NODES, 'learner')}
+        for name in ('estimator', 'sim', 'controller', 'learner'):
+            given[name].append(f'checkpoint:={network}')
+        # A pause of a busy machine is no fault of an emulated arm.
+        given['controller'] += ['explore:=true', 'max_age:=1.0']
+        given['learner'].append(f'state_directory:={network.parent / str(time.time_ns())}')
+        names = ('hardware_emulator',) if plain else (*NODES, *['learner'] * learn)
+        self.nodes: dict[str, subprocess.Popen[bytes]] = {}
+        quiet: dict[str, Any] = {'stdout': subprocess.DEVNULL}
+        for name in names:
+            values = [word for value in given[name] for word in ('-p', value)]
+            command = [str(folder / name), '--ros-args', *values]
+            self.nodes[name] = subprocess.Popen(command, **quiet)
+        if plain:
+            command = [sys.executable, '-c', PLAIN, str(network)]
+            self.nodes['plain'] = subprocess.Popen(command, **quiet)
+        rclpy.init()
+        self._rclpy, self._node = rclpy, rclpy.create_node('wire')
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self.stamps: dict[str, list[int]] = defaultdict(list)
+        for topic in ('muscle_states', 'muscle_length_command'):
+            # rclpy looks at the signature: a partial has none that it understands.
+            def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
+                self.stamps[topic].append(info['source_timestamp'])
+
+            self._node.create_subscription(Float64MultiArray, topic, take, qos_profile_sensor_data)
+
+    def spin(self, seconds: float) -> None:
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def end(self) -> None:
+        """End the nodes."""
+        for process in self.nodes.values():
+            process.send_signal(signal.SIGINT)
+        for process in self.nodes.values():
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        self._node.destroy_node()
+        self._rclpy.try_shutdown()
+
+
+def measure(system: System, rate: float, seconds: float) -> str:
+    """Return one line of the table."""
+    deadline = time.monotonic() + 60.0
+    while not system.stamps['muscle_length_command'] and time.monotonic() < deadline:
+        system.spin(0.5)
+    system.spin(WARM_UP)
+    system.stamps.clear()
+    before = {name: cpu(process.pid) for name, process in system.nodes.items()}
+    start = time.monotonic()
+    system.spin(seconds)
+    passed = time.monotonic() - start
+    used = {
+        name: 100.0 * (cpu(process.pid) - before[name]) / passed
+        for name, process in system.nodes.items()
+    }
+    states, commands = (
+        np.array(system.stamps[name]) for name in ('muscle_states', 'muscle_length_command')
+    )
+    after = np.searchsorted(commands, states)
+    known = after < len(commands)
+    latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
+    late = float((latency > 2e3 / rate).mean())
+    missed = max(0.0, 1.0 - len(states) / (rate * passed))
+    spread = np.percentile(latency, (50, 99, 100))
+    cost = ', '.join(f'{name} {value:.0f}' for name, value in used.items())
+    return (
+        f'{spread[0]:6.2f}{spread[1]:7.2f}{spread[2]:7.1f}{100 * late:7.2f}{100 * missed:7.2f}'
+        f'   {sum(used.values()):4.0f}   {cost}'
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure every combination and print a table."""
+    parser = Parser('wire', (__doc__ or '').partition('\n')[0])
+    parser.add_argument('--robots', default='arm26,musashi_left_arm', help='names or directories')
+    parser.add_argument('--rates', default='100,200,500', help='of messages [Hz]')
+    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='each takes')
+    parser.add_argument('--repeat', type=whole(1, 100), default=1, help='so many times')
+    args = parser.parse_args(argv)
+    print('latency [ms]: 50 %, 99 %, largest; late and missed messages [%]; CPU [% of a core]')
+    with tempfile.TemporaryDirectory() as name:
+        for robot in args.robots.split(','):
+            network = Path(name) / f'{Path(robot).name}.safetensors'
+            checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
+            for rate in map(float, args.rates.split(',')):
+                for what in ('nodes', 'with learner', 'plain node, torch') * args.repeat:
+                    system = System(
+                        robot, network, rate, what == 'with learner', what.startswith('plain')
+                    )
+                    try:
+                        line = measure(system, rate, args.seconds)
+                    finally:
+                        system.end()
+                    print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {what:<18}{line}', flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
