@@ -121,7 +121,9 @@ def test_a_moment_arm_of_wrong_sign_is_named(tmp_path, capsys, name, muscle, joi
 
 
 def test_without_declared_actions_a_joint_pulled_one_way_only_is_named(tmp_path, capsys):
-    status, printed, _ = verdict(capsys, change(write_robot(tmp_path), drop_straighteners), '--postures', 40)
+    status, printed, _ = verdict(
+        capsys, change(write_robot(tmp_path), drop_straighteners), '--postures', 40
+    )
     assert status == 1
     (line,) = [row for row in printed.splitlines() if 'no muscle that pulls' in row]
     for fragment in ("joint 'bend'", 'direction + (in 100 %', 'bender (-', 'bender_long (-'):
