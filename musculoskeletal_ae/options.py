@@ -140,11 +140,9 @@ class Parser(argparse.ArgumentParser):
             '--out', type=Path, metavar=metavar, default=default, required=required, help=text
         )
 
-    def add_plot(self, text: str, default: str) -> None:
-        """Add `--plot`, a picture that `save_plot` saves, and `--no-plot`."""
-        shown = f'{text} (default: {default})'
-        self.add_argument('--plot', type=Path, metavar='FILE.png', help=shown)
-        self.add_argument('--no-plot', action='store_true', help='write no plot')
+    def add_plot(self, text: str) -> None:
+        """Add `--plot`, a picture that `save_plot` saves where it is asked for."""
+        self.add_argument('--plot', type=Path, metavar='FILE.png', help=f'draw {text}')
 
 
 def save_plot(file: Path | None, save: Callable[[Path], None]) -> None:

@@ -21,7 +21,7 @@ def parser():
     made.add_seeds((0, 1, 2))
     made.add_minutes('of exploration', None)
     made.add_out('DIR', default=Path('results'))
-    made.add_plot('the result', 'check_<robot>.png')
+    made.add_plot('the result')
     made.add_argument('--jobs', type=options.whole(1, 8), default=2, help='processes')
     made.add_argument('--quick', action='store_true', help='less')
     return made
@@ -52,9 +52,9 @@ def test_a_mistake_is_one_line_that_names_the_option_and_status_2(arguments, pro
 
 def test_help_shows_every_default_once():
     text = ' '.join(parser().format_help().split())
-    for shown in ('musashi_left_arm', 'default', '0', '0,1,2', 'results', 'check_<robot>.png', '2'):
+    for shown in ('musashi_left_arm', 'default', '0', '0,1,2', 'results', '2'):
         assert f'(default: {shown})' in text
-    assert text.count('(default:') == 7
+    assert text.count('(default:') == 6
 
 
 def test_a_robot_may_be_required_or_come_by_position(capsys):

@@ -21,9 +21,9 @@ ROOT = Path(__file__).resolve().parent.parent
 LISTS = re.findall(r"^\w+ = (\['.*'\])$", (ROOT / 'setup.py').read_text('utf-8'), re.M)
 EXECUTABLES = [name for text in LISTS for name in re.findall(r"'(\w+)'", text)]
 ARGUMENTS = {
-    'check_robot': ['arm26', '--no-plot'],
+    'check_robot': ['arm26'],
     'experiment': ['all', '--quick', '--robot', 'arm26', '--out', '{folder}/results'],
-    'fit_series_elastic': ['config/testbed/one_muscle.csv', '--no-plot'],
+    'fit_series_elastic': ['config/testbed/one_muscle.csv'],
     'import_robot': ['config/arm26/robot.urdf', '--out', '{folder}/arm'],
     'record': ['-o', '{folder}/bag'],
     'render': ['--out', '{folder}/arm.png'],

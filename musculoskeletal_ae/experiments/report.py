@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from musculoskeletal_ae.experiments.results import read, table
+from musculoskeletal_ae.experiments.results import failures, read, table
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.experiments.table import NOTHING, individuals
 
@@ -30,6 +30,8 @@ def write_report(folder: Path) -> Path:
     environment.filters.update(flat=_flat, cell=_cell, individuals=individuals)
     page = environment.get_template(TEMPLATE).render(
         results=results,
+        failures=failures(results),
+        measured={name: result for name, result in results.items() if result['seeds']},
         experiments=EXPERIMENTS,
         about=next(iter(results.values()))['about'],
         table=[line for line in table(results) if line.default != NOTHING],

@@ -22,7 +22,7 @@ import numpy as np
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.experiments.study import Rows, Study
+from musculoskeletal_ae.experiments.study import Measured, Rows, Study
 from musculoskeletal_ae.experiments.table import Cells, markdown
 
 #: result.json of every experiment that was run, by name
@@ -35,16 +35,21 @@ BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
 
 
-def write(study: Study, measured: Mapping[str, Rows], out: Path) -> list[Path]:
+def write(
+    study: Study, measured: Mapping[str, Mapping[int, Measured | str]], out: Path
+) -> list[Path]:
     """Write result.json and plots of every experiment below a folder; return the files.
 
     Raises:
         MusculoskeletalError: If a number is not finite.
     """
     files = []
-    for name, rows in measured.items():
-        folder, result = out / name, combined(study, rows)
-        drawn = {f'{draw.__name__}.png': draw(study, rows) for draw in EXPERIMENTS[name].plots}
+    for name, said in measured.items():
+        rows = {seed: row for seed, row in said.items() if isinstance(row, Measured)}
+        folder, result, plots = out / name, combined(study, rows), EXPERIMENTS[name].plots
+        if failed := {str(seed): text for seed, text in said.items() if isinstance(text, str)}:
+            result['failed'] = failed
+        drawn = {f'{draw.__name__}.png': draw(study, rows) for draw in plots if rows}
         result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(result, indent=1, ensure_ascii=False)
@@ -76,17 +81,15 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
         'preset': study.preset,
         'minutes': study.minutes,
         'quick': study.quick,
-        'seeds': list(rows),
+        'seeds': list(study.seeds),
     }
-    rounded: dict[str, Any] = _rounded(
-        {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
-    )
-    return rounded
+    whole: dict[str, Any] = {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
+    return {key: rounded(value) for key, value in whole.items()}
 
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for key, first in rows[0].items():
+    for key, first in (rows[0] if rows else {}).items():
         values = [row[key] for row in rows if key in row]
         if isinstance(first, Mapping):
             result[key] = _mean(values)
@@ -99,12 +102,12 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Return the same with floats shortened; JSON cannot say what is not finite."""
     if isinstance(value, Mapping):
-        return {key: _rounded(part) for key, part in value.items()}
+        return {key: rounded(part) for key, part in value.items()}
     if isinstance(value, list):
-        return [_rounded(part) for part in value]
+        return [rounded(part) for part in value]
     if isinstance(value, float):
         if not math.isfinite(value):
             raise MusculoskeletalError('an experiment brought a number that is not finite')
@@ -125,7 +128,17 @@ def readme_table(results: Results) -> str:
     """Return what stands between the markers of a page."""
     if not results:
         return '\n\nNothing measured yet: `experiment all --readme doc/experiments.md`.\n\n'
-    return f'\n\n{markdown(next(iter(results.values()))["about"], table(results))}\n\n'
+    lost = ''.join(f'\n\nFailed: {line}' for line in failures(results))
+    return f'\n\n{markdown(next(iter(results.values()))["about"], table(results))}{lost}\n\n'
+
+
+def failures(results: Results) -> list[str]:
+    """Return what failed, and why, a line for each reason."""
+    lost: dict[tuple[str, str], list[str]] = {}
+    for name, result in results.items():
+        for seed_reason in result.get('failed', {}).items():
+            lost.setdefault(seed_reason, []).append(name)
+    return [f'{", ".join(names)} of individual {at}: {why}' for (at, why), names in lost.items()]
 
 
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:

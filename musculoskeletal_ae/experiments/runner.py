@@ -4,7 +4,8 @@
     train both presets → for each individual: record, learn → its other experiments
 
 An experiment of one individual starts as soon as that individual is learned. Every part draws from
-its own seeds, so that the numbers are the same however the parts are spread.
+its own seeds, so that the numbers are the same however the parts are spread. A part that fails
+takes only those with it that need it.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ SINGLE = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL'
 
 def run(
     study: Study, names: Sequence[str], jobs: int, report: Callable[[float, str], None]
-) -> dict[str, dict[int, Measured]]:
+) -> dict[str, dict[int, Measured | str]]:
     """Measure experiments on all individuals; return what they say by experiment, then by seed.
+
+    Of one that failed it is the error.
 
     Args:
         study: What is measured.
@@ -47,12 +50,12 @@ def run(
     total = len(PRESETS) + len(study.seeds) * sum(weights[name] for name in {LEARNING, *names})
     # The longest first, so that none of them is alone at the end.
     others = sorted(set(names) - {LEARNING}, key=weights.__getitem__, reverse=True)
-    measured: dict[str, dict[int, Measured]] = {name: {} for name in names}
+    measured: dict[str, dict[int, Measured | str]] = {name: {} for name in names}
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start)
     done, running = 0.0, dict[Future[Any], tuple[str, int]]()
 
     def submit(name: str, seed: int) -> None:
-        running[pool.submit(EXPERIMENTS[name].measure, study, seed)] = name, seed
+        running[pool.submit(_measure, name, study, seed)] = name, seed
 
     try:
         for preset in PRESETS:
@@ -60,14 +63,19 @@ def run(
         while running:
             ended, _ = wait(running, POLL, FIRST_COMPLETED)
             for future in ended:
-                (name, seed), result = running.pop(future), future.result()
+                (name, seed), error = running.pop(future), future.exception()
                 done += weights.get(name, 1.0)  # initial training: 1
+                if error:
+                    for lost in names if name in (LEARNING, *PRESETS) else (name,):
+                        for each in study.seeds if name in PRESETS else (seed,):
+                            measured[lost][each] = f'{type(error).__name__} in {name}: {error}'
+                    continue
                 if name in measured:
-                    measured[name][seed] = result
+                    measured[name][seed] = future.result()
                 if name == LEARNING:
                     for other in others:
                         submit(other, seed)
-                elif name in PRESETS and not running:  # both are trained
+                elif name in PRESETS and not running and not measured[names[0]]:  # both are trained
                     for each in study.seeds:
                         submit(LEARNING, each)
             report(done / total, ', '.join(sorted({name for name, _ in running.values()})))
@@ -78,6 +86,13 @@ def run(
         raise
     pool.shutdown()
     return {name: {seed: measured[name][seed] for seed in study.seeds} for name in names}
+
+
+def _measure(name: str, study: Study, seed: int) -> Measured:
+    from musculoskeletal_ae.experiments.results import rounded  # which needs this module
+
+    measured = EXPERIMENTS[name].measure(study, seed)
+    return measured._replace(numbers=rounded(measured.numbers))
 
 
 def _start() -> None:

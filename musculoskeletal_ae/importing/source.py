@@ -17,7 +17,7 @@ import yaml
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
+from musculoskeletal_ae.robot.description import Route, RoutePoint, written
 from musculoskeletal_ae.robot.kinematics import (
     PRISMATIC,
     REVOLUTE,
@@ -252,21 +252,13 @@ def urdf(source: Source) -> str:
     return '\n'.join([*parts, '</robot>', ''])
 
 
-def _item(item: RoutePoint | Wrap) -> dict[str, Any]:
-    given = {key: value for key, value in item._asdict().items() if value is not None}
-    given = {k: v if isinstance(v, str) else np.round(v, 9).tolist() for k, v in given.items()}
-    if isinstance(item, Wrap):
-        given = {'wrap': 'sphere' if item.axis is None else 'cylinder', **given}
-    return given
-
-
 def write(source: Source, out: Path) -> None:
     """Write robot.urdf and muscles.yaml into a directory, which must be new or empty."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SourceError(f'{out}: expected a new or empty directory')
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
-        muscles.append({'name': name, 'route': [_item(item) for item in route]})
+        muscles.append({'name': name, 'route': [written(item) for item in route]})
         if (force := source.strength.get(name, 0.0)) > 0.0:
             tension = {'bias': min(30.0, 0.1 * force), 'limit': force, 'max': 1.5 * force}
             muscles[-1]['tension'] = {k: round(v, 3) for k, v in tension.items()}

@@ -9,9 +9,9 @@ and the moment arms
 
 the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
 An arm is sound when at least 95 % of the postures are held, at least 95 % have a smallest stiffness
-eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff), every joint moves
-some mass, and no moment arm is at fault. Beside it, not judged: the one-sided stiffness, in which
-muscles at the bias tension count as slack.
+eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff; where it is
+negative, the arm is unstable), every joint moves some mass, and no moment arm is at fault. Beside
+it, not judged: the one-sided stiffness, in which muscles at the bias tension count as slack.
 
 An optional third file of a robot directory, `moment_arms.csv`, declares the action the designer
 meant (columns muscle, joint, sign), so that a route on the wrong side of a joint is found even
@@ -53,14 +53,32 @@ class Finding(NamedTuple):
 
     kind: str  # one word, such as 'wrong_sign'
     message: str  # names muscles and joints
-    remedy: str
+    remedy: str = ''  # of 'not_held' and 'not_stiff': what `remedies` measures
+    joint: int = -1  # of 'not_held' and 'not_stiff': the joint that most often is the weakest
+
+
+class Setting(NamedTuple):
+    """A robot in N postures, and what its holding and stiffness follow from."""
+
+    robot: Robot
+    theta: Array  # [rad], (N, D)
+    jacobian: Array  # G [m/rad], (N, M, D)
+    hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
+    torque: Array  # g [N·m], (N, D)
+
+    @classmethod
+    def of(cls, robot: Robot, theta: Array) -> Setting:
+        """Return a robot in postures (N, D)."""
+        jacobian = robot.routes.muscle_jacobian
+        torque = robot.kinematics.holding_torque(theta)
+        return cls(robot, theta, jacobian(theta), muscle_hessian(jacobian, theta), torque)
 
 
 @dataclass(frozen=True)
 class RobotCheck:
     """What was measured in N postures, and what is wrong."""
 
-    postures: Array  # θ [rad], (N, D)
+    setting: Setting
     moment_arms: Array  # r [m], (N, M, D)
     tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
     missing_torque: Array  # torque lacking where a posture is not held [N·m], (N, D)
@@ -87,11 +105,30 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
     """
     theta = robot.random_postures(postures, np.random.default_rng(seed))
-    jacobian = robot.routes.muscle_jacobian(theta)
-    torque = robot.kinematics.holding_torque(theta)
-    measured = [_measure(robot, *at) for at in zip(theta, jacobian, torque, strict=True)]
-    tension, missing, stiffness, softest, one_sided = map(np.array, zip(*measured, strict=True))
-    arms = -jacobian
+    return judge(Setting.of(robot, theta))
+
+
+def judge(setting: Setting) -> RobotCheck:
+    """Measure and judge a robot in given postures; errors as for `check_robot`."""
+    robot, theta, jacobian, hessian, torque = setting
+    bias, arms = robot.tension.bias, -jacobian
+    tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
+    for n, (at, load) in enumerate(zip(jacobian, torque, strict=True)):
+        programme = TensionProgramme(at, load, bias, robot.tension.limit)
+        try:
+            tension[n] = programme.nearest(DESIRED_TENSION)
+        except InfeasibleError:
+            missing[n] = programme.compromise().missing_torque
+    held = np.isfinite(tension[:, 0])
+    stiffness, one_sided = np.full((2, len(theta)), np.nan)
+    k = robot.muscle_stiffness(theta[held], tension[held])
+    taut = np.where(tension[held] > bias + SLACK_MARGIN, k, 0.0)
+    full, sided = (
+        joint_stiffness(jacobian[held], hessian[held], x, tension[held]) for x in (k, taut)
+    )
+    values, vectors = np.linalg.eigh(full)
+    stiffness[held], one_sided[held] = values[:, 0], np.linalg.eigvalsh(sided)[:, 0]
+    softest = np.abs(vectors[:, :, 0]).argmax(axis=1)[values[:, 0] < REQUIRED_STIFFNESS]
     faults = (
         *_wrong_signs(robot, arms),
         *_one_way_joints(robot, arms),
@@ -100,27 +137,7 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         *_holding_faults(robot, stiffness, softest, missing),
     )
     warnings = tuple(_flipping_muscles(robot, arms))
-    return RobotCheck(theta, arms, tension, missing, stiffness, one_sided, faults, warnings)
-
-
-def _measure(
-    robot: Robot, theta: Array, jacobian: Array, torque: Array
-) -> tuple[Array, Array, float, int, float]:
-    """Return tension, missing torque, stiffness, softest joint, one-sided stiffness at θ (D,)."""
-    bias = robot.tension.bias
-    programme = TensionProgramme(jacobian, torque, bias, robot.tension.limit)
-    try:
-        tension = programme.nearest(DESIRED_TENSION)
-    except InfeasibleError:
-        missing = programme.compromise().missing_torque
-        return np.full(robot.muscle_count, np.nan), missing, np.nan, -1, np.nan
-    hessian = muscle_hessian(robot.routes.muscle_jacobian, theta)
-    k = robot.muscle_stiffness(theta, tension)
-    taut = np.where(tension > bias + SLACK_MARGIN, k, 0.0)
-    values, vectors = np.linalg.eigh(joint_stiffness(jacobian, hessian, k, tension))
-    one_sided = np.linalg.eigvalsh(joint_stiffness(jacobian, hessian, taut, tension))[0]
-    softest = int(np.abs(vectors[:, 0]).argmax())
-    return tension, np.zeros(robot.joint_count), values[0], softest, one_sided
+    return RobotCheck(setting, arms, tension, missing, stiffness, one_sided, faults, warnings)
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
@@ -233,31 +250,37 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
 def _holding_faults(
     robot: Robot, stiffness: Array, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
+    """Shares that are too low; `softest` is of the postures that are held but not stiff."""
     held, stiff = np.isfinite(stiffness), stiffness >= REQUIRED_STIFFNESS
-    required = f'required {100 * REQUIRED_SHARE:.0f} %'
+    required, worst = f'required {100 * REQUIRED_SHARE:.0f} %', -1
     if held.mean() < REQUIRED_SHARE:
         lack = np.abs(missing[~held])
-        worst = lack.argmax(axis=1)
+        most = lack.argmax(axis=1)
+        counts = Counter(sorted(most.tolist())).most_common()
         where = ', '.join(
-            f'{robot.joints[k]} in {count} (up to {lack[worst == k, k].max():.2f} N·m)'
-            for k, count in Counter(sorted(worst.tolist())).most_common()
+            f'{robot.joints[k]} in {count} (up to {lack[most == k, k].max():.2f} N·m)'
+            for k, count in counts
         )
+        worst = counts[0][0]
         yield Finding(
             'not_held',
             f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
             f'weight with T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N, '
             f'{required}; of the {len(lack)} others torque lacks most at {where}',
-            'lengthen the moment arms of the muscles at these joints, raise tension.limit '
-            'or lighten the links',
+            joint=worst,
         )
     if stiff.mean() < REQUIRED_SHARE:
-        counts = Counter(sorted(softest[held & ~stiff].tolist()))
-        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts.items())
+        counts = Counter(sorted(softest.tolist())).most_common()
+        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts)
+        told = 'not stiff'
+        if (unstable := stiffness < 0.0).any():
+            told = f'unstable in {100 * unstable.mean():.1f} % of postures, with an eigenvalue of '
+            told += f'its stiffness down to {stiffness[unstable].min():.1f} N·m/rad, and not stiff'
         yield Finding(
             'not_stiff',
-            f'the arm is not stiff: {100 * stiff.mean():.1f} % of postures have a smallest '
+            f'the arm is {told}: {100 * stiff.mean():.1f} % of postures have a smallest '
             f'stiffness eigenvalue >= {REQUIRED_STIFFNESS:g} N·m/rad, {required} '
             '(a posture that is not held counts as not stiff); softest joint of the held ones, '
             f'in postures: {where or "none"}',
-            'lengthen the moment arms at these joints on both sides, or raise stiffness',
+            joint=counts[0][0] if counts else worst,
         )

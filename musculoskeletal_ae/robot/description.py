@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -45,6 +45,15 @@ class Wrap(NamedTuple):
     radius: float  # [m]
     axis: Array | None  # unit vector of a cylinder; None: a sphere
     side: Array | None  # a point on the side that the wire takes [m]; inside: a ring
+
+
+def written(item: RoutePoint | Wrap) -> dict[str, Any]:
+    """Return an item of a route as muscles.yaml has it."""
+    given = {key: value for key, value in item._asdict().items() if value is not None}
+    given = {k: v if isinstance(v, str) else np.round(v, 9).tolist() for k, v in given.items()}
+    if isinstance(item, Wrap):
+        given = {'wrap': 'sphere' if item.axis is None else 'cylinder', **given}
+    return given
 
 
 #: points, joined by straight lines or round a wrap that stands between two of them

@@ -27,15 +27,18 @@ def muscle_hessian(
 ) -> Array:
     """Return ∂²l/∂θ² [m/rad²] (M, D, D) at θ (D,), by central differences over ±step [rad] of G.
 
-    The callable maps θ (N, D) to G [m/rad] (N, M, D).
+    The callable maps θ (N, D) to G [m/rad] (N, M, D). With one of θ (..., D), θ may be (N, D).
     """
-    offsets = step * np.eye(len(theta))
-    difference = muscle_jacobian(theta + offsets) - muscle_jacobian(theta - offsets)
-    raw = difference.transpose(1, 2, 0) / (2.0 * step)
-    return 0.5 * (raw + raw.transpose(0, 2, 1))
+    offsets, middle = step * np.eye(theta.shape[-1]), theta[..., None, :]
+    difference = muscle_jacobian(middle + offsets) - muscle_jacobian(middle - offsets)
+    raw = np.moveaxis(difference, -3, -1) / (2.0 * step)
+    return 0.5 * (raw + raw.swapaxes(-1, -2))
 
 
 def joint_stiffness(jacobian: Array, hessian: Array, stiffness: Array, tension: Array) -> Array:
-    """Return K_θ [N·m/rad] (D, D) of G (M, D), ∂²l/∂θ² (M, D, D), k [N/m] (M,) and T [N] (M,)."""
-    elastic = jacobian.T @ (stiffness[:, None] * jacobian)
-    return elastic + np.einsum('m,mij->ij', tension, hessian)
+    """Return K_θ [N·m/rad] (D, D) of G (M, D), ∂²l/∂θ² (M, D, D), k [N/m] (M,) and T [N] (M,).
+
+    Or of N postures at once, all with N rows.
+    """
+    elastic = jacobian.swapaxes(-1, -2) @ (stiffness[..., None] * jacobian)
+    return elastic + np.einsum('...m,...mij->...ij', tension, hessian)

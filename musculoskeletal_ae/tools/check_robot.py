@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
-from musculoskeletal_ae.options import Parser, exit_status, whole
+from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.start import load
 
 
@@ -13,16 +14,23 @@ def main(argv: list[str] | None = None) -> int:
     """Check one robot; exit status 0 if it is sound, 1 if it is not or cannot be read."""
     parser = Parser(
         'check_robot',
-        'Says whether a robot description is sound, and where it is not. '
-        'Exit status 0: sound, 1: not sound.',
+        'Says whether a robot description is sound, where it is not, and what helps. '
+        'Exit status 0: sound (with --suggest: what it wrote is), 1: not sound.',
     )
     parser.add_robot('robot', default=None)
     parser.add_argument('--postures', type=whole(1, 1_000_000), default=200, help='random postures')
     parser.add_seed('of the postures')
-    parser.add_plot('picture of moment arms and stiffness', 'check_<robot>.png')
+    parser.add_plot('moment arms and stiffness')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
+    text = 'search for the smallest change of via points that makes it sound, for minutes'
+    parser.add_argument('--suggest', action='store_true', help=text)
+    text = 'new directory for the arm that --suggest finds, and a picture of before and after'
+    parser.add_argument('--out', type=Path, metavar='DIR', help=text)
+    text = 'how far --suggest may move a via point [m]'
+    parser.add_argument('--reach', type=number(1e-3, 1.0), default=0.02, help=text)
     args = parser.parse_args(argv)
-
+    if args.suggest != bool(args.out) or (args.out and args.out.exists()):
+        parser.error('--suggest and --out DIR, a new directory, go together')
     return exit_status(lambda: load('musculoskeletal_ae.tools.robot_report').check(args))
 
 

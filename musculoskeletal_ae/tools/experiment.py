@@ -23,7 +23,7 @@ def main(argv: list[str] | None = None) -> int:
         'experiment',
         'Runs an experiment of the paper on emulated arms, faster than real time and without ROS, '
         "and writes DIR/NAME/result.json, plots, and DIR/report.html with the paper's numbers "
-        'beside ours. Exit status 1: the robot or a file is not usable, 2: bad options.',
+        'beside ours. Exit status 1: a part failed or a file is not usable, 2: bad options.',
     )
     names = (*NAMES, 'all')
     parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))

@@ -31,7 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     text = f'CSV with the columns {", ".join(COLUMNS)} [N, m, m]'
     parser.add_argument('table', type=Path, help=text)
-    parser.add_plot('picture of table and fit', 'fit_<table>.png')
+    parser.add_plot('table and fit')
     text = 'write a synthetic table to TABLE instead (never over an existing file)'
     parser.add_argument('--make-example', action='store_true', help=text)
     parser.add_seed('of the example noise')
@@ -53,8 +53,7 @@ def fit(args: Namespace) -> None:
         f'series_elastic: {{force: {force:.2f}, rate: {rate:.3f}, wire_stretch: {stretch:.4e}}}\n'
         f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
     )
-    picture = None if args.no_plot else args.plot or Path(f'fit_{args.table.stem}.png')
-    save_plot(picture, lambda file: plot(table, constants, residual, file))
+    save_plot(args.plot, lambda file: plot(table, constants, residual, file))
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:

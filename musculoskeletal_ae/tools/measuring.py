@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import NAMES, results
 from musculoskeletal_ae.experiments.report import write_report
 from musculoskeletal_ae.experiments.runner import run
@@ -33,8 +34,11 @@ def measure(args: Namespace) -> None:
                 bar.n = share
                 bar.set_description_str(running)
 
-            measured = run(study, names, args.jobs, report)
-        files = [*results.write(study, measured, args.out), write_report(args.out)]
+            parts = run(study, names, args.jobs, report)
+        files = [*results.write(study, parts, args.out), write_report(args.out)]
     if args.readme:
         files += results.update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
+    measured = results.read(args.out)
+    if lost := results.failures({name: measured[name] for name in names}):
+        raise MusculoskeletalError(f'the rest is written, but this failed: {"; ".join(lost)}')

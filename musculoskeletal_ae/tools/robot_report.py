@@ -18,7 +18,9 @@ from musculoskeletal_ae.robot.checks import (
     check_robot,
 )
 from musculoskeletal_ae.robot.description import RobotDescription, shown
+from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.suggestion import suggest, write
 
 
 def check(args: Namespace) -> int:
@@ -29,22 +31,34 @@ def check(args: Namespace) -> int:
     if not args.quiet:
         print(summary(robot, result, args.seed))
         print(moment_arm_table(robot, result))
-    picture = None if args.no_plot else args.plot or Path(f'check_{name}.png')
-    save_plot(picture, lambda file: plot(robot, result, file))
+    save_plot(args.plot, lambda file: plot(robot, result, file))
     for told in robot.description.warnings:
         print(f'warning: {told}')
     for warning in result.warnings:
         print(f'warning: {warning.message}; {warning.remedy}')
     for fault in result.faults:
-        print(f'fault: {fault.message}\n    remedy: {fault.remedy}')
+        print(f'fault: {fault.message}')
+        for told in [fault.remedy] if fault.remedy else remedies(result, fault):
+            print(f'    remedy: {told}')
     count = len(result.faults)
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
-    return 1 if count else 0
+    if not (count and args.suggest):
+        return 1 if count else 0
+    change, before, after = suggest(robot, args.reach, args.postures, args.seed)
+    far = 1e3 * np.linalg.norm(change, axis=1)
+    if after:
+        print(f'no sound arm was found within {1e3 * args.reach:g} mm; the best is', end=' ')
+        if after >= before:
+            print('as it was, nothing is written')
+            return 1
+    write(robot, change, args.out)
+    print(f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, up to {far.max():.1f} mm')
+    return check(Namespace(**{**vars(args), 'robot': args.out, 'plot': None, 'suggest': False}))
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     """Return the holding and stiffness part of the report."""
-    count, held = len(result.postures), result.held
+    count, held = len(result.setting.theta), result.held
     need = f'required of both: {100 * REQUIRED_SHARE:.0f} % of postures'
     tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'
     lines = [
@@ -117,7 +131,7 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     arms = 1e3 * result.moment_arms.transpose(2, 1, 0)
-    for panel, name, angle, of_joint in zip(axes, robot.joints, result.postures.T, arms):
+    for panel, name, angle, of_joint in zip(axes, robot.joints, result.setting.theta.T, arms):
         for m, muscle in enumerate(robot.muscles):
             if np.abs(of_joint[m]).max() >= 1e3 * MATTERS:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}

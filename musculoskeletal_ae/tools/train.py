@@ -21,7 +21,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('FILE.safetensors', 'the checkpoint')
     parser.add_preset('paper: network and training as printed; default: the best measured')
     parser.add_seed('of data and weights')
-    parser.add_argument('--plot', type=Path, metavar='FILE.png', help='loss and errors')
+    parser.add_plot('loss and errors')
     for flag, text in (
         ('--from-bag', 'learn the real arm from recordings: bag directories or .mcap files'),
         ('--hold-out', 'with --from-bag: recordings that are only judged, before and after'),

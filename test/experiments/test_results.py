@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What result.json says of several individuals."""
+"""What result.json says of several individuals, and of parts that failed."""
 
 from __future__ import annotations
 
+import json
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments.results import combined
+from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
+from musculoskeletal_ae.experiments import online_learning, runner
+from musculoskeletal_ae.experiments.results import combined, read, readme_table
 from musculoskeletal_ae.experiments.study import Measured, Study
+from musculoskeletal_ae.tools import experiment
 
 
 def test_result_json_has_means_over_seeds_but_counts_alarms_in_all(arm26, tmp_path):
@@ -28,3 +33,59 @@ def test_a_number_that_json_cannot_say_is_refused(arm26, tmp_path):
     study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
     with pytest.raises(MusculoskeletalError, match='finite'):
         combined(study, {0: Measured({'deep': {'list': [1.0, float('nan')]}}, {})})
+
+
+def fails(_study, seed):
+    if seed:
+        raise InfeasibleError('no tension at all')
+    return Measured({'error_rad': 0.5}, {})
+
+
+def not_finite(_study, seed):
+    return Measured({'error_rad': float('nan') if seed else 0.5}, {})
+
+
+def learns(_study, _seed):
+    return Measured({}, {})
+
+
+@pytest.mark.parametrize(
+    ('learning', 'measuring', 'told'),
+    [
+        (learns, fails, 'InfeasibleError in body_change: no tension at all'),
+        (learns, not_finite, 'MusculoskeletalError in body_change: an experiment brought a number'),
+        (fails, learns, 'InfeasibleError in online_learning: no tension at all'),
+    ],
+)
+def test_a_part_that_fails_is_told_everywhere_and_the_others_go_on(
+    monkeypatch, tmp_path, capsys, learning, measuring, told
+):
+    monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(2))
+    monkeypatch.setattr(online_learning, 'train_initial', lambda *_: None)
+    for name, measure in ('online_learning', learning), ('body_change', measuring):
+        faked = runner.EXPERIMENTS[name]._replace(measure=measure, plots=())
+        monkeypatch.setitem(runner.EXPERIMENTS, name, faked)
+    command = f'body_change --robot arm26 --seeds 0,1 --out {tmp_path}'
+    assert experiment.main(command.split()) == 1
+    assert f'body_change of individual 1: {told}' in capsys.readouterr().err
+    content = json.loads((tmp_path / 'body_change' / 'result.json').read_text('utf-8'))
+    assert content['failed']['1'].startswith(told)
+    assert list(content['seeds']) == ['0']
+    assert f'body_change of individual 1: {told}' in (tmp_path / 'report.html').read_text('utf-8')
+    assert f'Failed: body_change of individual 1: {told}' in readme_table(read(tmp_path))
+
+
+def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
+    monkeypatch, tmp_path, capsys
+):
+    def train(_study, _preset):
+        raise InfeasibleError('no tension at all')
+
+    monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(1))
+    monkeypatch.setattr(online_learning, 'train_initial', train)
+    assert experiment.main(f'all --robot arm26 --seeds 0,1 --out {tmp_path}'.split()) == 1
+    assert 'body_change of individual 1: InfeasibleError in' in capsys.readouterr().err
+    results = read(tmp_path)
+    assert set(results) == set(runner.EXPERIMENTS)
+    assert all(set(result['failed']) == {'0', '1'} for result in results.values())
+    assert 'no tension at all' in (tmp_path / 'report.html').read_text('utf-8')

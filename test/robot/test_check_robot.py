@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.check_robot import main
 
@@ -37,7 +39,7 @@ def kinds(directory):
 
 
 def verdict(capsys, *arguments):
-    status = main([str(a) for a in arguments] + ['--no-plot'])
+    status = main([str(a) for a in arguments])
     printed = capsys.readouterr()
     return status, printed.out, printed.err
 
@@ -68,7 +70,7 @@ def test_tensions_hold_the_arm_within_limits_and_unheld_postures_lack_torque(tmp
     result = check_robot(robot)
     held = result.held
     assert 0 < held.sum() < len(held)
-    torque = robot.kinematics.holding_torque(result.postures)
+    torque = robot.kinematics.holding_torque(result.setting.theta)
     made = np.einsum('nmd,nm->nd', result.moment_arms, np.nan_to_num(result.tension))
     np.testing.assert_allclose(made[held], torque[held], atol=1e-8)
     assert result.tension[held].max() <= 45.0 + 1e-8
@@ -79,7 +81,7 @@ def test_tensions_hold_the_arm_within_limits_and_unheld_postures_lack_torque(tmp
 
 def test_the_same_seed_gives_the_same_postures_and_another_seed_others():
     robot = Robot.load('arm26')
-    one, two, three = (check_robot(robot, 20, seed).postures for seed in (3, 3, 4))
+    one, two, three = (check_robot(robot, 20, seed).setting.theta for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, three)
 
@@ -119,10 +121,9 @@ def test_a_moment_arm_of_wrong_sign_is_named(tmp_path, capsys, name, muscle, joi
 
 
 def test_without_declared_actions_a_joint_pulled_one_way_only_is_named(tmp_path, capsys):
-    def cut_straighteners(document):
-        document['muscles'] = [m for m in document['muscles'] if 'straight' not in m['name']]
-
-    status, printed, _ = verdict(capsys, change(write_robot(tmp_path), cut_straighteners))
+    status, printed, _ = verdict(
+        capsys, change(write_robot(tmp_path), drop_straighteners), '--postures', 40
+    )
     assert status == 1
     (line,) = [row for row in printed.splitlines() if 'no muscle that pulls' in row]
     for fragment in ("joint 'bend'", 'direction + (in 100 %', 'bender (-', 'bender_long (-'):
@@ -153,7 +154,7 @@ def test_muscles_too_weak_to_hold_the_arm_are_a_fault(tmp_path):
 def test_soft_muscles_are_a_fault_naming_the_softest_joint(tmp_path, capsys):
     status, printed, _ = verdict(capsys, write_robot(tmp_path, stiffness=500.0))
     assert status == 1
-    assert 'fault: the arm is not stiff' in printed
+    assert 'and not stiff: ' in printed and 'remedy: stiffness 2500 → 100 % stiff' in printed
     assert 'lift (' in printed or 'bend (' in printed or 'swing (' in printed
 
 
@@ -265,3 +266,88 @@ finally:
 def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, capsys):
     assert main(['arm26', '--plot', str(tmp_path / 'no' / 'such' / 'plot.png')]) == 1
     assert 'cannot be written' in capsys.readouterr().err
+
+
+def remedies_of(directory, kind, postures=60):
+    """Return what is said to help against a fault, and the check that found it."""
+    check = check_robot(Robot.load(directory), postures)
+    (fault,) = (fault for fault in check.faults if fault.kind == kind)
+    return remedies(check, fault), check
+
+
+def drop_straighteners(document):
+    document['muscles'] = [m for m in document['muscles'] if 'straight' not in m['name']]
+
+
+SOFT = {'force': 100.0, 'rate': 1.5}
+FAULTY = {
+    'weak': ('not_held', {'tension': {'limit': 45.0}}),
+    'tense': ('not_held', {'tension': {'bias': 120.0, 'limit': 130.0}}),
+    'soft modules': ('not_stiff', {'stiffness': 500.0}),
+    'soft elastic unit': ('not_stiff', {'series_elastic': SOFT}),
+    'soft in both': ('not_stiff', {'series_elastic': SOFT, 'stiffness': 300.0}),
+}
+
+
+@pytest.mark.parametrize('case', FAULTY)
+def test_a_remedy_written_into_muscles_yaml_does_what_it_says(tmp_path, case):
+    kind, top = FAULTY[case]
+    lines, before = remedies_of(write_robot(tmp_path / 'before', **top), kind)
+    tried = 0
+    number = re.compile(r'(series_elastic|tension)?\.?(\w+) ([\d.e-]+)(?: \(and max\))?(?=,| →)')
+    for line in lines:
+        said = float(re.search(r'→ ([\d.]+) %', line)[1])
+        changed = {key: dict(v) if isinstance(v, dict) else v for key, v in top.items()}
+        told = number.findall(line)
+        if len(told) != line.split('→')[0].count(',') + 1:
+            continue  # mass, moment arms and limits are not in muscles.yaml
+        for owner, name, value in told:
+            (changed.setdefault(owner, {}) if owner else changed)[name] = float(value)
+        changed.setdefault('tension', {})['max'] = 2000.0
+        after = check_robot(Robot.load(write_robot(tmp_path / 'after', **changed)), 60)
+        share = getattr(after, kind.removeprefix('not_')).mean()
+        assert 100.0 * share == pytest.approx(said, abs=0.06), line
+        assert share > getattr(before, kind.removeprefix('not_')).mean()
+        assert (share >= 0.95) == ('not enough' not in line)
+        tried += 1
+    assert tried
+
+
+def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
+    directory = change(write_robot(tmp_path), drop_straighteners)
+    lines, _ = remedies_of(directory, 'not_held')
+    change(directory, lambda d: d.update(tension={'limit': 10000.0, 'max': 10000.0}))
+    assert check_robot(Robot.load(directory), 60).held.mean() < 0.95  # the premise
+    assert lines
+    assert all('not enough' in line for line in lines)
+    assert 'other routes may help' in lines[-1]
+
+
+def test_stiffness_is_no_remedy_where_the_elastic_unit_is_what_gives(tmp_path):
+    directory = write_robot(tmp_path, series_elastic=SOFT)
+    lines, _ = remedies_of(directory, 'not_stiff')
+    change(directory, lambda d: d.update(stiffness=1e8))
+    assert 'not_stiff' in kinds(directory)  # the premise
+    (remedy,) = lines
+    assert remedy.startswith('series_elastic.rate ')
+
+
+def test_what_suffices_together_only_is_named_together(tmp_path):
+    lines, _ = remedies_of(write_robot(tmp_path, **FAULTY['soft in both'][1]), 'not_stiff')
+    assert lines[-1].startswith('together: stiffness ')
+    assert 'series_elastic.rate' in lines[-1]
+
+
+def test_a_negative_stiffness_is_called_unstable(tmp_path, capsys):
+    directory = write_robot(tmp_path, stiffness=300.0)
+    lowest = np.nanmin(check_robot(Robot.load(directory)).stiffness)
+    assert lowest < 0.0  # the premise
+    _, printed, _ = verdict(capsys, directory)
+    assert 'fault: the arm is unstable in' in printed
+    assert f'down to {lowest:.1f} N·m/rad' in printed
+
+
+def test_no_picture_is_drawn_unless_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(['arm26', '--quiet']) == 0
+    assert not list(tmp_path.iterdir())

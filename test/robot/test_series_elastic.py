@@ -95,7 +95,7 @@ def test_the_example_never_overwrites_a_file(tmp_path, capsys):
 def test_a_bad_table_is_refused_naming_file_and_row(tmp_path, capsys, text, fragments):
     file = tmp_path / 'table.csv'
     file.write_text(text)
-    assert tool.main([str(file), '--no-plot']) == 1
+    assert tool.main([str(file)]) == 1
     message = capsys.readouterr().err
     for fragment in ['table.csv', *fragments]:
         assert fragment in message

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What helps an arm that is not held or not stiff: a change is measured before it is named.
+
+The check's postures are held anew with other numbers in muscles.yaml, less mass, longer moment arms
+or narrower limits. Named is what suffices alone, in the least step that does; else what helps, and
+a combination: from all of it together, each change in turn, the costliest first, is set to what
+serves best, and then to the least that does as well.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
+from musculoskeletal_ae.robot.description import shown
+
+HELPS = 0.01  # of the postures; a change that wins less is not named
+#: what is multiplied by which factors, the least change first; the costliest first
+TRIED = {
+    'limits': (0.8, 0.6),
+    'moment arms': (1.25, 1.5, 2.0),
+    'mass': (0.75, 0.5, 0.25),
+    'series_elastic.wire_stretch': (0.5, 0.2),
+    'series_elastic.rate': (1.5, 2.0, 5.0, 20.0),
+    'tension.limit': (1.5, 2.0, 3.0, 5.0),
+    'stiffness': (2.0, 5.0, 20.0),
+    'tension.bias': (2.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0),
+}
+
+
+def remedies(check: RobotCheck, fault: Finding) -> list[str]:
+    """Return what raises the share of postures that a 'not_held' or 'not_stiff' fault is about."""
+    kind = fault.kind.removeprefix('not_')
+
+    @cache
+    def attempt(*steps: int) -> tuple[float, str]:
+        setting, words = check.setting, list[str]()
+        for (what, factors), step in zip(TRIED.items(), steps, strict=True):
+            if step:
+                setting, text = changed(setting, what, factors[step - 1], fault.joint)
+                words.insert(0, text)
+        share = float(getattr(judge(setting), kind).mean())
+        return share, f'{", ".join(words)} → {100 * share:.3g} % {kind}'
+
+    nothing, steps = [0] * len(TRIED), [len(factors) for factors in TRIED.values()]
+    (before, _), alone = attempt(*nothing), list[tuple[float, str]]()
+    for i, most in enumerate(steps):
+        ways = [attempt(*nothing[:i], step, *nothing[i + 1 :]) for step in range(1, most + 1)]
+        best, _ = max(ways)
+        wanted = REQUIRED_SHARE if best >= REQUIRED_SHARE else best - HELPS
+        alone.insert(0, next(way for way in ways if way[0] >= wanted))
+    if enough := [text for share, text in alone if share >= REQUIRED_SHARE]:
+        return enough
+    told = [f'{text}, not enough alone' for share, text in alone if share >= before + HELPS]
+    for pick in (-1, 0):
+        for i, most in enumerate(steps):
+            ways = [attempt(*steps[:i], step, *steps[i + 1 :]) for step in range(most + 1)]
+            shares = np.minimum([share for share, _ in ways], REQUIRED_SHARE)
+            steps[i] = int(np.flatnonzero(shares == shares.max())[pick])
+    share, text = attempt(*steps)
+    if share >= REQUIRED_SHARE:
+        return [*told, f'together: {text}']
+    told = told or ['nothing that was tried helps alone']
+    return [*told, f'not enough even together: {text}; other routes may help, see --suggest']
+
+
+def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
+    """Multiply something about an arm, or about one of its joints; say what it then is."""
+    robot = copy(setting.robot)
+    if what == 'mass':
+        text = f'links at {100 * factor:g} % of their mass'
+        return setting._replace(torque=factor * setting.torque), text
+    if what == 'moment arms':
+        scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
+        hessian = scale[:, None] * setting.hessian * scale
+        text = f'moment arms at {robot.joints[joint]} {factor:g} times as long'
+        return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
+    if what == 'limits':  # and the postures with them
+        theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
+        theta[:, joint] += (1.0 - factor) * (middle - theta[:, joint])
+        low, high = (middle + factor * (end[joint] - middle) for end in (robot.lower, robot.upper))
+        return Setting.of(robot, theta), f'limits of {robot.joints[joint]} [{low:.2f}, {high:.2f}]'
+    owner, _, part = what.rpartition('.')
+    of: Any = getattr(robot, owner) if owner else robot
+    values = factor * getattr(of, part)
+    vars(robot).update({owner: replace(of, **{part: values})} if owner else {part: values})
+    more = ' (and max)' if part == 'limit' and (values > robot.tension.max).any() else ''
+    return setting._replace(robot=robot), f'{what} {shown(values)}{more}'

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The smallest change of via points that makes an arm sound, by CMA-ES.
+
+    min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
+
+over x: each via point p is moved by d_p, less than the reach r. The penalty is zero where stiffness
+and moment arms are what the check requires in all but a few postures. In the end points that need
+not move are put back, those that moved least first.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from tqdm import tqdm
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.files import read_yaml
+from musculoskeletal_ae.robot import checks
+from musculoskeletal_ae.robot.description import RoutePoint, written
+from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
+from musculoskeletal_ae.robot.entries import refusal
+from musculoskeletal_ae.robot.robot import Robot
+
+FORGIVEN = 0.02  # of the postures; the check, which draws others, tolerates 0.05
+PENALTY = 10.0  # where all is lacking; the size of a change is below 1
+START = 0.2  # spread of x at first
+TRIES = 40  # for each coordinate of a via point
+RESOLUTION = 1e-4  # [m]
+
+
+def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
+    """Return d [m] (P, 3), in the links' frames, and what is `lacking` without and with it.
+
+    Arms are tried in so many random postures, other ones than a check with this seed draws.
+    """
+    import cma
+
+    still = np.zeros((len(robot.routes.point), 3))
+
+    def lacks(change: Array) -> float:
+        return lacking(checks.check_robot(moved(robot, change), postures, seed + 1))
+
+    def change_of(x: Array) -> Array:
+        x = x.reshape(still.shape)
+        change = reach * x / np.sqrt(1.0 + np.sum(x**2, axis=1, keepdims=True))
+        return np.trunc(change / RESOLUTION) * RESOLUTION  # never beyond the reach
+
+    def cost(x: Array) -> float:
+        missing, size = lacks(change_of(x)), np.linalg.norm(change_of(x), axis=1).mean() / reach
+        return float(size + (1.0 + PENALTY * missing) * (missing > 0.0))
+
+    options = {'seed': seed % 2**32 + 1, 'verbose': -9, 'tolfun': 1e-3}
+    search = cma.CMAEvolutionStrategy(still.ravel(), START, options)
+    for _ in tqdm(range(TRIES * still.size // search.popsize), disable=None):
+        if not search.stop():
+            tried = search.ask()
+            search.tell(tried, [cost(x) for x in tried])
+    change = change_of(search.best.x)
+    if not lacks(change):
+        for p in np.argsort(np.linalg.norm(change, axis=1)):
+            back = np.where(np.arange(len(change))[:, None] == p, 0.0, change)
+            change = change if lacks(back) else back
+    return change, lacks(still), lacks(change)
+
+
+def moved(robot: Robot, change: Array) -> Robot:
+    """Return a robot whose via points are elsewhere by (P, 3) [m], in the links' frames."""
+    left = iter(change)
+    routes = [
+        tuple(p._replace(xyz=p.xyz + next(left)) if isinstance(p, RoutePoint) else p for p in route)
+        for route in robot.description.routes
+    ]
+    return Robot(replace(robot.description, routes=tuple(routes)))
+
+
+def lacking(check: checks.RobotCheck) -> float:
+    """Return what an arm lacks that via points could give it; 0: nothing, and with a margin."""
+    arms, least = check.moment_arms, checks.MATTERS
+    torque = np.linalg.norm(check.missing_torque, axis=1)
+    soft = np.maximum(1.0 - check.stiffness / checks.REQUIRED_STIFFNESS, 0.0)
+    weak = np.where(check.held, soft / (1.0 + soft), 1.0 + torque / (1.0 + torque))
+    short = [least - arms.max(axis=1), least + arms.min(axis=1)]  # of either direction
+    actions = checks.read_declared_actions(check.setting.robot.description).items()
+    short += [RESOLUTION - sign * arms[:, [m], j] for (m, j), sign in actions]
+    rows = np.sort(np.column_stack([weak, np.maximum(np.hstack(short), 0.0) / least]), axis=0)
+    useless = np.maximum(least + RESOLUTION - np.abs(arms).max(axis=(0, 2)), 0.0) / least
+    return float(rows[: len(rows) - int(FORGIVEN * len(rows))].mean(axis=0).sum() + useless.sum())
+
+
+def write(robot: Robot, change: Array, out: Path) -> None:
+    """Write a robot directory with via points moved by (P, 3) [m], and a picture of both."""
+    here, after = robot.description.directory, moved(robot, change)
+    document = read_yaml(here / 'muscles.yaml', refusal)
+    for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
+        muscle['route'] = [written(item) for item in route]
+    out.mkdir(parents=True)
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+    (out / 'muscles.yaml').write_text(text, encoding='utf-8')
+    for file in ('robot.urdf', checks.DECLARATION_FILE):
+        if (here / file).exists():
+            shutil.copyfile(here / file, out / file)
+    middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
+    was, now = (draw_arm(each, middle, bias) for each in (robot, after))
+    was = [line._replace(colour=(0.85, 0.4, 0.3)) for line in was if line.kind == 'muscles']
+    save_picture([*was, *now], out / 'suggestion.png', 'red: before, green: after')

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`check_robot --suggest`: via points that make an arm sound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import copy_robot, read_muscles, write_muscles
+
+from musculoskeletal_ae.robot import suggestion
+from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.check_robot import main
+
+WRAP = {'wrap': 'sphere', 'link': 'upper_arm', 'xyz': [0.0, 0.0, -0.2], 'radius': 0.005}
+
+
+def poor_arm(directory, spread=0.03):
+    """The small arm as it would come out if each of its via points were placed by eye."""
+    document = read_muscles(copy_robot('arm26', directory))
+    rng = np.random.default_rng(3)
+    for muscle in document['muscles']:
+        for point in muscle['route']:
+            point['xyz'] = (point['xyz'] + rng.uniform(-spread, spread, 3)).tolist()
+    # What must be kept: a wrap, a point given twice, numbers of one muscle, an unequal default.
+    document['muscles'][4]['route'].insert(2, WRAP)
+    document['muscles'][5]['route'].insert(1, dict(document['muscles'][5]['route'][0]))
+    document['muscles'][0]['tension'] = {'limit': 190.0}
+    return write_muscles(directory, {**document, 'stiffness': 9000.0})
+
+
+def points(directory):
+    return np.array(
+        [
+            point.xyz
+            for route in Robot.load(directory).description.routes
+            for point in route
+            if not hasattr(point, 'radius')
+        ]
+    )
+
+
+def without_points(directory):
+    document = read_muscles(directory)
+    for muscle in document['muscles']:
+        muscle['route'] = [item for item in muscle['route'] if 'wrap' in item]
+    return document
+
+
+@pytest.fixture(autouse=True)
+def briefly(monkeypatch):
+    monkeypatch.setattr(suggestion, 'TRIES', 6)
+
+
+def suggest(arm, out, *more):
+    return main(
+        [str(arm), '--suggest', '--out', str(out), '--postures', '40', '--quiet', *map(str, more)]
+    )
+
+
+def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys):
+    arm, out, reach = poor_arm(tmp_path / 'arm'), tmp_path / 'better' / 'arm', 0.02
+    before = check_robot(Robot.load(arm), 400, seed=9)
+    assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # the premise
+    assert suggest(arm, out, '--reach', reach) == 0
+    assert 'arm: sound' in capsys.readouterr().out
+    # In postures that neither the search nor the check above has seen.
+    assert check_robot(Robot.load(out), 400, seed=9).faults == ()
+    distance = np.linalg.norm(points(out) - points(arm), axis=1)
+    assert 0.0 < distance.max() < reach
+    assert np.median(distance) < 1e-8  # most stay where they were
+    assert without_points(out) == without_points(arm)
+    for name in ('robot.urdf', 'moment_arms.csv'):
+        assert (out / name).read_bytes() == (arm / name).read_bytes()
+    assert (out / 'suggestion.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(tmp_path, capsys):
+    arm, out = poor_arm(tmp_path / 'arm'), tmp_path / 'better'
+    assert suggest(arm, out, '--reach', 0.002) == 1
+    printed = capsys.readouterr().out
+    assert 'no sound arm was found within 2 mm; the best is' in printed
+    assert 'better: not sound' in printed
+    lacks = [suggestion.lacking(check_robot(Robot.load(d), 40, seed=1)) for d in (arm, out)]
+    assert 0.0 < lacks[1] < lacks[0]
+
+
+def test_a_sound_arm_is_left_as_it_is(tmp_path):
+    assert suggest('arm26', tmp_path / 'better') == 0
+    assert not (tmp_path / 'better').exists()
+
+
+@pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
+def test_a_shipped_arm_lacks_nothing(name):
+    assert suggestion.lacking(check_robot(Robot.load(name))) == 0.0
+
+
+@pytest.mark.parametrize('options', [['--suggest'], ['--out', 'new'], ['--suggest', '--out', '.']])
+def test_suggest_needs_a_new_directory(options, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(['arm26', *options])
+    assert ended.value.code == 2
+    assert '--out DIR, a new directory' in capsys.readouterr().err
