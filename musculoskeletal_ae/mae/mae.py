@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
+from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
@@ -109,6 +110,41 @@ class Stack(NamedTuple):
         return x, tangent
 
 
+#: places of its inputs, a stack, places of its outputs
+Block = tuple[Ints | slice, Stack, Ints | slice]
+
+
+class Blocks(NamedTuple):
+    """Stacks side by side, each with inputs and outputs of its own: a block-diagonal network."""
+
+    blocks: tuple[Block, ...]
+    outputs: int
+
+    def __call__(self, x: Array) -> Array:
+        """Return the output (..., out) for x (..., in)."""
+        if len(self.blocks) == 1:
+            return self.blocks[0][1](x)
+        result = np.empty((*x.shape[:-1], self.outputs))
+        for into, stack, out in self.blocks:
+            result[..., out] = stack(x[..., into])
+        return result
+
+    def with_pullback(self, x: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Return the output and the function that maps a gradient by it to one by x."""
+        result, pulls = np.empty((*x.shape[:-1], self.outputs)), []
+        for into, stack, out in self.blocks:
+            result[..., out], pull = stack.with_pullback(x[..., into])
+            pulls.append(pull)
+
+        def pullback(gradient: Array) -> Array:
+            by_x = np.empty_like(x)
+            for (into, _, out), pull in zip(self.blocks, pulls, strict=True):
+                by_x[..., into] = pull(gradient[..., out])
+            return by_x
+
+        return result, pullback
+
+
 @dataclass(frozen=True, eq=False)
 class Mae:
     """A trained network and what a checkpoint says of it."""
@@ -117,18 +153,20 @@ class Mae:
     muscles: tuple[str, ...]  # M names, in the order of T and l
     preset: str
     activation: str
-    encoder: tuple[Layer, ...]  # weight (out, in), bias (out,); in scaled, standardised units
+    #: weight (out, in), bias (out,), in scaled, standardised units; one group after the other
+    encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
     mean: Array  # what scaled (θ, T, l) are centred by, (D+2M,)
     std: Array  # what they are divided by, (D+2M,)
     version: int = 0  # counts up with every checkpoint the learner publishes
     training: str = ''  # how it was trained, for people to read
     anomaly: AnomalyStatistics | None = None  # residuals of healthy data
-    _enter: dict[Mask, Stack] = field(init=False, repr=False)
-    _leave: Stack = field(init=False, repr=False)
-    _leave_length: Stack = field(init=False, repr=False)
+    groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
+    _enter: dict[Mask, Blocks] = field(init=False, repr=False)
+    _leave: Blocks = field(init=False, repr=False)
+    _leave_length: Blocks = field(init=False, repr=False)
     #: z (..., D+M) to (θ, T, l) in the paper's scaled units, one array (..., D+2M)
-    decode_scaled: Stack = field(init=False, repr=False)
+    decode_scaled: Blocks = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Freeze the arrays and fold units, standardisation and masks into the layers."""
@@ -140,39 +178,63 @@ class Mae:
         joints, muscles = len(self.joints), len(self.muscles)
         scale = scale_vector(joints, muscles)
         activation = ACTIVATIONS[self.activation]
-        (first, first_bias), *rest = encoder
-        after = tuple(_transposed(*layer) for layer in rest)
-        enter = {}
-        for mask in Mask:
-            seen = visible(mask, joints, muscles)
-            columns = first[:, : len(scale)][:, seen] / std[seen]
-            constant = first[:, len(scale) :] @ np.array(mask.value, dtype=float)
-            bias = first_bias + constant - columns @ mean[seen]
-            enter[mask] = Stack((_transposed(columns * scale[seen], bias), *after), activation)
-        *rest, (last, last_bias) = decoder
-        before = tuple(_transposed(*layer) for layer in rest)
-        weight, bias = last * std[:, None], last_bias * std + mean
-        si_weight, si_bias = weight / scale[:, None], bias / scale
-
-        def leave(weight: Array, bias: Array) -> Stack:
-            return Stack((*before, _transposed(weight, bias)), activation)
+        groups = self.groups or (Group.whole(joints, muscles),)
+        enter: dict[Mask, list[Block]] = {mask: [] for mask in Mask}
+        leave, leave_length, leave_scaled = list[Block](), list[Block](), list[Block]()
+        depth, start = len(encoder) // len(groups), 0
+        for g, group in enumerate(groups):
+            layers = slice(g * depth, (g + 1) * depth)
+            own, sizes = group.columns(joints, muscles), tuple(map(len, group))
+            (first, first_bias), *rest = encoder[layers]
+            after = tuple(_transposed(*layer) for layer in rest)
+            latent = slice(start, start := start + sum(sizes))
+            for mask in Mask:
+                seen = visible(mask, *sizes)
+                columns = first[:, : len(own)][:, seen] / std[own][seen]
+                constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
+                bias = first_bias + constant - columns @ mean[own][seen]
+                into = np.flatnonzero(np.isin(np.flatnonzero(visible(mask, joints, muscles)), own))
+                stack = Stack((_transposed(columns * scale[own][seen], bias), *after), activation)
+                enter[mask].append((into, stack, latent))
+            *rest, (last, last_bias) = decoder[layers]
+            before = tuple(_transposed(*layer) for layer in rest)
+            weight, bias = last * std[own][:, None], last_bias * std[own] + mean[own]
+            si_weight, si_bias = weight / scale[own][:, None], bias / scale[own]
+            lengths = np.s_[-sizes[1] :]
+            for blocks, layer, out in (
+                (leave, (si_weight, si_bias), own),
+                (leave_length, (si_weight[lengths], si_bias[lengths]), np.array(group.muscles)),
+                (leave_scaled, (weight, bias), own),
+            ):
+                stack = Stack((*before, _transposed(*layer)), activation)
+                blocks.append((latent, stack, out))
 
         vars(self).update(  # frozen: no other way in
             mean=mean,
             std=std,
             encoder=encoder,
             decoder=decoder,
-            _enter=enter,
-            _leave=leave(si_weight, si_bias),
-            _leave_length=leave(si_weight[-muscles:], si_bias[-muscles:]),
-            decode_scaled=leave(weight, bias),
+            groups=groups,
+            _enter={mask: Blocks(tuple(blocks), start) for mask, blocks in enter.items()},
+            _leave=Blocks(tuple(leave), len(scale)),
+            _leave_length=Blocks(tuple(leave_length), muscles),
+            decode_scaled=Blocks(tuple(leave_scaled), len(scale)),
         )
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
-        """Units of all layers from input to output; the latent one in the middle has D+M."""
-        stack = (*self.encoder, *self.decoder)
-        return (stack[0][0].shape[1], *(len(bias) for _, bias in stack))
+        """Units of all layers from input to output, one group after the other.
+
+        The latent one in the middle has D+M of the group.
+        """
+        each, depth = len(self.groups), len(self.encoder) // len(self.groups)
+        stacks = ((*self.encoder[i : i + depth], *self.decoder[i : i + depth])
+                  for i in range(0, each * depth, depth))  # fmt: skip
+        return tuple(
+            size
+            for stack in stacks
+            for size in (stack[0][0].shape[1], *(len(bias) for _, bias in stack))
+        )
 
     def encode(
         self,
@@ -222,9 +284,15 @@ class Mae:
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
         x = np.concatenate((theta, tension), axis=-1)
-        turn = np.eye(theta.shape[-1], x.shape[-1])  # each joint by itself
-        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
-        return self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+        result = np.zeros((*x.shape[:-1], len(self.muscles), len(self.joints)))
+        enter, leave = self._enter[Mask.THETA_TENSION].blocks, self._leave_length.blocks
+        for group, (into, to_latent, _), (_, to_length, _) in zip(self.groups, enter, leave):
+            turn = np.eye(len(group.joints), sum(map(len, group)))  # each joint by itself
+            z, tangent = to_latent.tangent(x[..., into], turn)
+            slopes = to_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+            muscles, joints = np.ix_(group.muscles, group.joints)
+            result[..., muscles, joints] = slopes
+        return result
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ① (it does not print Δθ)."""
