@@ -47,7 +47,7 @@ Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 #: what network and metadata call the same
-SHARED = ('joints', 'muscles', 'activation', 'preset', 'version', 'training', 'groups')
+SHARED = ('joints', 'muscles', 'activation', 'preset', 'version', 'training')
 
 
 class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -141,6 +141,8 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
     }
+    if len(mae.groups) > 1:
+        entries['groups'] = mae.groups
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
@@ -264,6 +266,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         mean=tensors['mean'],
         std=tensors['std'],
         anomaly=anomaly,
+        groups=meta.groups,
         **{name: getattr(meta, name) for name in SHARED},
     )
 

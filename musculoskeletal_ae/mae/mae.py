@@ -10,8 +10,10 @@ object is made, so one estimate is six small matrix products and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,40 @@ from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
+
+
+class BlockDiagonal:
+    """A weight (in, out) of blocks, each with inputs and outputs of its own."""
+
+    __array_ufunc__ = None  # x @ weight is then left to __rmatmul__
+
+    def __init__(self, blocks: Sequence[Array], into: Ints | None, out: Ints | None) -> None:
+        """Put blocks (in, out) side by side.
+
+        x[into] are their inputs, one block's after the other's, and y[out] of theirs the outputs;
+        None: they stand like that.
+        """
+        sizes = np.cumsum([(0, 0), *(block.shape for block in blocks)], axis=0).tolist()
+        self._blocks = [
+            (slice(i, j), block, slice(m, n))
+            for block, ((i, m), (j, n)) in zip(blocks, pairwise(sizes), strict=True)
+        ]
+        self._into, self._out, self._outputs = into, out, sizes[-1][1]
+
+    def __rmatmul__(self, x: Array) -> Array:
+        """Return x @ weight, shape (..., out), for x (..., in)."""
+        if self._into is not None:
+            x = x[..., self._into]
+        result = np.empty((*x.shape[:-1], self._outputs))
+        for into, block, out in self._blocks:
+            np.matmul(x[..., into], block, out=result[..., out])
+        return result if self._out is None else result[..., self._out]
+
+    @cached_property
+    def T(self) -> BlockDiagonal:
+        """The transposed weight, as of an array."""
+        into, out = (None if p is None else np.argsort(p) for p in (self._out, self._into))
+        return BlockDiagonal([block.T for _, block, _ in self._blocks], into, out)
 
 
 class Activation(NamedTuple):
@@ -69,7 +105,7 @@ ACTIVATIONS = {
 class Stack(NamedTuple):
     """Layers x @ weight + bias, weight (in, out); the activation follows all but the last."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[tuple[Array | BlockDiagonal, Array], ...]
     activation: Activation
 
     def __call__(self, x: Array) -> Array:
@@ -110,39 +146,19 @@ class Stack(NamedTuple):
         return x, tangent
 
 
-#: places of its inputs, a stack, places of its outputs
-Block = tuple[Ints | slice, Stack, Ints | slice]
-
-
-class Blocks(NamedTuple):
-    """Stacks side by side, each with inputs and outputs of its own: a block-diagonal network."""
-
-    blocks: tuple[Block, ...]
-    outputs: int
-
-    def __call__(self, x: Array) -> Array:
-        """Return the output (..., out) for x (..., in)."""
-        if len(self.blocks) == 1:
-            return self.blocks[0][1](x)
-        result = np.empty((*x.shape[:-1], self.outputs))
-        for into, stack, out in self.blocks:
-            result[..., out] = stack(x[..., into])
-        return result
-
-    def with_pullback(self, x: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the output and the function that maps a gradient by it to one by x."""
-        result, pulls = np.empty((*x.shape[:-1], self.outputs)), []
-        for into, stack, out in self.blocks:
-            result[..., out], pull = stack.with_pullback(x[..., into])
-            pulls.append(pull)
-
-        def pullback(gradient: Array) -> Array:
-            by_x = np.empty_like(x)
-            for (into, _, out), pull in zip(self.blocks, pulls, strict=True):
-                by_x[..., into] = pull(gradient[..., out])
-            return by_x
-
-        return result, pullback
+def side_by_side(
+    stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
+) -> Stack:
+    """Return stacks as one whose inputs and outputs stand as in `BlockDiagonal`."""
+    if len(stacks) == 1:
+        return stacks[0]
+    layers = list[tuple[BlockDiagonal, Array]]()
+    for i, level in enumerate(zip(*(stack.layers for stack in stacks), strict=True)):
+        ends = into if i == 0 else None, out if i == len(stacks[0].layers) - 1 else None
+        weights, biases = zip(*level, strict=True)
+        bias = np.concatenate(biases)
+        layers.append((BlockDiagonal(weights, *ends), bias if ends[1] is None else bias[out]))
+    return Stack(tuple(layers), stacks[0].activation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,11 +178,11 @@ class Mae:
     training: str = ''  # how it was trained, for people to read
     anomaly: AnomalyStatistics | None = None  # residuals of healthy data
     groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
-    _enter: dict[Mask, Blocks] = field(init=False, repr=False)
-    _leave: Blocks = field(init=False, repr=False)
-    _leave_length: Blocks = field(init=False, repr=False)
+    _enter: dict[Mask, Stack] = field(init=False, repr=False)
+    _leave: Stack = field(init=False, repr=False)
+    _leave_length: Stack = field(init=False, repr=False)
     #: z (..., D+M) to (θ, T, l) in the paper's scaled units, one array (..., D+2M)
-    decode_scaled: Blocks = field(init=False, repr=False)
+    decode_scaled: Stack = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Freeze the arrays and fold units, standardisation and masks into the layers."""
@@ -179,35 +195,40 @@ class Mae:
         scale = scale_vector(joints, muscles)
         activation = ACTIVATIONS[self.activation]
         groups = self.groups or (Group.whole(joints, muscles),)
-        enter: dict[Mask, list[Block]] = {mask: [] for mask in Mask}
-        leave, leave_length, leave_scaled = list[Block](), list[Block](), list[Block]()
-        depth, start = len(encoder) // len(groups), 0
-        for g, group in enumerate(groups):
-            layers = slice(g * depth, (g + 1) * depth)
-            own, sizes = group.columns(joints, muscles), tuple(map(len, group))
+        enter: dict[Mask, list[Stack]] = {mask: [] for mask in Mask}
+        leave, leave_length, leave_scaled = list[Stack](), list[Stack](), list[Stack]()
+        columns = [group.columns(joints, muscles) for group in groups]
+        depth = len(encoder) // len(groups)
+        for g, own in enumerate(columns):
+            layers, sizes = slice(g * depth, (g + 1) * depth), tuple(map(len, groups[g]))
             (first, first_bias), *rest = encoder[layers]
             after = tuple(_transposed(*layer) for layer in rest)
-            latent = slice(start, start := start + sum(sizes))
-            for mask in Mask:
+            for mask, stacks in enter.items():
                 seen = visible(mask, *sizes)
-                columns = first[:, : len(own)][:, seen] / std[own][seen]
+                weight = first[:, : len(own)][:, seen] / std[own][seen]
                 constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
-                bias = first_bias + constant - columns @ mean[own][seen]
-                into = np.flatnonzero(np.isin(np.flatnonzero(visible(mask, joints, muscles)), own))
-                stack = Stack((_transposed(columns * scale[own][seen], bias), *after), activation)
-                enter[mask].append((into, stack, latent))
+                bias = first_bias + constant - weight @ mean[own][seen]
+                layer = _transposed(weight * scale[own][seen], bias)
+                stacks.append(Stack((layer, *after), activation))
             *rest, (last, last_bias) = decoder[layers]
             before = tuple(_transposed(*layer) for layer in rest)
             weight, bias = last * std[own][:, None], last_bias * std[own] + mean[own]
             si_weight, si_bias = weight / scale[own][:, None], bias / scale[own]
-            lengths = np.s_[-sizes[1] :]
-            for blocks, layer, out in (
-                (leave, (si_weight, si_bias), own),
-                (leave_length, (si_weight[lengths], si_bias[lengths]), np.array(group.muscles)),
-                (leave_scaled, (weight, bias), own),
+            lengths = si_weight[-sizes[1] :], si_bias[-sizes[1] :]
+            for stacks, layer in (
+                (leave, (si_weight, si_bias)),
+                (leave_length, lengths),
+                (leave_scaled, (weight, bias)),
             ):
-                stack = Stack((*before, _transposed(*layer)), activation)
-                blocks.append((latent, stack, out))
+                stacks.append(Stack((*before, _transposed(*layer)), activation))
+        all_columns = np.concatenate(columns)
+        out = np.argsort(all_columns)
+        out_length = np.argsort(np.concatenate([group.muscles for group in groups]))
+
+        def entered(mask: Mask) -> Ints:
+            seen = visible(mask, joints, muscles)
+            places: Ints = (np.cumsum(seen) - 1)[all_columns[seen[all_columns]]]
+            return places
 
         vars(self).update(  # frozen: no other way in
             mean=mean,
@@ -215,10 +236,10 @@ class Mae:
             encoder=encoder,
             decoder=decoder,
             groups=groups,
-            _enter={mask: Blocks(tuple(blocks), start) for mask, blocks in enter.items()},
-            _leave=Blocks(tuple(leave), len(scale)),
-            _leave_length=Blocks(tuple(leave_length), muscles),
-            decode_scaled=Blocks(tuple(leave_scaled), len(scale)),
+            _enter={mask: side_by_side(stacks, entered(mask)) for mask, stacks in enter.items()},
+            _leave=side_by_side(leave, out=out),
+            _leave_length=side_by_side(leave_length, out=out_length),
+            decode_scaled=side_by_side(leave_scaled, out=out),
         )
 
     @property
@@ -284,14 +305,18 @@ class Mae:
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
         x = np.concatenate((theta, tension), axis=-1)
+        # Each joint by itself, but of all groups at once: those do not meet.
+        turn = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
+        for group in self.groups:
+            turn[np.arange(len(group.joints)), group.joints] = 1.0
+        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
+        slopes = self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+        if len(self.groups) == 1:
+            return slopes
         result = np.zeros((*x.shape[:-1], len(self.muscles), len(self.joints)))
-        enter, leave = self._enter[Mask.THETA_TENSION].blocks, self._leave_length.blocks
-        for group, (into, to_latent, _), (_, to_length, _) in zip(self.groups, enter, leave):
-            turn = np.eye(len(group.joints), sum(map(len, group)))  # each joint by itself
-            z, tangent = to_latent.tangent(x[..., into], turn)
-            slopes = to_length.tangent(z, tangent)[1].swapaxes(-1, -2)
-            muscles, joints = np.ix_(group.muscles, group.joints)
-            result[..., muscles, joints] = slopes
+        for joints, muscles in self.groups:
+            rows, columns = np.ix_(muscles, joints)
+            result[..., rows, columns] = slopes[..., muscles, : len(joints)]
         return result
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
