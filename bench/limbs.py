@@ -173,20 +173,16 @@ class Body:
                 places = [on_ring(side * angle, *rest) for angle, *rest in ends]
                 route = [*zip(('torso', 'head'), places, strict=True)]
                 self.muscles.append({'name': prefix + name, 'route': route})
-                lean = '-' if side > 0 else '+'
-                if ends[1][0] not in (160,):
-                    self.signs.append((prefix + name, 'neck_roll', lean))
+                self.signs.append((prefix + name, 'neck_roll', '-' if side > 0 else '+'))
         self.end_effectors.append('head')
 
     def write(self, out: Path) -> None:
         """Write the three files of a robot directory."""
         out.mkdir(parents=True, exist_ok=True)
         ET.indent(self.urdf)
-        head = (
-            '<?xml version="1.0"?>\n<!-- Written by `python -m bench limbs`; CHOSEN numbers. -->\n'
-        )
+        head = '<?xml version="1.0"?>\n<!-- SPDX-License-Identifier: Apache-2.0\n     Written by `python -m bench limbs`; all numbers are CHOSEN, see README.md. -->\n'
         (out / 'robot.urdf').write_text(head + ET.tostring(self.urdf, 'unicode') + '\n')
-        lines = ['# Written by `python -m bench limbs`. Every number is CHOSEN; README.md says how.',
+        lines = ['# Written by `python -m bench limbs`; every number is CHOSEN, see README.md.',
                  f'joints: [{", ".join(self.joints)}]', 'muscles:']  # fmt: skip
         for muscle in self.muscles:
             lines += [f'  - name: {muscle["name"]}', '    route:']
