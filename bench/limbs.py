@@ -180,7 +180,10 @@ class Body:
         """Write the three files of a robot directory."""
         out.mkdir(parents=True, exist_ok=True)
         ET.indent(self.urdf)
-        head = '<?xml version="1.0"?>\n<!-- SPDX-License-Identifier: Apache-2.0\n     Written by `python -m bench limbs`; all numbers are CHOSEN, see README.md. -->\n'
+        head = (
+            '<?xml version="1.0"?>\n<!-- SPDX-License-Identifier: Apache-2.0\n'
+            '     Written by `python -m bench limbs`; all numbers are CHOSEN, see README.md. -->\n'
+        )
         (out / 'robot.urdf').write_text(head + ET.tostring(self.urdf, 'unicode') + '\n')
         lines = ['# Written by `python -m bench limbs`; every number is CHOSEN, see README.md.',
                  f'joints: [{", ".join(self.joints)}]', 'muscles:']  # fmt: skip
