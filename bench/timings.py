@@ -46,14 +46,14 @@ class Row(NamedTuple):
 
 
 def microseconds(function: Callable[[], object], calls: int = 100, rounds: int = 20) -> float:
-    """Return the time of one call [µs]: the median of rounds, so that a busy core counts little."""
+    """Return the time of one call [µs]: of the process, the median of rounds."""
     function()
     times = []
     for _ in range(rounds):
-        start = time.perf_counter()
+        start = time.process_time()
         for _ in range(calls):
             function()
-        times.append((time.perf_counter() - start) / calls)
+        times.append((time.process_time() - start) / calls)
     return 1e6 * float(np.median(times))
 
 

@@ -7,9 +7,13 @@ is the best that this project can measure. Code asks a field of the record, neve
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.groups import Group
+
+REFERENCE = 5 + 10  # D + M of the arm that the numbers of preset `default` are for
 
 
 @dataclass(frozen=True)
@@ -19,6 +23,9 @@ class NetworkSettings:
     hidden: tuple[int, ...]  # units of the encoder's hidden layers; the decoder's are the reverse
     activation: str  # after every layer but the latent and the last one, which are linear
     standardise: bool  # centre inputs and divide by their spread in training; undone at the output
+    #: a block of its own for each group of joints and muscles that share nothing with the others,
+    #: whose layers grow with the group; else one network of `hidden` for any body
+    grouped: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,12 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Preset:
-    """Everything in which two presets differ."""
+    """Everything in which two presets differ.
+
+    The numbers of `default` are those of an arm of 5 joints and 10 muscles. They grow in proportion
+    to the D + M of a larger group: its layers, and by the largest group of a body the mini-batches
+    of initial training and of every update, with which the samples that are dreamed grow.
+    """
 
     name: str
     network: NetworkSettings
@@ -48,10 +60,20 @@ class Preset:
     least_samples: int  # from how many samples on it learns online
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
 
+    def grown(self, number: int, groups: Iterable[Group]) -> int:
+        """Return a number of steps, or of units of a group's layer, as it is for given groups."""
+        largest = max(sum(map(len, group)) for group in groups)
+        return round(number * max(1.0, largest / REFERENCE)) if self.network.grouped else number
+
+    def blocks(self, groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
+        """Return the groups that have a block of the network each, with its hidden layers."""
+        hidden, of = self.network.hidden, groups if self.network.grouped else ()
+        return {group: tuple(self.grown(units, [group]) for units in hidden) for group in of}
+
 
 DEFAULT = Preset(
     name='default',
-    network=NetworkSettings(hidden=(200, 100), activation='silu', standardise=True),
+    network=NetworkSettings(hidden=(200, 100), activation='silu', standardise=True, grouped=True),
     training=TrainingSettings(
         steps=3000,
         batch=128,

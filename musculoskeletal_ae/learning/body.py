@@ -69,7 +69,7 @@ class CorrectedBody:
     def __init__(self, robot: Robot, parameters: list[Array] | None = None, seed: int = 0) -> None:
         """Correct `robot` by one vector per muscle, zero by default; `seed` draws the features."""
         self.robot = robot
-        routes, kin = robot.routes, robot.kinematics
+        routes = robot.routes
         span = robot.upper - robot.lower
         rng = np.random.default_rng([seed, 0xF0])
         self.layouts: list[Layout] = []
@@ -78,8 +78,7 @@ class CorrectedBody:
         for m in range(robot.muscle_count):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.append(routes.first[segments], routes.second[segments[-1]])
-            moved = kin.moved_by[routes.joint[points]]
-            crossed = moved.any(axis=0) & ~moved.all(axis=0)
+            crossed = routes.crossed[m]
             features = FEATURES if crossed.any() else 0
             self.layouts.append(Layout(points, features))
             frequency = rng.normal(0.0, 1.0, (features, robot.joint_count))

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import tempfile
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,6 +29,7 @@ from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.mae.units import UNITS
 from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 
 FORMAT_VERSION = 1
@@ -58,7 +59,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format_version: int
     joints: Names
     muscles: Names
-    layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21)]
+    layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21_000)]
     activation: str
     units: str
     preset: str
@@ -68,6 +69,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -81,21 +83,37 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ):
             if word not in legal:
                 raise ValueError(f'{what} {word!r}; legal: {" or ".join(map(repr, legal))}')
-        sizes, joints, muscles = self.layer_sizes, len(self.joints), len(self.muscles)
-        ends = joints + 2 * muscles + 3, joints + muscles, joints + 2 * muscles
+        for names, places in zip((self.joints, self.muscles), zip(*self.whole), strict=True):
+            if sorted(chain(*places)) != [*range(len(names))] or not all(places):
+                raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
         # Encoder and decoder have the same hidden layers, so the latent one stands in the middle.
-        if len(sizes) % 2 == 0 or (sizes[0], sizes[len(sizes) // 2], sizes[-1]) != ends:
-            legal_sizes = '{}, …, {}, …, {}'.format(*ends)
-            raise ValueError(f'layer_sizes {sizes}; legal: {legal_sizes}')
+        for (joints, muscles), sizes in zip(self.whole, self.sizes_by_group(), strict=True):
+            d, m = len(joints), len(muscles)
+            ends = d + 2 * m + 3, d + m, d + 2 * m
+            uneven = len(sizes) % 2 == 0 or len(sizes) * len(self.whole) != len(self.layer_sizes)
+            if uneven or (sizes[0], sizes[len(sizes) // 2], sizes[-1]) != ends:
+                legal_sizes = '{}, …, {}, …, {}'.format(*ends)
+                raise ValueError(f'layer_sizes {sizes}; legal: {legal_sizes}')
+
+    @property
+    def whole(self) -> tuple[Group, ...]:
+        """The groups; one of all joints and muscles where none are given."""
+        return self.groups or (Group.whole(len(self.joints), len(self.muscles)),)
+
+    def sizes_by_group(self) -> list[tuple[int, ...]]:
+        """Return the layer sizes of each group."""
+        each = -(-len(self.layer_sizes) // len(self.whole))
+        return [self.layer_sizes[g * each :][:each] for g in range(len(self.whole))]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return name and shape of every tensor of such a network."""
         values = len(self.joints) + 2 * len(self.muscles)
         shapes: dict[str, tuple[int, ...]] = {'mean': (values,), 'std': (values,)}
-        depth = len(self.layer_sizes) // 2
-        for i, (into, out) in enumerate(pairwise(self.layer_sizes)):
-            name = f'encoder.{i}' if i < depth else f'decoder.{i - depth}'
-            shapes |= {f'{name}.weight': (out, into), f'{name}.bias': (out,)}
+        for g, sizes in enumerate(self.sizes_by_group()):
+            depth = len(sizes) // 2
+            for i, (into, out) in enumerate(pairwise(sizes)):
+                name, layer = ('decoder', 'encoder')[i < depth], g * depth + i % depth
+                shapes |= {f'{name}.{layer}.weight': (out, into), f'{name}.{layer}.bias': (out,)}
         if self.anomaly_calibrated is not None:
             muscles = 2 * len(self.muscles)
             shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
@@ -123,6 +141,8 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
     }
+    if len(mae.groups) > 1:
+        entries['groups'] = mae.groups
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
@@ -227,8 +247,8 @@ def _check_covariance(covariance: Array) -> None:
 
 def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     def stack(name: str) -> tuple[Layer, ...]:
-        depth = range(len(meta.layer_sizes) // 2)
-        return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in depth)
+        layers = range(sum(len(sizes) // 2 for sizes in meta.sizes_by_group()))
+        return tuple((tensors[f'{name}.{i}.weight'], tensors[f'{name}.{i}.bias']) for i in layers)
 
     anomaly = None
     if meta.anomaly_calibrated is not None:
@@ -246,6 +266,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         mean=tensors['mean'],
         std=tensors['std'],
         anomaly=anomaly,
+        groups=meta.groups,
         **{name: getattr(meta, name) for name in SHARED},
     )
 

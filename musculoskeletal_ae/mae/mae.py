@@ -10,18 +10,55 @@ object is made, so one estimate is six small matrix products and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
+from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
+
+
+class BlockDiagonal:
+    """A weight (in, out) of blocks, each with inputs and outputs of its own."""
+
+    __array_ufunc__ = None  # x @ weight is then left to __rmatmul__
+
+    def __init__(self, blocks: Sequence[Array], into: Ints | None, out: Ints | None) -> None:
+        """Put blocks (in, out) side by side.
+
+        x[into] are their inputs, one block's after the other's, and y[out] of theirs the outputs;
+        None: they stand like that.
+        """
+        sizes = np.cumsum([(0, 0), *(block.shape for block in blocks)], axis=0).tolist()
+        self._blocks = [
+            (slice(i, j), block, slice(m, n))
+            for block, ((i, m), (j, n)) in zip(blocks, pairwise(sizes), strict=True)
+        ]
+        self._into, self._out, self._outputs = into, out, sizes[-1][1]
+
+    def __rmatmul__(self, x: Array) -> Array:
+        """Return x @ weight, shape (..., out), for x (..., in)."""
+        if self._into is not None:
+            x = x[..., self._into]
+        result = np.empty((*x.shape[:-1], self._outputs))
+        for into, block, out in self._blocks:
+            np.matmul(x[..., into], block, out=result[..., out])
+        return result if self._out is None else result[..., self._out]
+
+    @cached_property
+    def T(self) -> BlockDiagonal:
+        """The transposed weight, as of an array."""
+        into, out = (None if p is None else np.argsort(p) for p in (self._out, self._into))
+        return BlockDiagonal([block.T for _, block, _ in self._blocks], into, out)
 
 
 class Activation(NamedTuple):
@@ -68,7 +105,7 @@ ACTIVATIONS = {
 class Stack(NamedTuple):
     """Layers x @ weight + bias, weight (in, out); the activation follows all but the last."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[tuple[Array | BlockDiagonal, Array], ...]
     activation: Activation
 
     def __call__(self, x: Array) -> Array:
@@ -109,6 +146,21 @@ class Stack(NamedTuple):
         return x, tangent
 
 
+def side_by_side(
+    stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
+) -> Stack:
+    """Return stacks as one whose inputs and outputs stand as in `BlockDiagonal`."""
+    if len(stacks) == 1:
+        return stacks[0]
+    layers = list[tuple[BlockDiagonal, Array]]()
+    for i, level in enumerate(zip(*(stack.layers for stack in stacks), strict=True)):
+        ends = into if i == 0 else None, out if i == len(stacks[0].layers) - 1 else None
+        weights, biases = zip(*level, strict=True)
+        bias = np.concatenate(biases)
+        layers.append((BlockDiagonal(weights, *ends), bias if ends[1] is None else bias[out]))
+    return Stack(tuple(layers), stacks[0].activation)
+
+
 @dataclass(frozen=True, eq=False)
 class Mae:
     """A trained network and what a checkpoint says of it."""
@@ -117,13 +169,15 @@ class Mae:
     muscles: tuple[str, ...]  # M names, in the order of T and l
     preset: str
     activation: str
-    encoder: tuple[Layer, ...]  # weight (out, in), bias (out,); in scaled, standardised units
+    #: weight (out, in), bias (out,), in scaled, standardised units; one group after the other
+    encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
     mean: Array  # what scaled (θ, T, l) are centred by, (D+2M,)
     std: Array  # what they are divided by, (D+2M,)
     version: int = 0  # counts up with every checkpoint the learner publishes
     training: str = ''  # how it was trained, for people to read
     anomaly: AnomalyStatistics | None = None  # residuals of healthy data
+    groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
     _leave_length: Stack = field(init=False, repr=False)
@@ -140,39 +194,68 @@ class Mae:
         joints, muscles = len(self.joints), len(self.muscles)
         scale = scale_vector(joints, muscles)
         activation = ACTIVATIONS[self.activation]
-        (first, first_bias), *rest = encoder
-        after = tuple(_transposed(*layer) for layer in rest)
-        enter = {}
-        for mask in Mask:
-            seen = visible(mask, joints, muscles)
-            columns = first[:, : len(scale)][:, seen] / std[seen]
-            constant = first[:, len(scale) :] @ np.array(mask.value, dtype=float)
-            bias = first_bias + constant - columns @ mean[seen]
-            enter[mask] = Stack((_transposed(columns * scale[seen], bias), *after), activation)
-        *rest, (last, last_bias) = decoder
-        before = tuple(_transposed(*layer) for layer in rest)
-        weight, bias = last * std[:, None], last_bias * std + mean
-        si_weight, si_bias = weight / scale[:, None], bias / scale
+        groups = self.groups or (Group.whole(joints, muscles),)
+        enter: dict[Mask, list[Stack]] = {mask: [] for mask in Mask}
+        leave, leave_length, leave_scaled = list[Stack](), list[Stack](), list[Stack]()
+        columns = [group.columns(joints, muscles) for group in groups]
+        depth = len(encoder) // len(groups)
+        for g, own in enumerate(columns):
+            layers, sizes = slice(g * depth, (g + 1) * depth), tuple(map(len, groups[g]))
+            (first, first_bias), *rest = encoder[layers]
+            after = tuple(_transposed(*layer) for layer in rest)
+            for mask, stacks in enter.items():
+                seen = visible(mask, *sizes)
+                weight = first[:, : len(own)][:, seen] / std[own][seen]
+                constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
+                bias = first_bias + constant - weight @ mean[own][seen]
+                layer = _transposed(weight * scale[own][seen], bias)
+                stacks.append(Stack((layer, *after), activation))
+            *rest, (last, last_bias) = decoder[layers]
+            before = tuple(_transposed(*layer) for layer in rest)
+            weight, bias = last * std[own][:, None], last_bias * std[own] + mean[own]
+            si_weight, si_bias = weight / scale[own][:, None], bias / scale[own]
+            lengths = si_weight[-sizes[1] :], si_bias[-sizes[1] :]
+            for stacks, layer in (
+                (leave, (si_weight, si_bias)),
+                (leave_length, lengths),
+                (leave_scaled, (weight, bias)),
+            ):
+                stacks.append(Stack((*before, _transposed(*layer)), activation))
+        all_columns = np.concatenate(columns)
+        out = np.argsort(all_columns)
+        out_length = np.argsort(np.concatenate([group.muscles for group in groups]))
 
-        def leave(weight: Array, bias: Array) -> Stack:
-            return Stack((*before, _transposed(weight, bias)), activation)
+        def entered(mask: Mask) -> Ints:
+            seen = visible(mask, joints, muscles)
+            places: Ints = (np.cumsum(seen) - 1)[all_columns[seen[all_columns]]]
+            return places
 
         vars(self).update(  # frozen: no other way in
             mean=mean,
             std=std,
             encoder=encoder,
             decoder=decoder,
-            _enter=enter,
-            _leave=leave(si_weight, si_bias),
-            _leave_length=leave(si_weight[-muscles:], si_bias[-muscles:]),
-            decode_scaled=leave(weight, bias),
+            groups=groups,
+            _enter={mask: side_by_side(stacks, entered(mask)) for mask, stacks in enter.items()},
+            _leave=side_by_side(leave, out=out),
+            _leave_length=side_by_side(leave_length, out=out_length),
+            decode_scaled=side_by_side(leave_scaled, out=out),
         )
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
-        """Units of all layers from input to output; the latent one in the middle has D+M."""
-        stack = (*self.encoder, *self.decoder)
-        return (stack[0][0].shape[1], *(len(bias) for _, bias in stack))
+        """Units of all layers from input to output, one group after the other.
+
+        The latent one in the middle has D+M of the group.
+        """
+        each, depth = len(self.groups), len(self.encoder) // len(self.groups)
+        stacks = ((*self.encoder[i : i + depth], *self.decoder[i : i + depth])
+                  for i in range(0, each * depth, depth))  # fmt: skip
+        return tuple(
+            size
+            for stack in stacks
+            for size in (stack[0][0].shape[1], *(len(bias) for _, bias in stack))
+        )
 
     def encode(
         self,
@@ -222,9 +305,19 @@ class Mae:
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
         x = np.concatenate((theta, tension), axis=-1)
-        turn = np.eye(theta.shape[-1], x.shape[-1])  # each joint by itself
+        # Each joint by itself, but of all groups at once: those do not meet.
+        turn = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
+        for group in self.groups:
+            turn[np.arange(len(group.joints)), group.joints] = 1.0
         z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
-        return self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+        slopes = self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+        if len(self.groups) == 1:
+            return slopes
+        result = np.zeros((*x.shape[:-1], len(self.muscles), len(self.joints)))
+        for joints, muscles in self.groups:
+            rows, columns = np.ix_(muscles, joints)
+            result[..., rows, columns] = slopes[..., muscles, : len(joints)]
+        return result
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ① (it does not print Δθ)."""

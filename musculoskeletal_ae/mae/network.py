@@ -9,37 +9,78 @@ enters the first layer.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.units import Mask, visible
 from musculoskeletal_ae.presets import PRESETS, NetworkSettings
+from musculoskeletal_ae.robot.groups import Group
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
 
+class Blocks(nn.Module):
+    """Stacks side by side; each takes some of the inputs, and gives some of the outputs."""
+
+    order: Tensor
+
+    def __init__(self, stacks: list[nn.Sequential], into: list[Ints], out: list[Ints]) -> None:
+        super().__init__()
+        self.stacks, self._into = nn.ModuleList(stacks), [*map(torch.as_tensor, into)]
+        self.register_buffer('order', torch.as_tensor(np.argsort(np.concatenate(out))))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the outputs (N, out) of inputs (N, in)."""
+        if len(self.stacks) == 1:
+            result: Tensor = self.stacks[0](x)
+            return result
+        each = [stack(x[:, own]) for stack, own in zip(self.stacks, self._into, strict=True)]
+        return torch.cat(each, dim=-1)[:, self.order]
+
+
 class Network(nn.Module):
-    """D joints, M muscles: layers (D+2M+3, *hidden, D+M, *reversed hidden, D+2M)."""
+    """D joints, M muscles: layers (D+2M+3, *hidden, D+M, *reversed hidden, D+2M).
+
+    One such block for each group, with its own D, M and hidden layers, where there are several.
+    """
 
     mean: Tensor
     std: Tensor
     rows: Tensor
 
     def __init__(
-        self, joints: int, muscles: int, settings: NetworkSettings, mean: Array, std: Array
+        self,
+        joints: int,
+        muscles: int,
+        settings: NetworkSettings,
+        mean: Array,
+        std: Array,
+        blocks: Mapping[Group, tuple[int, ...]] | None = None,
     ) -> None:
-        """Start from torch's random weights; (θ, T, l) are centred by mean, divided by std."""
+        """Start from torch's random weights; (θ, T, l) are centred by mean, divided by std.
+
+        The blocks say the hidden layers of each group.
+        """
         super().__init__()
         self.joints, self.muscles, self.settings = joints, muscles, settings
-        values, latent = joints + 2 * muscles, joints + muscles
-        encoder = (values + 3, *settings.hidden, latent)
-        decoder = (latent, *reversed(settings.hidden), values)
-        self.encoder, self.decoder = self._stack(encoder), self._stack(decoder)
+        blocks = blocks or {Group.whole(joints, muscles): settings.hidden}
+        self.groups = tuple(blocks)
+        values, start, encoders, decoders = joints + 2 * muscles, 0, [], []
+        own, latents = [group.columns(joints, muscles) for group in blocks], []
+        for columns, (group, hidden) in zip(own, blocks.items(), strict=True):
+            latents.append(np.arange(start, start := start + sum(map(len, group))))
+            sizes = len(columns) + 3, *hidden, len(latents[-1]), *reversed(hidden), len(columns)
+            encoders.append(self._stack(sizes[: len(hidden) + 2]))
+            decoders.append(self._stack(sizes[len(hidden) + 1 :]))
+        seen = [np.append(columns, values + np.arange(3)) for columns in own]
+        self.encoder, self.decoder = Blocks(encoders, seen, latents), Blocks(decoders, latents, own)
         self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
         self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
         # One row per mask: which entries pass, then the three mask inputs themselves.
@@ -78,7 +119,7 @@ def to_mae(
     def array(tensor: Tensor) -> Array:
         return tensor.detach().cpu().numpy().astype(np.float64)
 
-    def stack(layers: nn.Sequential) -> tuple[Layer, ...]:
+    def stack(layers: Blocks) -> tuple[Layer, ...]:
         return tuple((array(layer.weight), array(layer.bias)) for layer in _linear(layers))
 
     return Mae(
@@ -91,17 +132,17 @@ def to_mae(
         mean=array(network.mean),
         std=array(network.std),
         training=training,
+        groups=network.groups,
     )
 
 
 def from_mae(mae: Mae) -> Network:
     """Return a torch network with the weights of a numpy one, to go on learning from."""
-    settings = NetworkSettings(
-        hidden=tuple(len(bias) for _, bias in mae.encoder[:-1]),
-        activation=mae.activation,
-        standardise=PRESETS[mae.preset].network.standardise,
-    )
-    network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std)
+    settings = replace(PRESETS[mae.preset].network, activation=mae.activation)
+    hidden = [len(bias) for _, bias in mae.encoder]
+    depth = len(hidden) // len(mae.groups)
+    blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
+    network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std, blocks)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
             for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):
@@ -110,5 +151,5 @@ def from_mae(mae: Mae) -> Network:
     return network
 
 
-def _linear(layers: nn.Sequential) -> list[nn.Linear]:
-    return [layer for layer in layers if isinstance(layer, nn.Linear)]
+def _linear(layers: nn.Module) -> list[nn.Linear]:
+    return [layer for layer in layers.modules() if isinstance(layer, nn.Linear)]

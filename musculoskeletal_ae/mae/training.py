@@ -204,7 +204,8 @@ def initial_mae(
     Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
     """
     chosen = preset_named(preset)
-    settings = chosen.training if steps is None else replace(chosen.training, steps=steps)
+    count = chosen.grown(chosen.training.steps, robot.groups) if steps is None else steps
+    settings = replace(chosen.training, steps=count)
     rng = np.random.default_rng(seed)
     if chosen.network.standardise:
         samples = overload_states(robot, settings.samples, rng).scaled()
@@ -216,7 +217,8 @@ def initial_mae(
         samples = with_twins(robot, samples, std, rng)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = Network(robot.joint_count, robot.muscle_count, chosen.network, mean, std)
+        sizes = robot.joint_count, robot.muscle_count
+        network = Network(*sizes, chosen.network, mean, std, chosen.blocks(robot.groups))
     losses = fit(network, shuffled(samples, settings.batch, rng), settings, seed, progress)
     history = (
         f'initial training on the geometric model of {robot.description.directory.name}: '

@@ -11,6 +11,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, load_description
+from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.stiffness import muscle_stiffness
@@ -31,6 +32,7 @@ class Robot:
             description.model, self.joints, description.end_effector, description.couplings
         )
         self.routes = Routes(self.kinematics, description.routes)
+        self.groups = groups(self.routes.crossed)
         #: joint limits [rad], (D,)
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
 

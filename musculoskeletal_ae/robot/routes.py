@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 
@@ -51,6 +51,10 @@ class Routes:
     def __init__(self, kinematics: Kinematics, routes: Sequence[Route]) -> None:
         """Attach the routes of a description to the tree."""
         self._kinematics = kinematics
+        links = ([kinematics.placement(item.link)[0] for item in route] for route in routes)
+        moved = [kinematics.moved_by[joints] for joints in links]
+        #: joints that each muscle crosses: they move some of its route and not all, (M, D)
+        self.crossed: Bools = np.array([some.any(axis=0) & ~some.all(axis=0) for some in moved])
         pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
         attached = [kinematics.attach(*point) for points in pieces for point in points]
         #: joint of the tree that carries each point, (P,), and the point in its frame [m], (P, 3)

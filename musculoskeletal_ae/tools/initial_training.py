@@ -48,7 +48,8 @@ def train(args: Namespace) -> None:
         if not file.parent.is_dir() or file.is_dir():
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
     robot = Robot.load(args.robot)
-    steps = PRESETS[args.preset].training.steps // (10 if args.quick else 1)
+    preset = PRESETS[args.preset]
+    steps = preset.grown(preset.training.steps, robot.groups) // (10 if args.quick else 1)
     if args.from_bag:
         checkpoint.save(_learned(robot, args, steps).mae, args.out)
         print(f'checkpoint: {args.out}')

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Accuracy, time and memory from 2 joints and 6 muscles to 39 and 74, as a table and a plot.
+
+    python -m bench scaling [--bodies 2x6,5x10,…] [--minutes 10] --out DIR
+
+The bodies are arm26 and those of `bench limbs`. Of each, in a process of its own: the initial
+training and its error of ② on the geometric model per joint; the core's steps; ten minutes of
+individual 0, learned in updates of 400 steps every 20 s, and the error of ② on the held-out motion
+before and after, beside the oracle; one update of the learner as it ships, with a full store; and
+the largest memory. Times are of one core. DIR keeps networks and rows, and goes on from them.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import resource
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from bench.learned_arm import initial, learned_arm
+from bench.limbs import BODIES, write_body
+from bench.timings import microseconds
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.methods import proposed
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments.least_squares import oracle_errors
+from musculoskeletal_ae.experiments.recording import (
+    HELD_OUT_STREAM,
+    Recording,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.samples import CAPACITY, Observations
+from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.training import Job
+from musculoskeletal_ae.learning.update import make_updater
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import random_states
+from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.presets import DEFAULT
+from musculoskeletal_ae.robot.directories import find_robot
+from musculoskeletal_ae.robot.robot import Robot
+
+SMALLEST, INDIVIDUAL, UNSEEN = '2x6', 0, 5000
+HELD_OUT = 300.0  # [s]
+#: number of a row: heading in the table
+COLUMNS = {
+    'nominal': '② nominal [rad a joint]',
+    'before': 'before [rad a joint]',
+    'after': 'after',
+    'oracle': 'oracle',
+    'training': 'training [s]',
+    'update': 'update [s]',
+    'estimate': 'estimate [µs]',
+    'solve': 'control solve [µs]',
+    'memory': 'memory [MB]',
+    'checkpoint': 'checkpoint [MB]',
+}
+Row = dict[str, float]
+
+
+def measure(body: str, folder: Path, minutes: float) -> Row:
+    """Return the numbers of a body; errors are divided by √D."""
+    folder.mkdir(parents=True, exist_ok=True)
+    robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
+    begun = time.process_time()
+    nominal = initial(robot, folder)
+    row = {'training': time.process_time() - begun}
+    states = random_states(robot, UNSEEN, np.random.default_rng(7), robot.tension.limit)
+    joint = np.sqrt(robot.joint_count)
+    error = nominal.estimate(states.tension, states.length).theta - states.theta
+    row['nominal'] = float(np.linalg.norm(error, axis=1).mean() / joint)
+    arm = EmulatedArm(robot, INDIVIDUAL)
+    mae, driver, exploring = learned_arm(robot, INDIVIDUAL, folder, minutes)
+    held_out = record(arm, driver, HELD_OUT_STREAM, HELD_OUT)
+    row['before'] = estimation_error(nominal, held_out) / joint
+    row['after'] = estimation_error(mae, held_out) / joint
+    row['oracle'] = oracle_errors(arm, INDIVIDUAL, held_out)['oracle_rad'] / joint
+    one = held_out.tension[0], held_out.length[0]
+    row['estimate'] = microseconds(lambda: mae.estimate(*one))
+    row['solve'] = microseconds(lambda: _solve(robot, mae))
+    row['update'] = _update_time(robot, mae, exploring)
+    row['checkpoint'] = (folder / f'learned_{INDIVIDUAL}.safetensors').stat().st_size / 1e6
+    row['memory'] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    return row
+
+
+def _solve(robot: Robot, mae: Mae) -> Array:
+    theta, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
+    torque = robot.kinematics.holding_torque(theta)
+    return proposed(robot, mae, theta, torque, bias, robot.tension.limit).length
+
+
+def _update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
+    """Return the time of an update from a store that is full [s]."""
+    part = exploring.part(np.linspace(0, len(exploring.theta) - 1, CAPACITY, dtype=int))
+    none = np.zeros_like(part.tension)
+    seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
+    messages = np.concatenate([exploring.tension, exploring.length], axis=1)[::10]
+    updater = make_updater(robot, mae, DEFAULT)
+    job = Job(seen, Healthy(messages.astype(np.float32), 600.0, 100), True, STEPS)
+    updater.update(job)
+    begun = time.process_time()
+    updater.update(job)
+    return time.process_time() - begun
+
+
+def table(rows: dict[str, Row]) -> str:
+    """Return the rows as a table in Markdown."""
+    lines = [f'| body | {" | ".join(COLUMNS.values())} |', '|---' * (1 + len(COLUMNS)) + '|']
+    for body, row in rows.items():
+        cells = (f'{row[key]:.4f}' if row[key] < 1.0 else f'{row[key]:.3g}' for key in COLUMNS)
+        lines.append(f'| {body.replace("x", " × ")} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def draw(rows: dict[str, Row], file: Path) -> None:
+    """Draw accuracy, time and memory over the number of joints."""
+    figure, panels = plots.new_figure(13.0, 4.6, 1, 3)
+    joints = [int(body.split('x')[0]) for body in rows]
+    kinds = (
+        ('error of ② per joint [rad]', {'before': 'before learning', 'after': 'after ten minutes',
+                                        'oracle': 'oracle', 'nominal': 'on the geometric model'}),
+        ('time on one core [s]', {'training': 'initial training', 'update': 'update',
+                                  'solve': 'control solve', 'estimate': 'estimate'}),
+        ('size [MB]', {'memory': 'largest memory of the process', 'checkpoint': 'checkpoint'}),
+    )  # fmt: skip
+    for panel, (label, curves) in zip(panels, kinds, strict=True):
+        for key, name in curves.items():
+            scale = 1e-6 if COLUMNS[key].endswith('[µs]') else 1.0
+            panel.plot(joints, [scale * row[key] for row in rows.values()], 'o-', label=name)
+        panel.set_xscale('log')
+        panel.set_yscale('log')
+        panel.set_xticks(joints, [body.replace('x', '×') for body in rows], minor=False)
+        panel.minorticks_off()
+        plots.tidy(panel, 'joints × muscles', label, '', legend='below')
+    figure.savefig(file, dpi=110)
+
+
+def run(bodies: list[str], minutes: float, out: Path) -> None:
+    """Measure what is not there yet, print the table and draw the plot."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / 'rows.json'
+    rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}
+    for body in bodies:
+        if body not in rows:
+            with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
+                rows[body] = pool.submit(measure, body, out / f'{body}_learned', minutes).result()
+            print(body, rows[body], flush=True)
+            file.write_text(json.dumps(rows, indent=1))
+    print(table(rows))
+    draw(rows, out / 'scaling.png')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure bodies."""
+    parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
+    text = f'of {", ".join((SMALLEST, *BODIES))}'
+    parser.add_argument(
+        '--bodies', type=lambda t: t.split(','), default=[SMALLEST, *BODIES], help=text
+    )
+    parser.add_minutes('duration of the exploration', 10.0)
+    parser.add_out('DIR', 'networks, rows and plot')
+    args = parser.parse_args(argv)
+    return exit_status(lambda: run(args.bodies, args.minutes, args.out))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

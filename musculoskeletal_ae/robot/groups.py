@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Groups of joints and muscles: the limbs of a body, found from its routes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Bools, Ints
+
+
+class Group(NamedTuple):
+    """Joints and muscles that share nothing with the others, as those of one limb."""
+
+    joints: tuple[int, ...]  # places in θ
+    muscles: tuple[int, ...]  # places in T and l
+
+    @classmethod
+    def whole(cls, joints: int, muscles: int) -> Group:
+        """Return a group of D joints and M muscles."""
+        return cls(tuple(range(joints)), tuple(range(muscles)))
+
+    def columns(self, joints: int, muscles: int) -> Ints:
+        """Return the places in (θ, T, l) of a body of D joints and M muscles."""
+        own = joints + np.array(self.muscles)
+        return np.concatenate([self.joints, own, muscles + own])
+
+
+def groups(crossed: Bools) -> tuple[Group, ...]:
+    """Return the connected components of muscles and the joints that they cross (M, D).
+
+    What is connected to nothing goes with the first joint, or with the first muscle.
+    """
+    of_joint = np.arange(crossed.shape[1])
+    for own in crossed[crossed.any(axis=1)]:
+        of_joint[np.isin(of_joint, of_joint[own])] = of_joint[own].min()
+    of_muscle = of_joint[crossed.argmax(axis=1)]
+    of_joint[~np.isin(of_joint, of_muscle)] = of_muscle[0]
+    return tuple(
+        Group(*(tuple(np.flatnonzero(of == g).tolist()) for of in (of_joint, of_muscle)))
+        for g in np.unique(of_muscle)
+    )

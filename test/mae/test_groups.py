@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A body of several limbs: which groups its routes make, and a network with a block for each."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from musculoskeletal_ae.exceptions import CheckpointError
+from musculoskeletal_ae.mae.checkpoint import from_bytes, to_bytes
+from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
+from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.presets import DEFAULT, PAPER
+from musculoskeletal_ae.robot.groups import Group, groups
+from musculoskeletal_ae.robot.robot import Robot
+
+# Three limbs whose joints and muscles are listed in no order.
+LIMBS = (Group((0, 4), (1, 6, 7, 8)), Group((1,), (0, 5)), Group((2, 3), (2, 3, 4)))
+JOINTS, MUSCLES = 5, 9
+
+
+@pytest.fixture(scope='module')
+def mae():
+    rng = np.random.default_rng(0)
+    mean, std = rng.normal(size=23), rng.uniform(0.5, 2.0, 23)
+    torch.manual_seed(0)
+    blocks = {limb: (6 + i, 4) for i, limb in enumerate(LIMBS)}
+    network = Network(JOINTS, MUSCLES, DEFAULT.network, mean, std, blocks)
+    return to_mae(network, tuple('abcde'), tuple('ABCDEFGHI'), 'default', '')
+
+
+@pytest.fixture
+def state():
+    rng = np.random.default_rng(1)
+    sizes = (7, JOINTS), (7, MUSCLES), (7, MUSCLES)
+    return [scale * rng.normal(size=size) for scale, size in zip((1.0, 100.0, 0.1), sizes)]
+
+
+def test_two_arms_and_a_neck_are_three_groups():
+    robot = Robot.load('musashi_upper_body')
+    named = [
+        ({robot.joints[j].split('_')[0] for j in g.joints}, len(g.muscles)) for g in robot.groups
+    ]
+    assert named == [({'left'}, 14), ({'right'}, 14), ({'neck'}, 12)]
+
+
+@pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
+def test_one_arm_is_one_group(name):
+    robot = Robot.load(name)
+    assert robot.groups == (Group.whole(robot.joint_count, robot.muscle_count),)
+
+
+def test_groups_are_what_muscles_connect_however_they_are_listed():
+    crossed = np.zeros((MUSCLES, JOINTS), dtype=bool)
+    for joints, muscles in LIMBS:
+        for k, muscle in enumerate(muscles):  # a chain: each joint meets the next one only
+            crossed[muscle, joints[k % len(joints)]] = True
+            crossed[muscle, joints[(k + 1) % len(joints)]] |= k == 0
+    assert groups(crossed) == LIMBS
+
+
+def test_a_joint_without_muscles_and_a_muscle_without_joints_are_in_some_group():
+    crossed = np.array([[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]], dtype=bool)
+    found = groups(crossed)
+    for whole, parts in zip((range(4), range(3)), zip(*found)):
+        assert sorted(sum(parts, ())) == [*whole]
+    assert all(joints and muscles for joints, muscles in found)
+
+
+def test_layers_and_steps_grow_with_a_group_beyond_that_of_the_arm_and_never_in_preset_paper():
+    arm, small, large = (Group.whole(*sizes) for sizes in ((5, 10), (2, 6), (7, 14)))
+    blocks = DEFAULT.blocks((arm, small, large))
+    assert list(blocks.values()) == [(200, 100), (200, 100), (280, 140)]
+    assert DEFAULT.grown(3000, (arm, small)) == 3000
+    assert DEFAULT.grown(3000, (arm, large, small)) == 4200
+    assert PAPER.grown(3000, (large,)) == 3000
+    assert not PAPER.blocks((arm, large))
+
+
+@pytest.mark.parametrize('index', range(3))
+def test_numpy_agrees_with_torch(mae, state, index):
+    scaled = np.concatenate([state[0], state[1] / 200.0, 10.0 * state[2]], axis=1)
+    with torch.no_grad():
+        expected = from_mae(mae)(torch.tensor(scaled).float(), torch.full((7,), index))
+    z = mae.encode(list(Mask)[index], *state)
+    assert z.shape == (7, JOINTS + MUSCLES)
+    np.testing.assert_allclose(mae.decode_scaled(z), expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(mae.decode(z).scaled(), expected.numpy(), atol=1e-5)
+
+
+def test_a_limb_is_estimated_from_its_own_muscles_alone(mae, state):
+    _, tension, length = state
+    before = mae.estimate(tension, length)
+    for joints, muscles in LIMBS:
+        other = [part.copy() for part in (tension, length)]
+        for part in other:
+            part[:, muscles] += 1.0
+        changed = mae.estimate(*other).theta != before.theta
+        assert changed[:, joints].all()
+        assert not np.delete(changed, joints, axis=1).any()
+
+
+def test_its_jacobian_is_the_slope_of_its_lengths_and_zero_between_limbs(mae, state):
+    theta, tension, _ = state
+    jacobian = mae.muscle_jacobian(theta, tension)
+    difference = mae.muscle_jacobian_difference(theta, tension, 1e-6)
+    np.testing.assert_allclose(jacobian, difference, atol=1e-5 * np.abs(jacobian).max())
+    own = np.zeros((MUSCLES, JOINTS), dtype=bool)
+    for joints, muscles in LIMBS:
+        own[np.ix_(muscles, joints)] = True
+    assert (jacobian[:, ~own] == 0.0).all()
+    assert (jacobian[:, own] != 0.0).all()
+    _, pullback = mae.lengths_with_pullback(theta, tension)
+    expected = np.einsum('nmd,nm->nd', jacobian, tension)
+    np.testing.assert_allclose(pullback(tension.copy()), expected, rtol=1e-9)
+
+
+def test_a_checkpoint_brings_the_groups_and_the_same_answers(mae, state):
+    again = from_bytes(to_bytes(mae))
+    assert again.groups == LIMBS
+    for part, expected in zip(again.estimate(*state[1:]), mae.estimate(*state[1:])):
+        np.testing.assert_array_equal(part, expected)
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        ({'groups': LIMBS[:2]}, 'each joint and muscle in one group'),
+        ({'groups': (*LIMBS[:2], Group((2, 3), (2, 3, 3)))}, 'each joint and muscle in one group'),
+        ({'groups': (*LIMBS, Group((), ()))}, 'each joint and muscle in one group'),
+        ({'groups': (Group((0, 1, 4), (0, 1, 5, 6, 7, 8)), LIMBS[2])}, 'layer_sizes'),
+        ({'groups': ()}, 'layer_sizes'),
+        ({'groups': 3}, 'groups'),
+        ({'groups': [[[-1], [0]]]}, 'groups'),
+        ({'layer_sizes': [1, 2, 3]}, 'layer_sizes'),
+    ],
+)
+def test_groups_that_do_not_fit_are_refused(mae, change, says):
+    data = to_bytes(mae)
+    size = int.from_bytes(data[:8], 'little')
+    header = json.loads(data[8 : 8 + size])
+    header['__metadata__'] |= {key: json.dumps(value) for key, value in change.items()}
+    text = json.dumps(header).encode()
+    with pytest.raises(CheckpointError, match=says):
+        from_bytes(len(text).to_bytes(8, 'little') + text + data[8 + size :])
+
+
+def test_training_goes_on_from_a_network_of_groups(mae):
+    network = from_mae(replace(mae, version=3))
+    again = to_mae(network, mae.joints, mae.muscles, 'default', '')
+    assert again.groups == mae.groups
+    assert again.layer_sizes == mae.layer_sizes
+    for (w1, b1), (w2, b2) in zip(again.encoder + again.decoder, mae.encoder + mae.decoder):
+        np.testing.assert_array_equal(w1, w2)
+        np.testing.assert_array_equal(b1, b2)
