@@ -47,6 +47,7 @@ class Preset:
     corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
     least_samples: int  # from how many samples on it learns online
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
+    whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 
 
 DEFAULT = Preset(
@@ -67,6 +68,7 @@ DEFAULT = Preset(
     corrected_body=True,
     least_samples=2,
     equilibrium=True,
+    whitened=True,
 )
 
 PAPER = Preset(
@@ -90,6 +92,7 @@ PAPER = Preset(
     corrected_body=False,
     least_samples=21,  # "from C_thre samples on" is read as: when the count exceeds C_thre = 20
     equilibrium=False,
+    whitened=False,
 )
 
 PRESETS = {preset.name: preset for preset in (DEFAULT, PAPER)}

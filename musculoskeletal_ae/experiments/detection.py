@@ -104,7 +104,7 @@ class Watched(NamedTuple):
 
 def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     """Run estimator and detector over a recording as the node does; nothing is latched."""
-    detector, rows = AnomalyDetector(robot), []
+    detector, rows = AnomalyDetector(robot, preset=mae.preset), []
     detector.use(mae)
     estimated = mae.estimate(recording.tension, recording.length)
     for n, (tension, length) in enumerate(zip(recording.tension, recording.length, strict=True)):

@@ -42,7 +42,8 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         """Declare topics; options are those of Node."""
         super().__init__('estimator', **options)
-        self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
+        self.core = Core(self.robot, self.parameter('preset'))
+        self.plausibility = Plausibility(self.robot)
         self.follow_parameter(
             'anomaly_threshold', partial(setattr, self.core.detector, 'threshold')
         )

@@ -41,7 +41,7 @@ def learn(
 
     `progress` is told the recorded seconds that have passed since it was last told.
     """
-    detector = AnomalyDetector(learner.robot)
+    detector = AnomalyDetector(learner.robot, preset=learner.training.preset.name)
     mae = learner.mae
     detector.use(mae)
     learner.reset()
