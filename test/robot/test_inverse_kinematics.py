@@ -29,8 +29,9 @@ def test_an_estimate_that_explains_the_pose_stays():
 
 
 def test_a_cameras_noise_does_not_turn_joints_anywhere():
-    """As far as solutions that a pull towards the estimate (0.2 rad) keeps: 0.17 rad of 400."""
+    """A search to the end turns them by 0.41 rad; one that is pulled to within 0.2 rad, by 0.17."""
     rng = np.random.default_rng(1)
-    seen = [seen_by_camera(ARM.kinematics.end_effector_pose(theta), rng) for theta in POSTURES]
-    found = [inverse_kinematics(ARM, *known).theta for known in zip(seen, POSTURES, strict=True)]
-    assert np.linalg.norm(np.array(found) - POSTURES, axis=1).max() < 0.2
+    theta = ARM.random_postures(400, rng)
+    seen = [seen_by_camera(ARM.kinematics.end_effector_pose(each), rng) for each in theta]
+    found = [inverse_kinematics(ARM, *known).theta for known in zip(seen, theta, strict=True)]
+    assert np.linalg.norm(np.array(found) - theta, axis=1).max() < 0.2
