@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulated arms driven through a list of commands, and what their sensors said."""
+"""Emulated arms driven in closed loop or by a list of commands, and what their sensors said."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
+from musculoskeletal_ae.control.safety import LENGTH, Muscles
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
@@ -41,6 +46,63 @@ class Motion(NamedTuple):
 
     theta: Array  # [rad], (N, D)
     tension: Array  # [N], (N, M)
+
+
+class ClosedLoop:
+    """An arm, its controller and the estimate, as the nodes connect them.
+
+    sense → estimate → control → command
+    """
+
+    def __init__(
+        self, arm: EmulatedArm, mae: Mae, settings: Settings | None = None, seed: int = 0
+    ) -> None:
+        """Connect an arm where it is; the random seed is that of the exploration."""
+        self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
+        self._read, self._now = arm.sense(), 0.0
+        self.use(mae)
+
+    def use(self, mae: Mae) -> None:
+        """Estimate and control by another network."""
+        self.mae = mae
+        self.core.use(mae)
+
+    def step(self) -> tuple[Array, ...]:
+        """Let a message's time pass; return the columns of a recording."""
+        arm, core, read, now = self.arm, self.core, self._read, self._now
+        with suppress(MessageError):  # which nodes count, and control waits for better ones
+            core.muscles(Muscles(read.length, read.tension, read.temperature), now)
+            core.estimated(self.mae.estimate(read.tension, read.length).theta, now)
+        command = core.step(now)
+        if command is not None:
+            follow = arm.command_length if command.kind == LENGTH else arm.command_tension
+            follow(command.value)
+        arm.step(SAMPLE_TIME)
+        self._read, self._now = arm.sense(), now + SAMPLE_TIME
+        told, sent = self._read, read.length if command is None else command.value
+        return arm.theta, told.theta, told.length, told.tension, sent
+
+    def explore(self) -> tuple[Array, ...]:
+        """Make a step of exploring; what stopped the arm is reset once its cause is gone."""
+        core = self.core
+        if core.safety.cause and not core.reset(self._now):
+            self.stops += 1
+        if not core.safety.cause and not core.posture.exploring:
+            core.explore(True)
+        return self.step()
+
+    def go(self, theta: Array, duration: float) -> None:
+        """Go to θ [rad] (D,) within a time [s].
+
+        Raises:
+            MusculoskeletalError: If the controller stopped on the way.
+        """
+        joints = zip(self.arm.robot.joints, theta.tolist(), strict=True)
+        self.core.target({name: (angle, 0.0) for name, angle in joints})
+        for _ in range(round(duration / SAMPLE_TIME)):
+            self.step()
+        if self.core.safety.cause:
+            raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
 
 
 def record(

@@ -5,13 +5,13 @@
     z = ③(θ_sim, l_sim),  L_sim,2 = w₄‖T‖ + w₅‖l − l_sim‖ + w₇‖θ − θ_fix‖   where joints are forced
     (θ_sim, T_sim) ← f_decode(z) after the descent
 
-l_sim is the length sent, l_target (in the Japanese text: the muscle length sent to the robot); only
-θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle that was sent nothing gives way: its
-l_sim is the length it has. Not printed but kept: θ_sim and T_sim stay within what joints and modules
-can do. That bounds the iteration on any network, and without it tensions fall below T_bias: on a
-minute of individual 0 ‖T_sim − T‖ is then 573 N instead of 220 before learning, 219 N instead of 173
-after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it would be 85 N, and
-0.34 rad instead of 0.49.)
+l_sim is the length sent, l_target (in the Japanese text: the muscle length sent to the robot);
+only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle that was sent nothing gives
+way: its l_sim is the length it has. Not printed but kept: θ_sim and T_sim stay within what joints
+and modules can do. That bounds the iteration on any network, and without it tensions fall below
+T_bias: on a minute of individual 0 ‖T_sim − T‖ is then 573 N instead of 220 before learning, 219
+N instead of 173 after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it
+would be 85 N, and 0.34 rad instead of 0.49.)
 """
 
 from __future__ import annotations
