@@ -25,6 +25,7 @@ from scipy.optimize import curve_fit
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import learned, oracle_errors
 from musculoskeletal_ae.experiments.recording import (
@@ -44,13 +45,16 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.network import Network, to_mae
+from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors, training_states
+from musculoskeletal_ae.mae.units import Mask, State, scale_vector
 from musculoskeletal_ae.presets import PRESETS
 
 CURVE_STRIDE = 10  # of held-out messages, after every update
 FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit
 PRINTED_MINUTES = 10.0
 PRINTED = (0.324, 0.154)  # [rad] the paper's fit at the start and after ten minutes
+NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
 COLOURS = {'paper': plots.PAPER, 'default': plots.AFTER}
 
 #: what is seen of θ [rad] (D,) at the n-th message, with the network of the moment; None if nothing
@@ -102,9 +106,30 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
 
 
 def train_initial(study: Study, preset: str) -> None:
-    """Train a network on the geometric model and keep it."""
-    trained = initial_mae(study.robot, preset, steps=300 if study.quick else None)
+    """Train a network on the geometric model; keep it, and how its errors fell."""
+    robot, rows = study.robot, list[list[float]]()
+    test = training_states(robot, preset, TESTED, np.random.default_rng([0, 2]))
+
+    def note(step: int, _: float, network: Network, batch: Array) -> None:
+        if step % NOTED:
+            return
+        mae = to_mae(network, robot.joints, robot.muscles, preset, '')
+        joints, muscles = robot.joint_count, robot.muscle_count
+        samples = batch.reshape(-1, batch.shape[-1]) / scale_vector(joints, muscles)
+        train = State(*np.split(samples, [joints, -muscles], axis=1))
+        norms = ([each.norm for each in pair_errors(mae, states)] for states in (train, test))
+        rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
+
+    trained = initial_mae(robot, preset, progress=note, steps=300 if study.quick else None)
     checkpoint.save(trained.mae, study.network_file(preset, None))
+    np.save(study.folder / f'{preset}_initial.npy', rows)
+
+
+def beginner(study: Study, arm: EmulatedArm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
+    """Return a learner that begins with the initial network, and the arm that it is to explore."""
+    initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
+    learner = Learner(study.robot, initial, preset, seed, steps=steps)
+    return learner, ClosedLoop(arm, initial, Settings(preset=preset), EXPLORATION_STREAM + seed)
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -113,12 +138,9 @@ def measure(study: Study, seed: int) -> Measured:
     held_out = record(study.arm(seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
     study.keep(seed, held_out=held_out)
     numbers, traces = oracle_errors(study.arm(seed), seed, held_out), {}
-    steps = STEPS // 5 if study.quick else STEPS
     for preset in PRESETS:
         initial = study.network(None, preset)
-        learner = Learner(study.robot, initial, preset, seed, steps=steps)
-        settings = Settings(preset=preset)
-        loop = ClosedLoop(study.arm(seed), initial, settings, EXPLORATION_STREAM + seed)
+        learner, loop = beginner(study, study.arm(seed), seed, preset)
         curve, stream = follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         if learner.training.body is not None:
@@ -177,6 +199,26 @@ def exponential_fit(time: Array, error: Array) -> Array:
     return model(time, *curve_fit(model, time, error, guess, bounds=bounds)[0])
 
 
+def initial_training(study: Study, _: Rows) -> Plot:
+    """Draw each error of both presets over the initial training."""
+    figure, panels = plots.new_figure(12.0, 6.2, 2, 3, sharex='row')
+    for p, (preset, colour) in enumerate(COLOURS.items()):
+        step, *errors = np.load(study.folder / f'{preset}_initial.npy').T
+        for n, (name, unit, *_factor) in enumerate(OUTPUTS):
+            panel = panels[3 * p + n]
+            for label, values, width in (('train', errors[n], 0.7), ('test', errors[3 + n], 1.8)):
+                plots.line(panel, step, values, color=colour, lw=width, label=label)
+            panel.set_yscale('log')
+            title = f'preset {preset}: {name}'
+            plots.tidy(panel, 'mini-batches' if p else '', f'mean norm [{unit}]', title)
+        panels[3 * p].legend(fontsize=9)
+    return figure, (
+        'Errors ‖θ − θ_calc‖, ‖T − T_calc‖ and ‖l − l_calc‖ in initial training, means over the '
+        'three masks: of the mini-batch (thin) and of states of the geometric model that are never '
+        'trained on (bold).'
+    )
+
+
 def online_learning(study: Study, rows: Rows) -> Plot:
     """Draw the running error with its exponential fit, and the held-out error over samples."""
     figure, (left, right) = plots.new_figure(12.0, 5.2, 1, 2, width_ratios=(3, 2))
@@ -231,4 +273,4 @@ ROWS = (
     Row('samples at rest until the error is halved', NOTHING,
         'paper_samples_to_halve', 'samples_to_halve', digits=0),
 )  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (online_learning,), 12.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (online_learning, initial_training), 16.0, ROWS)

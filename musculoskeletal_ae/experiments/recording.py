@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
@@ -23,8 +23,9 @@ SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 #: random streams of the exploration (plus the individual's seed), and of the held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
-#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles
-Script = Callable[[EmulatedArm, float], None]
+#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles,
+#: and says which ones (M,) are switched off, if any are
+Script = Callable[[EmulatedArm, float], Bools | None]
 
 
 class Recording(NamedTuple):
@@ -115,7 +116,8 @@ def record(
     """Drive an arm through the exploration's three steps, as one fixed list of commands.
 
     Each command is `first`'s. `second` needs the tension of the moment, which a fixed list cannot
-    know: the least tension that holds the posture on the geometric model stands in for it.
+    know: the least tension that holds the posture on the geometric model stands in for it. While a
+    muscle is switched off all are commanded tensions: its own is 0 N, the others' as MSC has them.
 
     Args:
         arm: Is moved on from the state it is in.
@@ -126,18 +128,22 @@ def record(
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts where the arm is, so that it does not jump.
-    command = arm.sense().length
-    for step in Exploration(arm.robot, stream) if isinstance(stream, int) else stream:
+    robot, read = arm.robot, arm.sense()
+    command = read.length
+    for step in Exploration(robot, stream) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
-        start, goal = command, first_command(arm.robot, mae, step.theta, step.tension)
+        start, goal = command, first_command(robot, mae, step.theta, step.tension)
         planned += step.duration
         for tick in range(round(step.duration / SAMPLE_TIME)):
-            if script:
-                script(arm, SAMPLE_TIME * len(rows))
+            off = script(arm, SAMPLE_TIME * len(rows)) if script else None
             share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step.duration))
             command = start + share * (goal - start)
-            arm.command_length(command)
+            if off is None:
+                arm.command_length(command)
+            else:
+                pull = np.maximum(0.0, robot.stiffness * (read.length - command))
+                arm.command_tension(np.where(off, 0.0, robot.tension.bias + pull))
             arm.step(SAMPLE_TIME)
             read = arm.sense()
             rows.append((arm.theta, read.theta, read.length, read.tension, command))
