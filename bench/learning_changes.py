@@ -102,7 +102,7 @@ def going_on(learner: Learner, after: Streams, read_at: tuple[float, ...]) -> li
     for minutes in read_at:
         end = round(6000.0 * minutes)
         part = Recording(*(column[begun:end] for column in after.exploring))
-        follow(learner, part, after.held_out)
+        follow(learner, zip(*part, strict=True), after.held_out)
         errors.append(estimation_error(learner.mae, after.held_out))
         begun = end
     return errors
@@ -122,10 +122,11 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
         EmulatedArm(robot, seed, individual), mae, EXPLORATION_STREAM + seed, minutes, held_out
     )
     learner = Learner(robot, mae, seed=seed)
-    follow(learner, *before)
+    follow(learner, zip(*before.exploring, strict=True), before.held_out)
     by_sensor = estimation_error(learner.mae, before.held_out)
     watcher = Learner(robot, mae, seed=seed)
-    follow(watcher, *before, camera(robot, before.exploring, seed))
+    watched = zip(*before.exploring, strict=True)
+    follow(watcher, watched, before.held_out, camera(robot, before.exploring, seed))
     by_camera = estimation_error(watcher.mae, before.held_out)
     initial = estimation_error(mae, before.held_out)
     head = f'individual {seed}, {minutes:g} min: error before {initial:.4f} rad, after: '

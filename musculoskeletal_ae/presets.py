@@ -59,6 +59,7 @@ class Preset:
     corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
     least_samples: int  # from how many samples on it learns online
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
+    whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 
     def grown(self, number: int, groups: Iterable[Group]) -> int:
         """Return a number of steps, or of units of a group's layer, as it is for given groups."""
@@ -89,6 +90,7 @@ DEFAULT = Preset(
     corrected_body=True,
     least_samples=2,
     equilibrium=True,
+    whitened=True,
 )
 
 PAPER = Preset(
@@ -112,6 +114,7 @@ PAPER = Preset(
     corrected_body=False,
     least_samples=21,  # "from C_thre samples on" is read as: when the count exceeds C_thre = 20
     equilibrium=False,
+    whitened=False,
 )
 
 PRESETS = {preset.name: preset for preset in (DEFAULT, PAPER)}

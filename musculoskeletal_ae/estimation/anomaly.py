@@ -17,6 +17,8 @@ Physics needs no statistics: a module holds at least T_bias, so a muscle whose t
 zero while much is commanded has no wire, or a slack one. Slack is wound in by a slow winch, and no
 longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
 ② restores it: slack wire is too long, and what is left of a cut one too short.
+
+Preset `paper` decides on A alone, against the largest that the healthy arm showed.
 """
 
 from __future__ import annotations
@@ -31,10 +33,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLACK, outside_limits
+from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Name of the distance threshold among the thresholds of the checkpoint.
-DISTANCE = 'distance'
+#: Names of the thresholds of d and A among those of the checkpoint.
+DISTANCE, NORM = 'distance', 'norm'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
@@ -57,12 +60,14 @@ class AnomalyDetector:
     A beyond the threshold is an anomaly; with threshold 0 the calibrated detector decides.
     """
 
-    def __init__(self, robot: Robot, settings: Detection | None = None) -> None:
-        self._robot = robot
+    def __init__(
+        self, robot: Robot, settings: Detection | None = None, preset: str = 'default'
+    ) -> None:
+        self._robot, self.whitened = robot, preset_named(preset).whitened
         self.settings = settings or Detection()
         self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
-        self._farthest = np.inf  # d of its threshold, where it is calibrated
+        self._farthest = np.inf  # d, or A, of its threshold, where it is calibrated
         #: [s] without tension, without winding in; l [m] when tension went, when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
         self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
@@ -76,7 +81,8 @@ class AnomalyDetector:
             self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
         self._statistics, self._farthest = mae.anomaly, np.inf
         if mae.anomaly is not None and mae.anomaly.calibrated:
-            self._farthest = mae.anomaly.thresholds.get(DISTANCE, np.inf)
+            name = DISTANCE if self.whitened else NORM
+            self._farthest = mae.anomaly.thresholds.get(name, np.inf)
 
     @property
     def calibrated(self) -> bool:
@@ -107,12 +113,12 @@ class AnomalyDetector:
         muscles = len(tension)
         score = share[:muscles] ** 2 + share[muscles:] ** 2
         dead = self._dead(state.theta, tension, length, dt)
-        if dead is not None:
+        if dead is not None and self.whitened:
             return Verdict(size, distance, dead, 'no tension where the command demands it')
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
-        waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any())
+        waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any() and self.whitened)
         cause = ''
         if self.judges:
             cause = self._beyond_threshold(size, distance, state.theta, slack, waits)
@@ -127,8 +133,9 @@ class AnomalyDetector:
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def limit(self, theta: Array) -> float:
-        """Return the d that no healthy arm reaches at θ [rad] (D,), ∞ while nothing is known."""
-        return self._farthest * float(np.clip(self.unfamiliar(theta), 1.0, WIDEST))
+        """Return the d, or A, that no healthy arm reaches at θ [rad] (D,), ∞ if unknown."""
+        wider = np.clip(self.unfamiliar(theta), 1.0, WIDEST) if self.whitened else 1.0
+        return self._farthest * float(wider)
 
     def _beyond_threshold(
         self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
@@ -137,7 +144,9 @@ class AnomalyDetector:
         if limit <= 0.0:
             if not self.calibrated:
                 return ''
-            limit, value, what = self._farthest, distance, 'd'
+            limit = self._farthest
+            if self.whitened:
+                value, what = distance, 'd'
             if value > limit and not slack.any() and (wider := self.limit(theta)) > limit:
                 limit, where = wider, ' in an unfamiliar posture'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0

@@ -49,10 +49,11 @@ class Estimate(NamedTuple):
 class Estimator:
     """Steps network and detector. `time` is the messages' clock [s], `now` a steady one [s]."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, preset: str = 'default') -> None:
+        """Wait for a network; the preset says what decides that there is an anomaly."""
         self._robot = robot
         self.mae: Mae | None = None  # the network in use
-        self.detector = AnomalyDetector(robot)
+        self.detector = AnomalyDetector(robot, preset=preset)
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
@@ -181,7 +182,8 @@ class Estimator:
                 'suspect muscle': self._suspect or self._robot.muscles[self._verdict.suspect],
             }
             if self.detector.calibrated:
-                values['d limit'] = f'{self.detector.limit(self._theta):.1f}'
+                letter = 'd' if self.detector.whitened else 'A'
+                values[f'{letter} limit'] = f'{self.detector.limit(self._theta):.3g}'
         if self.zeros.offset.any():
             zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
             values['length zeros'] = ', '.join(f'{n} {o:.1f} ± {d:.1f} mm' for n, o, d in zeros)

@@ -7,6 +7,7 @@ Paper. Five random θ_eval, each approached from five random postures, by the ge
 
 Here. The same as in the paper, in closed loop with the estimator and the controller that the nodes
 run, on targets that the true body can hold within [T_bias, T_limit]; read 8 s after the command.
+Starts are reached by moving there, for all methods with `proposed` of the learned network.
 `geometric` is the model’s, the others run on the learned network, `proposed_paper` is the printed
 method on the network of preset paper. QP bound: the least ‖T‖ with which the true body holds
 θ_eval. "Bound reached": the same at the posture where the arm came to rest, as an arm that sags
@@ -22,15 +23,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import proposed
-from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
+from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
@@ -55,33 +54,7 @@ METHODS = {
 APPROACHES = 5  # θ_eval, and starts for each
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
 DURATION = 8.0  # [s]
-
-
-def approach(arm: EmulatedArm, mae: Mae, settings: Settings, start: Array, theta: Array) -> None:
-    """Let an arm go from rest at `start` to θ [rad] (D,), closed as on the real one.
-
-        sense → estimate → control → command
-
-    Raises:
-        MusculoskeletalError: If the controller stopped on the way.
-    """
-    arm.reset(start)
-    core = Controller(arm.robot, settings)
-    core.use(mae)
-    core.target({name: (angle, 0.0) for name, angle in zip(arm.robot.joints, theta.tolist())})
-    now = 0.0
-    for _ in range(round(DURATION / SAMPLE_TIME)):
-        read = arm.sense()
-        core.muscles(Muscles(read.length, read.tension, read.temperature), now)
-        core.estimated(mae.estimate(read.tension, read.length).theta, now)
-        command = core.step(now)
-        if command is not None:
-            follow = arm.command_length if command.kind == LENGTH else arm.command_tension
-            follow(command.value)
-        arm.step(SAMPLE_TIME)
-        now += SAMPLE_TIME
-    if core.safety.cause:
-        raise MusculoskeletalError(f'control stopped: {core.safety.cause}')
+STARTING = 5.0  # [s] to a start
 
 
 class Approaches(NamedTuple):
@@ -109,8 +82,11 @@ def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: in
     for p, (theta, _) in enumerate(held):
         for s, start in enumerate(robot.random_postures(count, rng)):
             for name, (method, preset, _) in METHODS.items():
-                settings = Settings(method=method, preset=preset)
-                approach(arm, networks[preset], settings, start, theta)
+                loop = ClosedLoop(arm, networks['default'])
+                loop.go(start, STARTING)
+                loop.use(networks[preset])
+                loop.core.configure(Settings(method=method, preset=preset))
+                loop.go(theta, DURATION)
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
                 there[name][p, s] = _bound(arm)
@@ -164,7 +140,7 @@ def _causes(smooth: EmulatedArm, mae: Mae, ended: Approaches) -> dict[str, float
         torque = robot.kinematics.holding_torque(theta)
         none = np.full(robot.muscle_count, robot.tension.bias)
         plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
-        approach(smooth, mae, Settings(method='proposed'), 0.5 * (robot.lower + robot.upper), theta)
+        ClosedLoop(smooth, mae).go(theta, DURATION)
         parts = plan.tension, smooth.tension, smooth.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)

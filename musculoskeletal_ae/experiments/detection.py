@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscles cut in turn, what the estimator's detector says of it, and how that is counted."""
+"""Muscles cut or switched off in turn, what the detector says of it, and how that is counted."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from scipy.stats import mannwhitneyu
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.estimation.anomaly import DISTANCE, AnomalyDetector
+from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM, AnomalyDetector
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, columns, rows_between
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 PAYLOAD = 3.6  # [kg], the paper's dumbbell
@@ -33,12 +33,15 @@ class GraspAndCut:
     """Script of the paper's estimation experiment: grasp midway, then cut; here every muscle.
 
     A cut comes when the muscle carries tension; if it never does, it is cut all the same at the end
-    of its wait, and `carried` says so.
+    of its wait, and `carried` says so. Muscles may be switched off instead: the wire is whole, and
+    the module is commanded no tension.
     """
 
-    def __init__(self, robot: Robot, duration: float, seed: int) -> None:
+    def __init__(
+        self, robot: Robot, duration: float, seed: int, switched_off: bool = False
+    ) -> None:
         """Plan a motion of `duration` [s] and the cuts that follow it."""
-        count = robot.muscle_count
+        count, self._switched_off = robot.muscle_count, switched_off
         self.grasp, self._motion = 0.5 * duration, duration  # [s]
         self.duration = duration + SLOT * count  # of everything [s]
         # Messages of the motion without weight, and with it before the first cut.
@@ -67,22 +70,26 @@ class GraspAndCut:
             disturbed[rows_between(cut, cut + CUT_TIME + RECOVERED)] = True
         return disturbed
 
-    def __call__(self, arm: EmulatedArm, time: float) -> None:
+    def __call__(self, arm: EmulatedArm, time: float) -> Bools | None:
         """Grasp, cut or mend, if it is time to; see `recording.Script`."""
         if abs(time - self.grasp) < 0.5 * SAMPLE_TIME:
             arm.set_payload(PAYLOAD)
         now = time + 1e-9
         place = int((now - self._motion) // SLOT)
         if not 0 <= place < len(self.order):
-            return
+            return None
         muscle, elapsed = self.order[place], now - self._motion - SLOT * place
         if np.isnan(self.cut[muscle]):
             carries = arm.tension[muscle] > self._robot.tension.bias[muscle] + CARRYING
             if elapsed >= LATEST_CUT or (carries and elapsed >= self._wait[muscle]):
-                arm.set_ruptured([self._robot.muscles[muscle]])
                 self.cut[muscle], self.carried[muscle] = time, carries
+                if not self._switched_off:
+                    arm.set_ruptured([self._robot.muscles[muscle]])
         elif abs(now - self.cut[muscle] - CUT_TIME) < 0.5 * SAMPLE_TIME:
             arm.set_ruptured([])
+        if self._switched_off and self.cut[muscle] <= now < self.cut[muscle] + CUT_TIME:
+            return np.arange(len(self.cut)) == muscle
+        return None
 
 
 def grasp_and_release(arm: EmulatedArm, time: float) -> None:
@@ -104,7 +111,7 @@ class Watched(NamedTuple):
 
 def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     """Run estimator and detector over a recording as the node does; nothing is latched."""
-    detector, rows = AnomalyDetector(robot), []
+    detector, rows = AnomalyDetector(robot, preset=mae.preset), []
     detector.use(mae)
     estimated = mae.estimate(recording.tension, recording.length)
     for n, (tension, length) in enumerate(zip(recording.tension, recording.length, strict=True)):
@@ -134,9 +141,10 @@ def detection(
             delay[muscle] = SAMPLE_TIME * (at + 1)
             named[muscle] = seen.suspect[rows][at] == muscle
     statistics, counted = mae.anomaly, plan.counted
+    name = DISTANCE if PRESETS[mae.preset].whitened else NORM
     by_muscle = {'carried': plan.carried, 'detected': noticed, 'detection_s': delay, 'named': named}
     return {
-        'threshold': float(statistics.thresholds.get(DISTANCE, 0.0)) if statistics else 0.0,
+        'threshold': float(statistics.thresholds.get(name, 0.0)) if statistics else 0.0,
         'calibrated': bool(statistics and statistics.calibrated),
         'detection_s': float(delay[counted].mean()),
         'detection_worst_s': float(delay[counted].max()),
@@ -154,11 +162,12 @@ def detection(
 
 
 def anomaly_levels(
-    plan: GraspAndCut, watched: Mapping[str, Watched], well: Mapping[str, Watched]
+    plan: GraspAndCut, watched: Mapping[str, Watched], well: Mapping[str, Watched], fault: str
 ) -> dict[str, Any]:
     """Return A and d: the largest of the healthy messages, the smallest level of a cut.
 
-    The level of a cut is the median over the messages between cut and mending.
+    The level of a cut is the median over the messages between cut and mending; `fault` is what keys
+    call it.
     """
     numbers: dict[str, Any] = {}
     for when, prefix in (('before', '_before'), ('after', '')):
@@ -171,34 +180,12 @@ def anomaly_levels(
             values = {
                 'healthy_max': float(calm.max()),
                 'healthy_median': float(np.median(calm)),
-                'ruptured_min': min(levels[m] for m in plan.counted),
-                'ruptured': levels,
-                'auroc': auroc(calm, faulty),
+                f'{fault}_min': min(levels[m] for m in plan.counted),
+                fault: levels,
+                f'{fault}_auroc': auroc(calm, faulty),
             }
             numbers |= {f'{letter}{prefix}_{key}': value for key, value in values.items()}
-    numbers['auroc'] = numbers['d_auroc']
     return numbers
-
-
-def slack_auroc(robot: Robot, mae: Mae, taken: Recording, plan: GraspAndCut) -> float:
-    """Return how well A tells a muscle switched off from healthy messages, as AUROC.
-
-    The paper switches a muscle off, so that it goes slack while l follows the joints on; here cut
-    wires let the module wind in, which no network can overlook. So what the paper did is judged
-    on messages of the loaded motion in which one muscle's tension is replaced by none.
-    """
-
-    def size(tension: Array, length: Array) -> Array:
-        return anomaly(residuals(mae.estimate(tension, length), tension, length))
-
-    part = taken.part(slice(plan.loaded.start, plan.loaded.stop, 10))
-    slack = []
-    for muscle in range(robot.muscle_count):
-        carried = part.tension[:, muscle] > robot.tension.bias[muscle] + CARRYING
-        off = part.tension[carried]
-        off[:, muscle] = 0.0
-        slack.append(size(off, part.length[carried]))
-    return auroc(size(part.tension, part.length), np.concatenate(slack))
 
 
 def begins(alarm: Bools) -> Bools:

@@ -5,30 +5,36 @@ Paper. Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s r
 T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from 0.324 to
 0.154 rad.
 
-Here. The initial network knows the geometric model only. One stream of sensor messages of each
-individual, commanded by the initial default network, feeds both presets. The held-out motion
-follows one fixed list of commands from a random stream that is never used for learning; its error
-is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all joints,
-with the true angles of the emulator. Oracle: weighted least squares on one message with the true
-routes, elastic constants and noise, friction taken as zero.
+Here. The initial network knows the geometric model only. Each preset explores by itself, as the
+nodes do: in closed loop through estimate and controller, with the network that is being learned.
+Both go to the same random postures; "same stream" is preset paper taught by the messages of the
+default one’s exploration. All are judged on one held-out motion, which follows a fixed list of
+commands from a random stream that is never used for learning; its error is the mean over all
+messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all joints, with the true angles of
+the emulator. Oracle: weighted least squares on one message with the true routes, elastic constants
+and noise, friction taken as zero.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import curve_fit
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import learned, oracle_errors
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
     SAMPLE_TIME,
+    ClosedLoop,
     Recording,
+    columns,
     estimation_error,
     record,
     times,
@@ -39,13 +45,16 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.network import Network, to_mae
+from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors, training_states
+from musculoskeletal_ae.mae.units import Mask, State, scale_vector
 from musculoskeletal_ae.presets import PRESETS
 
 CURVE_STRIDE = 10  # of held-out messages, after every update
 FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit
 PRINTED_MINUTES = 10.0
 PRINTED = (0.324, 0.154)  # [rad] the paper's fit at the start and after ten minutes
+NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
 COLOURS = {'paper': plots.PAPER, 'default': plots.AFTER}
 
 #: what is seen of θ [rad] (D,) at the n-th message, with the network of the moment; None if nothing
@@ -61,55 +70,89 @@ class Curve(NamedTuple):
 
 
 def follow(
-    learner: Learner, stream: Recording, held_out: Recording, see: See | None = None
-) -> Curve:
-    """Feed a recorded stream to a learner, as the node would, and judge it on the held-out motion.
+    learner: Learner,
+    stream: Iterable[tuple[Array, ...]],
+    held_out: Recording,
+    see: See | None = None,
+) -> tuple[Curve, Recording]:
+    """Feed messages to a learner, as the node would, and judge it on the held-out motion.
 
-    θ comes from `see`; from the joint sensors by default.
+    They come one by one, rows of a recording, which is returned too; θ comes from `see`, from the
+    joint sensors by default.
     """
-    mae, start, end = learner.mae, 0, len(stream.theta)
-    samples = [len(learner.samples)]
-    errors = [estimation_error(mae, held_out, CURVE_STRIDE)]
-    running = np.empty(end)
-    for n in range(end):
-        theta = stream.theta_sensor[n] if see is None else see(n, mae)
-        learner.step(n * SAMPLE_TIME, theta, stream.tension[n], stream.length[n])
-        if learner.mae is not mae or n == end - 1:
-            part = slice(start, n + 1)
-            estimate = mae.estimate(stream.tension[part], stream.length[part]).theta
-            running[part] = np.linalg.norm(estimate - stream.theta_sensor[part], axis=1)
-            start, mae = n + 1, learner.mae
+    samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
+    errors, mae = list[float](), None
+    for n, row in enumerate(stream):
+        if learner.mae is not mae:
+            mae = learner.mae
             samples.append(len(learner.samples))
             errors.append(estimation_error(mae, held_out, CURVE_STRIDE))
-    return Curve(samples, errors, running)
+        _, sensor, length, tension, _ = row
+        running.append(float(np.linalg.norm(mae.estimate(tension, length).theta - sensor)))
+        theta = sensor if see is None else see(n, mae)
+        learner.step(n * SAMPLE_TIME, theta, tension, length)
+        rows.append(row)
+    samples.append(len(learner.samples))
+    errors.append(estimation_error(learner.mae, held_out, CURVE_STRIDE))
+    return Curve(samples, errors, np.array(running)), Recording(*columns(rows))
+
+
+def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
+    """Yield messages of an arm that explores for so long [s] with what the learner has learned."""
+    for _ in range(round(duration / SAMPLE_TIME)):
+        if learner.mae is not loop.mae:
+            loop.use(learner.mae)
+        yield loop.explore()
 
 
 def train_initial(study: Study, preset: str) -> None:
-    """Train a network on the geometric model and keep it."""
-    trained = initial_mae(study.robot, preset, steps=300 if study.quick else None)
+    """Train a network on the geometric model; keep it, and how its errors fell."""
+    robot, rows = study.robot, list[list[float]]()
+    test = training_states(robot, preset, TESTED, np.random.default_rng([0, 2]))
+
+    def note(step: int, _: float, network: Network, batch: Array) -> None:
+        if step % NOTED:
+            return
+        mae = to_mae(network, robot.joints, robot.muscles, preset, '')
+        joints, muscles = robot.joint_count, robot.muscle_count
+        samples = batch.reshape(-1, batch.shape[-1]) / scale_vector(joints, muscles)
+        train = State(*np.split(samples, [joints, -muscles], axis=1))
+        norms = ([each.norm for each in pair_errors(mae, states)] for states in (train, test))
+        rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
+
+    trained = initial_mae(robot, preset, progress=note, steps=300 if study.quick else None)
     checkpoint.save(trained.mae, study.network_file(preset, None))
+    np.save(study.folder / f'{preset}_initial.npy', rows)
+
+
+def beginner(study: Study, arm: EmulatedArm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
+    """Return a learner that begins with the initial network, and the arm that it is to explore."""
+    initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
+    learner = Learner(study.robot, initial, preset, seed, steps=steps)
+    return learner, ClosedLoop(arm, initial, Settings(preset=preset), EXPLORATION_STREAM + seed)
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Record an individual, learn of it with both presets, and keep all."""
-    driven_by, stream = study.network(None, 'default'), EXPLORATION_STREAM + seed
-    exploring = record(study.arm(seed), driven_by, stream, 60.0 * study.minutes)
+    """Let an individual explore and learn with both presets, and keep all."""
+    driven_by = study.network(None, 'default')
     held_out = record(study.arm(seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
-    study.keep(seed, exploring=exploring, held_out=held_out)
+    study.keep(seed, held_out=held_out)
     numbers, traces = oracle_errors(study.arm(seed), seed, held_out), {}
-    steps = STEPS // 5 if study.quick else STEPS
     for preset in PRESETS:
         initial = study.network(None, preset)
-        learner = Learner(study.robot, initial, preset, seed, steps=steps)
-        curve = follow(learner, exploring, held_out)
+        learner, loop = beginner(study, study.arm(seed), seed, preset)
+        curve, stream = follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         if learner.training.body is not None:
-            study.keep(seed, rests=_rests(learner))
+            study.keep(seed, exploring=stream, rests=_rests(learner))
             body = learned(study.robot, learner.training.body)
             numbers = {'body_rad': body.error(held_out), **numbers}
-        values = _numbers(curve, learner, initial, held_out)
+        values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
+    pupil = Learner(study.robot, study.network(None, 'paper'), 'paper', seed)
+    follow(pupil, zip(*study.stream(seed, 'exploring'), strict=True), held_out)
+    numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
     return Measured(numbers, traces)
 
 
@@ -154,6 +197,26 @@ def exponential_fit(time: Array, error: Array) -> Array:
     guess = float(last.mean()), float(first.mean()), span / 5.0
     bounds = [0.0, 0.0, 1.0], [10.0, 10.0, 10.0 * span]
     return model(time, *curve_fit(model, time, error, guess, bounds=bounds)[0])
+
+
+def initial_training(study: Study, _: Rows) -> Plot:
+    """Draw each error of both presets over the initial training."""
+    figure, panels = plots.new_figure(12.0, 6.2, 2, 3, sharex='row')
+    for p, (preset, colour) in enumerate(COLOURS.items()):
+        step, *errors = np.load(study.folder / f'{preset}_initial.npy').T
+        for n, (name, unit, *_factor) in enumerate(OUTPUTS):
+            panel = panels[3 * p + n]
+            for label, values, width in (('train', errors[n], 0.7), ('test', errors[3 + n], 1.8)):
+                plots.line(panel, step, values, color=colour, lw=width, label=label)
+            panel.set_yscale('log')
+            title = f'preset {preset}: {name}'
+            plots.tidy(panel, 'mini-batches' if p else '', f'mean norm [{unit}]', title)
+        panels[3 * p].legend(fontsize=9)
+    return figure, (
+        'Errors ‖θ − θ_calc‖, ‖T − T_calc‖ and ‖l − l_calc‖ in initial training, means over the '
+        'three masks: of the mini-batch (thin) and of states of the geometric model that are never '
+        'trained on (bold).'
+    )
 
 
 def online_learning(study: Study, rows: Rows) -> Plot:
@@ -210,4 +273,4 @@ ROWS = (
     Row('samples at rest until the error is halved', NOTHING,
         'paper_samples_to_halve', 'samples_to_halve', digits=0),
 )  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (online_learning,), 12.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (online_learning, initial_training), 16.0, ROWS)

@@ -1,25 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulated arms driven through a list of commands, and what their sensors said."""
+"""Emulated arms driven in closed loop or by a list of commands, and what their sensors said."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
+from musculoskeletal_ae.control.safety import LENGTH, Muscles
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 #: random streams of the exploration (plus the individual's seed), and of the held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
-#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles
-Script = Callable[[EmulatedArm, float], None]
+#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles,
+#: and says which ones (M,) are switched off, if any are
+Script = Callable[[EmulatedArm, float], Bools | None]
 
 
 class Recording(NamedTuple):
@@ -43,6 +49,63 @@ class Motion(NamedTuple):
     tension: Array  # [N], (N, M)
 
 
+class ClosedLoop:
+    """An arm, its controller and the estimate, as the nodes connect them.
+
+    sense → estimate → control → command
+    """
+
+    def __init__(
+        self, arm: EmulatedArm, mae: Mae, settings: Settings | None = None, seed: int = 0
+    ) -> None:
+        """Connect an arm where it is; the random seed is that of the exploration."""
+        self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
+        self._read, self._now = arm.sense(), 0.0
+        self.use(mae)
+
+    def use(self, mae: Mae) -> None:
+        """Estimate and control by another network."""
+        self.mae = mae
+        self.core.use(mae)
+
+    def step(self) -> tuple[Array, ...]:
+        """Let a message's time pass; return the columns of a recording."""
+        arm, core, read, now = self.arm, self.core, self._read, self._now
+        with suppress(MessageError):  # which nodes count, and control waits for better ones
+            core.muscles(Muscles(read.length, read.tension, read.temperature), now)
+            core.estimated(self.mae.estimate(read.tension, read.length).theta, now)
+        command = core.step(now)
+        if command is not None:
+            follow = arm.command_length if command.kind == LENGTH else arm.command_tension
+            follow(command.value)
+        arm.step(SAMPLE_TIME)
+        self._read, self._now = arm.sense(), now + SAMPLE_TIME
+        told, sent = self._read, read.length if command is None else command.value
+        return arm.theta, told.theta, told.length, told.tension, sent
+
+    def explore(self) -> tuple[Array, ...]:
+        """Make a step of exploring; what stopped the arm is reset once its cause is gone."""
+        core = self.core
+        if core.safety.cause and not core.reset(self._now):
+            self.stops += 1
+        if not core.safety.cause and not core.posture.exploring:
+            core.explore(True)
+        return self.step()
+
+    def go(self, theta: Array, duration: float) -> None:
+        """Go to θ [rad] (D,) within a time [s].
+
+        Raises:
+            MusculoskeletalError: If the controller stopped on the way.
+        """
+        joints = zip(self.arm.robot.joints, theta.tolist(), strict=True)
+        self.core.target({name: (angle, 0.0) for name, angle in joints})
+        for _ in range(round(duration / SAMPLE_TIME)):
+            self.step()
+        if self.core.safety.cause:
+            raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
+
+
 def record(
     arm: EmulatedArm,
     mae: Mae,
@@ -53,7 +116,8 @@ def record(
     """Drive an arm through the exploration's three steps, as one fixed list of commands.
 
     Each command is `first`'s. `second` needs the tension of the moment, which a fixed list cannot
-    know: the least tension that holds the posture on the geometric model stands in for it.
+    know: the least tension that holds the posture on the geometric model stands in for it. While a
+    muscle is switched off all are commanded tensions: its own is 0 N, the others' as MSC has them.
 
     Args:
         arm: Is moved on from the state it is in.
@@ -64,18 +128,22 @@ def record(
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts where the arm is, so that it does not jump.
-    command = arm.sense().length
-    for step in Exploration(arm.robot, stream) if isinstance(stream, int) else stream:
+    robot, read = arm.robot, arm.sense()
+    command = read.length
+    for step in Exploration(robot, stream) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
-        start, goal = command, first_command(arm.robot, mae, step.theta, step.tension)
+        start, goal = command, first_command(robot, mae, step.theta, step.tension)
         planned += step.duration
         for tick in range(round(step.duration / SAMPLE_TIME)):
-            if script:
-                script(arm, SAMPLE_TIME * len(rows))
+            off = script(arm, SAMPLE_TIME * len(rows)) if script else None
             share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step.duration))
             command = start + share * (goal - start)
-            arm.command_length(command)
+            if off is None:
+                arm.command_length(command)
+            else:
+                pull = np.maximum(0.0, robot.stiffness * (read.length - command))
+                arm.command_tension(np.where(off, 0.0, robot.tension.bias + pull))
             arm.step(SAMPLE_TIME)
             read = arm.sense()
             rows.append((arm.theta, read.theta, read.length, read.tension, command))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
@@ -141,7 +141,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     )
     thresholds = {
         DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
-        'norm': float(anomaly(error[sound]).max()),
+        NORM: float(anomaly(error[sound]).max()),
     }
     return replace(
         statistics, thresholds=thresholds, postures=_spread_out(state.theta[sound], POSTURES)

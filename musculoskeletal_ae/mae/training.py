@@ -46,8 +46,8 @@ TINY = 1e-12
 LEAST_SPREAD = 1e-4
 UNSEEN_STATES = 5000  # of the geometric model, for the residuals a new network starts with
 
-#: told (step, loss) after every mini-batch
-Progress = Callable[[int, float], None]
+#: told (step, loss, network, mini-batch) after every one
+Progress = Callable[[int, float, Network, Array], None]
 
 # -- samples -----------------------------------------------------------------------------------
 
@@ -68,6 +68,13 @@ def random_states(
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
     return State(theta, tension, robot.muscle_lengths(theta, tension))
+
+
+def training_states(robot: Robot, preset: str, count: int, rng: np.random.Generator) -> State:
+    """Return random states as a preset trains on."""
+    if preset_named(preset).network.standardise:
+        return overload_states(robot, count, rng)
+    return random_states(robot, count, rng, robot.tension.max)
 
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
@@ -149,7 +156,8 @@ def fit(
     losses = []
     with one_thread():
         for step in range(settings.steps):
-            values = torch.as_tensor(next(batches), dtype=torch.float32)
+            batch = next(batches)
+            values = torch.as_tensor(batch, dtype=torch.float32)
             twin = values[:, 1] if values.ndim == 3 else values[:0]  # (N or 0, D+2M)
             rows = values[:, 0] if values.ndim == 3 else values  # (N, D+2M)
             if settings.every_mask:
@@ -163,7 +171,7 @@ def fit(
             optimiser.step(annealing(step / settings.steps) if settings.annealed else 1.0)
             losses.append(value.item())
             if progress is not None:
-                progress(step, losses[-1])
+                progress(step, losses[-1], network, batch)
     return losses
 
 
@@ -207,11 +215,10 @@ def initial_mae(
     count = chosen.grown(chosen.training.steps, robot.groups) if steps is None else steps
     settings = replace(chosen.training, steps=count)
     rng = np.random.default_rng(seed)
+    samples = training_states(robot, preset, settings.samples, rng).scaled()
     if chosen.network.standardise:
-        samples = overload_states(robot, settings.samples, rng).scaled()
         mean, std = samples.mean(axis=0), np.maximum(samples.std(axis=0), LEAST_SPREAD)
     else:
-        samples = random_states(robot, settings.samples, rng, robot.tension.max).scaled()
         mean, std = np.zeros(samples.shape[1]), np.ones(samples.shape[1])
     if settings.slope_weight > 0.0:
         samples = with_twins(robot, samples, std, rng)

@@ -47,7 +47,8 @@ class Estimator(Shell):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
-        self.core, self.plausibility = Core(self.robot), Plausibility(self.robot)
+        self.core = Core(self.robot, self.parameter('preset'))
+        self.plausibility = Plausibility(self.robot)
         self.joints = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscles = self.create_publisher(Float64MultiArray, 'estimated_muscle_states', RELIABLE)
         self.anomaly = self.create_publisher(Float64, 'anomaly', RELIABLE)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint angles from the pose of the end effector, started from an estimate.
 
-    min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R² + ‖θ − θ_est‖²/σ_θ²,   lower ≤ θ ≤ upper
+    θ = IK(P_marker, θ_initial = θ_est):  min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R²
 
-by damped least squares (Levenberg–Marquardt) over pinocchio's Jacobian. Where the pose says little
-about a joint (near a singular posture), a camera's noise would turn it anywhere; the estimate,
-taken as known to σ_θ, keeps it. A robot without joint sensors is watched by a camera
-(paper, section "Musculoskeletal Humanoids"): this is how its θ gets into online learning.
+(paper, section "Musculoskeletal Humanoids") in the joint limits, by damped least squares
+(Levenberg–Marquardt) over pinocchio's Jacobian. Nothing pulls θ towards the estimate, but where the
+pose says little about a joint (near a singular posture), a camera's noise would turn it anywhere;
+so no step is free of damping, and the search ends once a step gains less than the noise amounts to.
+A robot without joint sensors is watched by a camera: this is how its θ gets into online learning.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from musculoskeletal_ae.robot.robot import Robot
 # How far the pose of a usual camera's marker can be trusted: σ_p [m], σ_R [rad].
 SPREADS = np.repeat([0.002, 0.01], 3)
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)  # however the hand is turned
-ESTIMATE_SPREAD = 0.2  # σ_θ [rad]
 ITERATIONS = 30
-LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
-SMALL_STEP = 1e-6  # [rad]
+LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6  # shares of JᵀJ
+STEP_SPREAD = 0.1  # [rad] of a joint of which the pose says nothing: damping of any step
+LEAST_GAIN = 1.0  # of the sum above
 
 
 class Posture(NamedTuple):
@@ -46,35 +47,34 @@ def inverse_kinematics(
     """
     kin, lower, upper = robot.kinematics, robot.lower, robot.upper
     theta, damping = np.clip(start, lower, upper), 1e-2
-    error = _error(robot, pose, theta, start, spreads)
-    prior = np.eye(len(theta)) / ESTIMATE_SPREAD
+    error = _error(robot, pose, theta, spreads)
     for _ in range(ITERATIONS):
-        jacobian = np.vstack([kin.end_effector_jacobian(theta) / spreads[:, None], prior])
+        jacobian = kin.end_effector_jacobian(theta) / spreads[:, None]
         # At a limit, a joint that wants to go beyond is held.
         gradient = jacobian.T @ error
         held = (theta <= lower) & (gradient < 0.0) | (theta >= upper) & (gradient > 0.0)
         jacobian[:, held] = 0.0
         normal = jacobian.T @ jacobian
-        scale = damping * np.maximum(np.diag(normal), 1e-3 * np.diag(normal).max() + 1e-12)
-        step = np.linalg.solve(normal + np.diag(scale), jacobian.T @ error)
+        scale = damping * np.maximum(np.diag(normal), 1e-3 * np.diag(normal).max())
+        step = np.linalg.solve(normal + np.diag(scale + STEP_SPREAD**-2), jacobian.T @ error)
         tried = np.clip(theta + step, lower, upper)
-        tried_error = _error(robot, pose, tried, start, spreads)
-        if tried_error @ tried_error < error @ error:
-            moved = np.abs(tried - theta).max()
+        tried_error = _error(robot, pose, tried, spreads)
+        gain = error @ error - tried_error @ tried_error
+        if gain > 0.0:
             theta, error, damping = tried, tried_error, max(0.2 * damping, LEAST_DAMPING)
-            if moved < SMALL_STEP:
+            if gain < LEAST_GAIN:
                 break
         else:
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
-    left = error[:6] * spreads
+    left = error * spreads
     return Posture(theta, float(np.linalg.norm(left[:3])), float(np.linalg.norm(left[3:])))
 
 
-def _error(robot: Robot, pose: pin.SE3, theta: Array, start: Array, spreads: Array) -> Array:
-    """Return what is missing in position, orientation and to the estimate, weighted, (6+D,)."""
+def _error(robot: Robot, pose: pin.SE3, theta: Array, spreads: Array) -> Array:
+    """Return what is missing in position and orientation, weighted, (6,)."""
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
-    missing = np.concatenate([pose.translation - here.translation, turn]) / spreads
-    return np.concatenate([missing, (start - theta) / ESTIMATE_SPREAD])
+    missing: Array = np.concatenate([pose.translation - here.translation, turn]) / spreads
+    return missing

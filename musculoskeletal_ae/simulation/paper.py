@@ -5,10 +5,13 @@
     z = ③(θ_sim, l_sim),  L_sim,2 = w₄‖T‖ + w₅‖l − l_sim‖ + w₇‖θ − θ_fix‖   where joints are forced
     (θ_sim, T_sim) ← f_decode(z) after the descent
 
-The paper leaves open what l_sim is. Here it is what the modules make of the command: the length at
-which MSC carries T_sim, l_sim = l_target − l_comp(T_sim); a muscle that MSC holds at T_bias may be
-shorter. τ_target = g(θ_sim) − JᵀF. The result is clipped to what joints and modules can do, which
-the print does not say; without it nothing bounds the iteration.
+l_sim is the length sent, l_target (in the Japanese text: the muscle length sent to the robot);
+only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle that was sent nothing gives
+way: its l_sim is the length it has. Not printed but kept: θ_sim and T_sim stay within what joints
+and modules can do. That bounds the iteration on any network, and without it tensions fall below
+T_bias: on a minute of individual 0 ‖T_sim − T‖ is then 573 N instead of 220 before learning, 219
+N instead of 173 after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it
+would be 85 N, and 0.34 rad instead of 0.49.)
 """
 
 from __future__ import annotations
@@ -16,7 +19,6 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
@@ -43,18 +45,15 @@ class PaperDescent:
         fixed: Array | None = None,
     ) -> ArmState:
         """Return the arms after one descent each."""
-        bias = self._robot.tension.bias
         load, _ = self._load(state.theta, wrench)
-        length = command - msc_compensation(self._robot, np.maximum(state.tension, bias))
-        slack = (state.tension <= bias) | (command == PAID_OUT)
-        length = np.where(slack, np.minimum(length, state.length), length)
+        length = np.where(command == PAID_OUT, state.length, command)
         # A bound that no command in its senses meets: no muscle is wound in by its whole length.
         whole = self._robot.routes.length_at_zero
         length = np.clip(length, -whole, whole)
         forced = np.full_like(state.theta, np.nan) if fixed is None else fixed
         arms = zip(state.theta, state.tension, length, load, forced, strict=True)
         theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
-        return ArmState(theta, tension, reached, command, np.zeros_like(theta))
+        return ArmState(theta, tension, reached, length, np.zeros_like(theta))
 
     def _descend(
         self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array

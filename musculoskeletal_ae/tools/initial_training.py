@@ -57,7 +57,7 @@ def train(args: Namespace) -> None:
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
 
-        def progress(step: int, loss: float) -> None:
+        def progress(step: int, loss: float, *_: object) -> None:
             bar.update()
             if step % 100 == 0:
                 bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
@@ -113,7 +113,7 @@ def learn(
 
     `progress` is told the recorded seconds that have passed since it was last told.
     """
-    detector = AnomalyDetector(learner.robot)
+    detector = AnomalyDetector(learner.robot, preset=learner.training.preset.name)
     mae = learner.mae
     detector.use(mae)
     learner.reset()

@@ -11,6 +11,7 @@ from musculoskeletal_ae.estimation.anomaly import (
     DEAD_TIME,
     DISTANCE,
     IN_A_ROW,
+    NORM,
     AnomalyDetector,
 )
 from musculoskeletal_ae.estimation.settings import Detection
@@ -22,8 +23,8 @@ DT = 0.01
 def judge(robot):
     """Return a function that shows a detector with a network a message so many times."""
 
-    def make(mae, threshold=0.0):
-        detector = AnomalyDetector(robot, Detection(threshold))
+    def make(mae, threshold=0.0, preset='default'):
+        detector = AnomalyDetector(robot, Detection(threshold), preset)
         detector.use(mae)
 
         def verdicts(message, times=1):
@@ -121,3 +122,19 @@ def test_far_from_what_was_calibrated_less_is_sure_but_not_of_a_slack_muscle(
     detector, verdicts = judge(replace(calibrated, anomaly=statistics))
     assert (detector.unfamiliar(state.theta) > 1.0) == bool(away)
     assert any(verdict.cause for verdict in verdicts(message, IN_A_ROW)) == found
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
+    calibrated, judge, healthy, wound, slack, known
+):
+    largest = judge(calibrated)[1](healthy)[0].anomaly
+    statistics = replace(calibrated.anomaly, thresholds={NORM: largest}, calibrated=known)
+    detector, verdicts = judge(replace(calibrated, anomaly=statistics), preset='paper')
+    detector.commanded(tension=np.full(6, 60.0))
+    judged = verdicts(wound, IN_A_ROW)[-1]
+    assert judged.cause.startswith('A = ') if known else not judged.cause
+    detector.reset()
+    assert not any(verdict.cause for verdict in verdicts(healthy, IN_A_ROW))
+    detector.threshold = 1e6  # as large as no A is: no physics comes to its aid
+    assert not any(verdict.cause for verdict in verdicts(slack, round(2 * DEAD_TIME / DT)))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.detection import (
     CARRYING,
     CUT_TIME,
@@ -19,13 +20,14 @@ from musculoskeletal_ae.experiments.detection import (
     detection,
     grasp_and_release,
 )
+from musculoskeletal_ae.experiments.recording import record
 
 
 class Fake:
     """Records what a script does to an arm whose muscles all pull alike."""
 
     def __init__(self, robot, tension):
-        self.time, self.done = 0.0, []
+        self.time, self.done, self.off = 0.0, [], []
         self.tension = np.full(robot.muscle_count, tension)
 
     def set_payload(self, mass):
@@ -37,7 +39,8 @@ class Fake:
     def follow(self, script, duration):
         for tick in range(round(duration / 0.01)):
             self.time = 0.01 * tick
-            script(self, self.time)
+            off = script(self, self.time)
+            self.off.append(np.zeros(len(self.tension), dtype=bool) if off is None else off)
 
 
 def test_grasp_comes_midway_and_every_muscle_is_cut_once_and_mended(arm26):
@@ -61,6 +64,28 @@ def test_a_muscle_that_never_carries_tension_is_cut_at_the_end_of_its_wait(arm26
     assert not plan.carried.any()
     np.testing.assert_allclose((plan.cut - 4.0) % SLOT, LATEST_CUT, atol=0.011)
     assert plan.counted.tolist() == list(range(arm26.muscle_count))  # rather all than none
+
+
+def test_a_muscle_that_is_switched_off_keeps_its_wire_and_is_commanded_no_tension(arm26):
+    plan = GraspAndCut(arm26, 4.0, seed=0, switched_off=True)
+    arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
+    arm.follow(plan, plan.duration)
+    assert not any(what for _, what in arm.done if isinstance(what, tuple))
+    off = np.array(arm.off)
+    np.testing.assert_allclose(0.01 * off.sum(axis=0), CUT_TIME, atol=0.02)
+    assert off.sum(axis=1).max() == 1
+
+
+def test_on_the_arm_a_switched_off_muscle_goes_slack_and_the_others_hold(arm26, networks):
+    def script(_, time):
+        return np.arange(6) == 1 if time >= 6.0 else None
+
+    taken = record(EmulatedArm(arm26, 3), networks['default'], 7, 7.0, script)
+    before, after = taken.tension[590:600], taken.tension[690:700]
+    assert after[:, 1].max() < 0.1 * arm26.tension.bias[1] < before[:, 1].min()
+    others = np.arange(6) != 1
+    assert (after[:, others] > 0.5 * arm26.tension.bias[others]).all()
+    assert np.abs(taken.length[-1] - taken.length[599]).max() < 0.05  # nothing winds in
 
 
 def test_the_weight_is_grasped_and_released_every_minute(arm26):

@@ -8,13 +8,20 @@ import math
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.experiments.online_learning import (
     Curve,
     exponential_fit,
     measure,
     samples_to_halve,
 )
-from musculoskeletal_ae.experiments.recording import HELD_OUT_STREAM, record
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    ClosedLoop,
+    record,
+)
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.presets import PRESETS
@@ -42,12 +49,24 @@ def test_the_same_seed_gives_the_same_numbers_and_networks(twice):
             np.testing.assert_array_equal(*weights)
 
 
-def test_both_presets_learn_and_from_the_same_stream(twice):
+def test_both_presets_learn_each_from_its_own_exploration(twice):
     (study, measured), _ = twice
-    assert measured.numbers['samples'] == measured.numbers['paper_samples'] > 0
+    assert min(measured.numbers[f'{prefix}samples'] for prefix in ('', 'paper_')) > 0
     assert measured.numbers['updates'] > 0
     changed = study.network(0).decoder[0][0] - study.network(None).decoder[0][0]
     assert np.abs(changed).max() > 0.0
+
+
+def test_exploration_goes_through_the_controller_with_the_network_being_learned(twice):
+    """No command leaps, and its goals are those of networks that have learned on the way."""
+    (study, _), _ = twice
+    taken = study.stream(0, 'exploring')
+    step = np.abs(np.diff(taken.command, axis=0)).max()
+    assert 0.0 < step <= Settings().rate_limit * SAMPLE_TIME + 1e-9
+    driven = ClosedLoop(study.arm(0), study.network(None), seed=EXPLORATION_STREAM)
+    fixed = np.array([driven.explore()[-1] for _ in taken.command])
+    apart = np.abs(fixed - taken.command).max(axis=1)
+    assert apart[0] == 0.0 and apart[-1] > 1e-4
 
 
 def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice):

@@ -132,7 +132,7 @@ def test_training_goes_on_from_given_weights(robot, trained):
     before = trained['paper']
     network = from_mae(before)
     seen: list[int] = []
-    losses = fit(network, batches, settings, progress=lambda step, _: seen.append(step))
+    losses = fit(network, batches, settings, progress=lambda step, *_: seen.append(step))
     after = to_mae(network, robot.joints, robot.muscles, 'paper', 'more')
     states = random_states(robot, 500, rng, 200.0)
     assert seen == list(range(200)) and len(losses) == 200

@@ -16,3 +16,15 @@ def test_it_goes_towards_forced_postures(trained):
     state = arms.step(1.0)
     assert abs(state.theta[0, 1] + 1.2) < 0.1 * before  # at most 0.02 over five seeds
     assert np.all((state.theta >= robot.lower) & (state.theta <= robot.upper))
+
+
+def test_l_sim_is_the_length_sent_whatever_muscle_stiffness_control_makes_of_it(trained):
+    """Where nothing is forced, w₅ outweighs the others: l goes to what was sent, not beyond it."""
+    robot = Robot.load('arm26')
+    arms = Simulation(robot, trained['paper'], 'paper')
+    resting = arms.step(0.2).length[0]
+    sent = robot.muscle_lengths(np.array([0.4, -1.0]), np.full(6, 60.0))
+    arms.command[0] = sent
+    reached = arms.step(1.0).length[0]
+    np.testing.assert_array_equal(arms.state.followed[0], sent)
+    assert np.linalg.norm(reached - sent) < 0.3 * np.linalg.norm(resting - sent)
