@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import LENGTH_NOISE, TENSION_NOISE, EmulatedArm
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.robot.robot import Robot

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.emulator import mechanics
+from musculoskeletal_ae.emulator import mechanics, modules
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -132,7 +133,7 @@ def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot):
     drive(arm, command, 0.1)
     read = arm.sense()
     assert read.tension[1] == 0.0
-    assert before[1] - read.length[1] == pytest.approx(0.1 * mechanics.SPEED_LIMIT, abs=1e-3)
+    assert before[1] - read.length[1] == pytest.approx(0.1 * SPEED_LIMIT, abs=1e-3)
     drive(arm, command, 3.0)
     limit = arm.sense().length[1]
     drive(arm, command, 0.5)
@@ -156,18 +157,18 @@ def test_heat_settles_where_the_two_resistors_say(robot):
     arm = nominal_arm(robot)
     muscle = arm._muscle
     for _ in range(20):  # the housing's time constant is minutes: start it near its end
-        muscle.housing[:] = mechanics.AMBIENT + mechanics.HOUSING_RESISTANCE * (
-            mechanics.LOSS * muscle.tension**2
+        muscle.housing[:] = modules.AMBIENT + modules.HOUSING_RESISTANCE * (
+            modules.LOSS * muscle.tension**2
         )
         arm.command_tension(np.full(robot.muscle_count, 100.0))
         for _ in range(20):
             arm.command_tension(np.full(robot.muscle_count, 100.0))
             arm.step(0.4)
-    heat = mechanics.LOSS * 100.0**2
-    housing = mechanics.AMBIENT + heat * mechanics.HOUSING_RESISTANCE
+    heat = modules.LOSS * 100.0**2
+    housing = modules.AMBIENT + heat * modules.HOUSING_RESISTANCE
     np.testing.assert_allclose(muscle.housing, housing, rtol=0.03)
     np.testing.assert_allclose(
-        muscle.winding, housing + heat * mechanics.WINDING_RESISTANCE, rtol=0.03
+        muscle.winding, housing + heat * modules.WINDING_RESISTANCE, rtol=0.03
     )
 
 
