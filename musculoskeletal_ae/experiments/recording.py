@@ -11,7 +11,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.mae.mae import Mae
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
@@ -19,7 +19,7 @@ SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
 #: told the arm and the time [s] before every step; may put weights into its hand or cut muscles
-Script = Callable[[EmulatedArm, float], None]
+Script = Callable[[Arm, float], None]
 
 
 class Recording(NamedTuple):
@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 
 
 def record(
-    arm: EmulatedArm,
+    arm: Arm,
     mae: Mae,
     stream: int | Iterable[Step],
     duration: float,
