@@ -8,7 +8,6 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import mechanics
-from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
@@ -65,6 +64,7 @@ class EmulatedArm(Arm):
             np.zeros(3),
         )
         self._joint = mechanics.JointState(*(np.zeros(self._model.nv) for _ in range(4)))
+        self._angles, self._rates = self._joint.q, self._joint.velocity
         self.reset()
 
     def _constants(self) -> mechanics.Body:
@@ -90,18 +90,6 @@ class EmulatedArm(Arm):
         for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
             state[:] = 0.0
         self._joint.q[:] = self.robot.kinematics.tree_angles(theta)
-
-    @property
-    def theta(self) -> Array:
-        """True joint angles [rad], shape (D,)."""
-        angles: Array = self._joint.q[self._order]
-        return angles
-
-    @property
-    def velocity(self) -> Array:
-        """True joint velocities [rad/s], shape (D,)."""
-        rates: Array = self._joint.velocity[self._order]
-        return rates
 
     def set_payload(self, mass: float) -> None:
         """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
@@ -140,12 +128,11 @@ class EmulatedArm(Arm):
         coupled = np.linalg.solve(gear.T @ inertia @ gear, gear.T @ (joint.torque - bias))
         return gear @ coupled
 
-    def sense(self) -> Readings:
-        """Read all sensors once, with their noise, bias, resolution and faults."""
+    def _sensed(self) -> tuple[Array, Array, Array, Array]:
         muscle, true = self._muscle, self.individual
         tension = true.tension_gain * muscle.tension + true.tension_bias
         length = muscle.length + self._command.length_error + self._command.zero
-        return self._readings(self.theta, length, tension, muscle.housing)
+        return self.theta, length, tension, muscle.housing
 
     def route_points(self) -> Array:
         """True route points in the root link's frame [m], shape (P, 3)."""

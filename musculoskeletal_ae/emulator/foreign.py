@@ -48,11 +48,9 @@ class ForeignBody:
         """Look at a model whose joints and tendons have the robot's names."""
         self._robot, self._model = robot, model
         self._data = mujoco.MjData(model)
-        tree, count = robot.kinematics.model.names[1:], robot.muscle_count
-        #: where the tree's joints and θ stand in qpos and qvel, and muscles among tendons
-        self.position = np.array([int(model.joint(name).qposadr[0]) for name in tree])
-        self.order = np.array([int(model.joint(name).qposadr[0]) for name in robot.joints])
-        self.speed = np.array([int(model.joint(name).dofadr[0]) for name in robot.joints])
+        names, count = robot.kinematics.model.names[1:], robot.muscle_count
+        #: where the joints of the tree stand in qpos and qvel, and muscles among tendons
+        self.tree = np.array([model.joint(name).id for name in names])
         self.tendons = np.array([model.tendon(name).id for name in robot.muscles])
         self.length_at_zero = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
         self.elastic = Springs(robot, self.length_at_zero, draw)
@@ -62,7 +60,7 @@ class ForeignBody:
 
     def look(self, data: Any, theta: Array) -> None:
         """Put the bones of some MjData at θ [rad] (D,) and find lengths and moment arms."""
-        data.qpos[self.position] = self._robot.kinematics.tree_angles(theta)
+        data.qpos[self.tree] = self._robot.kinematics.tree_angles(theta)
         mujoco.mj_fwdPosition(self._model, data)
 
     def absolute_lengths(self, theta: Array) -> Array:
@@ -75,14 +73,13 @@ class ForeignBody:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return G [m/rad], θ (N, D) gives (N, M, D)."""
-        model, data, kin = self._model, self._data, self._robot.kinematics
+        model, data = self._model, self._data
         jacobian = np.empty((len(theta), model.ntendon, model.nv))
-        tree = [int(model.joint(name).dofadr[0]) for name in kin.model.names[1:]]
         for dense, angles in zip(jacobian, theta, strict=True):
             self.look(data, angles)
             rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
             mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
-        return kin.of_theta(jacobian[:, self.tendons][:, :, tree])
+        return self._robot.kinematics.of_theta(jacobian[:, self.tendons][:, :, self.tree])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l [m] without friction, loops, give and sensor errors, θ (N, D), T (N, M)."""
@@ -104,7 +101,6 @@ class ForeignArm(Arm):
         seed: int = 0,
         effects: Effects | None = None,
         file: Path | None = None,
-        command_timeout: float = 0.5,
     ) -> None:
         """Build an arm at rest, modules safe.
 
@@ -113,7 +109,6 @@ class ForeignArm(Arm):
             seed: Which individual, and its sensor noise.
             effects: How much is wrong with it; as calibrated by default.
             file: A user's own MJCF arm instead, which has its own effects and none of ours.
-            command_timeout: Seconds without a command until the modules go safe.
 
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.
@@ -128,7 +123,9 @@ class ForeignArm(Arm):
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
         data = self._data = mujoco.MjData(model)
         self.individual = body = ForeignBody(robot, copy.copy(model), draw)
-        super().__init__(robot, seed, body.length_bias, command_timeout)
+        super().__init__(robot, seed, body.length_bias)
+        self._angles, self._rates = data.qpos, data.qvel
+        self._order = np.array([model.joint(name).id for name in robot.joints])
         self._hand = model.body(mjcf.HAND).id
         names = [model.body(i).name for i in range(model.nbody)]
         self._root = names.index(robot.root_link) if file and robot.root_link in names else 0
@@ -150,24 +147,15 @@ class ForeignArm(Arm):
         self.reset()
 
     def _make_guides(self) -> Guides:
-        model, data, tendons = self._model, self._data, self.individual.tendons
-        sites, site = [], mujoco.mjtWrap.mjWRAP_SITE
-        for t in tendons:
+        model, data, sites = self._model, self._data, []
+        for t in self.individual.tendons:
             path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
-            sites.append(model.wrap_objid[path][model.wrap_type[path] == site])
-        give = self._draw.about('give', model.nsite)
-        return Guides(
-            data.wrap_xpos.reshape(-1, 3),
-            data.wrap_obj.reshape(-1),
-            data.ten_wrapadr,
-            data.ten_wrapnum,
-            np.concatenate(sites).astype(np.int64),
-            model.site_bodyid.astype(np.int64),
-            data.xmat.reshape(-1, 9),
-            model.site_pos,
-            model.site_pos.copy(),
-            give,
-        )
+            of_sites = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
+            sites.append(model.wrap_objid[path][of_sites])
+        place, give = model.site_pos, self._draw.about('give', model.nsite)
+        runs = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.ravel(), data.ten_wrapadr
+        site = np.concatenate(sites), model.site_bodyid, data.xmat.reshape(-1, 9)
+        return Guides(*runs, data.ten_wrapnum, *site, place, place.copy(), give)
 
     def _draw_sensors(self) -> None:
         """Draw what is wrong with joint sensors and messages, and when wires slip."""
@@ -204,18 +192,6 @@ class ForeignArm(Arm):
         self._muscle.length[which] -= memory.longer[which]
         memory.elongation[which] = self.individual.elastic.elongation(bias)[which]
         memory.slow[which], memory.loop[which] = 0.0, 0.0
-
-    @property
-    def theta(self) -> Array:
-        """True joint angles [rad], shape (D,)."""
-        angles: Array = self._data.qpos[self.individual.order]
-        return angles
-
-    @property
-    def velocity(self) -> Array:
-        """True joint velocities [rad/s], shape (D,)."""
-        rates: Array = self._data.qvel[self.individual.speed]
-        return rates
 
     def set_payload(self, mass: float) -> None:
         """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
@@ -262,21 +238,21 @@ class ForeignArm(Arm):
         memory, muscle = self._memory, self._muscle
         return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
 
-    def sense(self) -> Readings:
-        """Read all sensors once, late, with their noise, errors, resolution and faults."""
-        joints, rng = self.robot.joint_count, self._rng
-        jitter = self.effects.jitter * rng.uniform(-0.5, 0.5)
+    def _sensed(self) -> tuple[Array, Array, Array, Array]:
+        joints, jitter = self.robot.joint_count, self.effects.jitter * self._rng.uniform(-0.5, 0.5)
         late = np.maximum(self._delays + jitter, 0.0) / STEP
         seen = [self._history[(self._steps - round(steps)) % HISTORY] for steps in late]
-        length, tension, housing = seen[1][joints:].reshape(3, -1).copy()
         half, span = 0.5 * self._backlash, self.robot.upper - self.robot.lower
-        theta = seen[0][:joints]
+        theta = seen[0][:joints] + self._joint_zero
         theta = theta + self._joint_bend * span * np.sin(2.0 * np.pi * theta / span)
-        theta = theta + self._joint_zero
         self._play = np.clip(self._play, theta - half, theta + half)
-        now = self._readings(self._play, length, tension, housing)
-        last = self._last = self._last or now
-        lost = rng.uniform(size=len(length)) < self.effects.dropouts
+        return self._play, *seen[1][joints:].reshape(3, -1)
+
+    def sense(self) -> Readings:
+        """Read all sensors once, late, with their noise, errors, resolution and faults."""
+        now = super().sense()
+        last = self._last or now
+        lost = self._rng.uniform(size=len(now.length)) < self.effects.dropouts
         length, tension = (np.where(lost, old, new) for old, new in zip(last[1:3], now[1:3]))
         self._last = now._replace(length=length, tension=tension)
         return self._last

@@ -7,7 +7,6 @@ tendons; the actuators of a file are left out.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import RoutePoint, Wrap
+from musculoskeletal_ae.robot.description import Wrap
+from musculoskeletal_ae.robot.kinematics import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
@@ -75,54 +75,47 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
 
 def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
     """Add the wires: route points that are off, what is described to wrap round, and heads."""
-    kin, rng, size = robot.kinematics, draw.rng('heads'), draw.sizes.attachment
-    shift = draw.rng('attachment')
+    kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
     for muscle, route in zip(robot.muscles, robot.description.routes):
-        tendon, path = spec.add_tendon(name=muscle), list[tuple[Any, Any]]()
+        tendon, before = spec.add_tendon(name=muscle), list[tuple[int, Array]]()
         for n, item in enumerate(route):
             joint, at = kin.placement(item.link)
-            place, name = at.act(item.xyz), f'{muscle}, {n}'
-            if isinstance(item, RoutePoint):
-                place = place + size * shift.normal(size=3)
-                bodies[joint].add_site(name=name, pos=place)
-                path.append((joint, place))
-            else:
+            place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
+            if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
-                radius = item.radius * (1.0 + 0.1 * rng.uniform(-1.0, 1.0) * (size > 0.0))
+                # Described ones are a little off as well.
+                radius = item.radius * (rng.uniform(0.9, 1.1) if draw.sizes.heads > 0.0 else 1.0)
                 _add_round(bodies[joint], name, place, axis, radius)
                 if item.side is not None:
-                    bodies[joint].add_site(name=f'{name} side', pos=at.act(item.side))
-        for n, (item, after) in enumerate(pairwise([*route, None])):
-            if isinstance(item, Wrap):
-                tendon.wrap_geom(
-                    f'{muscle}, {n}', '' if item.side is None else f'{muscle}, {n} side'
-                )
+                    side = f'{name} side'
+                    bodies[joint].add_site(name=side, pos=at.act(item.side))
+                tendon.wrap_geom(name, side)
+                before = []
                 continue
-            tendon.wrap_site(f'{muscle}, {n}')
-            ends, path = path[:2], path[1:]
-            head = draw.sizes.heads * rng.uniform(0.8, 1.2), rng.uniform() < 0.5
-            if isinstance(after, RoutePoint) and (found := _head(robot, poses, ends, *head)):
-                joint, axis, radius = found
-                name = f'{muscle}, head after {n}'
-                _add_round(bodies[joint], name, np.zeros(3), axis, radius)
-                tendon.wrap_geom(name, '')
+            here = joint, place + draw.sizes.attachment * off.normal(size=3)
+            share, cylinder = draw.sizes.heads * rng.uniform(0.8, 1.2), rng.uniform() < 0.5
+            for last in before if share > 0.0 else ():
+                carrier, axis, radius = _head(robot, poses, [last, here], share, cylinder)
+                if radius > 1e-3:
+                    _add_round(bodies[carrier], f'{name} head', np.zeros(3), axis, radius)
+                    tendon.wrap_geom(f'{name} head', '')
+            bodies[joint].add_site(name=name, pos=here[1])
+            tendon.wrap_site(name)
+            before = [here]
 
 
 def _head(
-    robot: Robot, poses: Any, ends: list[tuple[Any, Any]], share: float, cylinder: bool
-) -> tuple[int, Array | None, float] | None:
-    """Return joint, axis (None: a sphere) and radius of the bone's head that a wire passes.
+    robot: Robot, poses: JointPoses, ends: list[tuple[int, Array]], share: float, cylinder: bool
+) -> tuple[int, Array | None, float]:
+    """Return joint, axis (None: a sphere) and radius [m] of the bone's head that a wire passes.
 
     It stands at the joint between its two ends that the straight line is nearest to, and touches
     the line in a `share` of the postures. A wire may slip over it to its other side.
     """
-    kin = robot.kinematics
-    best, result = np.inf, None
+    kin, best, head = robot.kinematics, np.inf, (0, None, 0.0)
     between = kin.hangs_on[ends[0][0]] ^ kin.hangs_on[ends[1][0]]
-    for joint in np.flatnonzero(between & ~kin.prismatic) if share > 0.0 else ():
-        if joint == 0:
-            continue
+    for joint in np.flatnonzero(between & ~kin.prismatic):
         away = []
         for carrier, place in ends:
             place = poses.rotation[:, carrier] @ place + poses.translation[:, carrier]
@@ -135,25 +128,18 @@ def _head(
         if np.median(distance) < best:
             best, least = np.median(distance), min(np.linalg.norm(a, axis=1).min() for a in away)
             radius = min(float(np.quantile(distance, min(share, 1.0))), 0.8 * least, THICKEST_HEAD)
-            result = int(joint), kin.local_axis[joint] if cylinder else None, radius
-    return result if result and result[2] > 1e-3 else None
+            head = int(joint), kin.local_axis[joint] if cylinder else None, radius
+    return head
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
     """Add a sphere or a cylinder that wires wrap round and nothing else touches."""
-    kinds, turn = mujoco.mjtGeom, np.eye(3)
+    kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
-        turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix()
-    body.add_geom(
-        name=name,
-        type=kinds.mjGEOM_SPHERE if axis is None else kinds.mjGEOM_CYLINDER,
-        pos=place,
-        quat=_turn(turn),
-        size=[radius, radius, 0.0],
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
-    )
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
+    free = {'contype': 0, 'conaffinity': 0, 'mass': 0.0, 'size': [radius, radius, 0.0]}
+    body.add_geom(name=name, type=kind, pos=place, quat=_turn(turn.matrix()), **free)
 
 
 def _turn(rotation: Array) -> Array:

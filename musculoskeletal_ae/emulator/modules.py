@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -150,8 +150,14 @@ class Arm(ABC):
     """
 
     individual: Any
+    #: angles and velocities of all joints, and where those of θ stand in either
+    _angles: Array
+    _rates: Array
+    _order: Ints
 
-    def __init__(self, robot: Robot, seed: int, length_bias: Array, command_timeout: float) -> None:
+    def __init__(
+        self, robot: Robot, seed: int, length_bias: Array, command_timeout: float = 0.5
+    ) -> None:
         """Build the modules, whose length sensors are off by `length_bias` [m] (M,)."""
         self.robot, self._length_bias = robot, length_bias
         self.command_timeout = command_timeout
@@ -200,14 +206,16 @@ class Arm(ABC):
         """Put the bones at rest at θ [rad] (D,)."""
 
     @property
-    @abstractmethod
     def theta(self) -> Array:
         """True joint angles [rad], shape (D,): what errors are measured against."""
+        angles: Array = self._angles[self._order]
+        return angles
 
     @property
-    @abstractmethod
     def velocity(self) -> Array:
         """True joint velocities [rad/s], shape (D,)."""
+        rates: Array = self._rates[self._order]
+        return rates
 
     @property
     def tension(self) -> Array:
@@ -280,11 +288,12 @@ class Arm(ABC):
         """Let one `STEP` pass."""
 
     @abstractmethod
+    def _sensed(self) -> tuple[Array, Array, Array, Array]:
+        """Return θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,), wrong but without noise."""
+
     def sense(self) -> Readings:
         """Read all sensors once, with their noise, bias, resolution and faults."""
-
-    def _readings(self, theta: Array, length: Array, tension: Array, housing: Array) -> Readings:
-        """Return what the sensors make of these [rad] (D,), [m], [N], [°C] (M,)."""
+        theta, length, tension, housing = self._sensed()
         cut, rng = self._muscle.ruptured > 0.0, self._rng
         # A cut wire pulls on no sensor, and a tension unit does not read below zero.
         pull = noisy(np.where(cut, 0.0, tension), TENSION_NOISE, TENSION_RESOLUTION, rng)

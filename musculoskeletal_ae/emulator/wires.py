@@ -12,12 +12,12 @@ give       a route point moves by its own load, low-passed
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 from numba import njit
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import (
     AMBIENT,
@@ -98,81 +98,38 @@ class Springs:
         return np.stack([np.interp(tension[..., m], *column) for m, column in columns], axis=-1)
 
 
-class Wires(NamedTuple):
-    """Constants of M wires, each of shape (M,) but for the table."""
-
-    length_at_zero: Array  # of the route [m]
-    pull: Array  # table of `Springs`, (M, K)
-    spacing: Array
-    late: Array
-    hysteresis: Array
-    creep: Array
-    friction: Array  # per radian
-    stiction: Array
-    cell_gain: Array
-    cell_zero: Array
-    cell_bend: Array  # [N]
-    cell_drift: Array
-    full_scale: Array  # [N]
-    spool_gain: Array
-    layer: Array
-    layer_start: Array  # l from which the second layer is wound [m]
-    eccentricity: Array
-    phase: Array
-
-
-class Memory(NamedTuple):
-    """What wires remember beside `MuscleState`, each of shape (M,) but for `slow`."""
-
-    elongation: Array  # of the rubber unit [m]
-    loop: Array  # side of its loop s_x, in [−1, 1]
-    slow: Array  # e_i [m], (M, 6)
-    rest: Array  # share of stiction
-    bend: Array  # φ [rad]
-    longer: Array  # by which wires have become longer, by bedding-in and slips [m]
-    reading: Array  # what the module's sensors read: l [m] …
-    cell: Array  # … and T [N]
-
-
-class Guides(NamedTuple):
-    """Where the wires run: MuJoCo's arrays, P points of the paths and S sites."""
-
-    point: Array  # in the world [m], (P, 3)
-    kind: Ints  # −1: a site, else a wrapping geom, (P,)
-    start: Ints  # of each path, (M,)
-    count: Ints
-    site: Ints  # the sites of the paths in their order
-    body: Ints  # that carries each site, (S,)
-    turn: Array  # of the bodies, (B, 9)
-    place: Array  # of sites in their bodies [m], (S, 3), changed
-    rest: Array  # the same without load
-    give: Array  # [m/N], (S,)
+#: Constants of M wires, each (M,): l_abs(0) [m], table of `Springs` (M, K) and its spacing [m],
+#: late stretch [m/N], friction per radian, full scale of the load cell [N], l where the second layer
+#: begins [m], phase of the spool's eccentricity; the rest as in `Effects`.
+Wires = namedtuple(
+    'Wires',
+    'length_at_zero pull spacing late friction full_scale layer_start phase hysteresis creep '
+    'stiction tension_gain tension_zero tension_bend tension_drift spool_gain spool_layer '
+    'eccentricity',
+)
+#: What wires remember beside `MuscleState`, each (M,): elongation x [m], side of the loop s_x, slow
+#: elongations e_i [m] (M, 6), share of stiction p, bend φ [rad], by how much they grew longer [m],
+#: and what the module's sensors read of l [m] and T [N].
+Memory = namedtuple('Memory', 'elongation loop slow rest bend longer reading cell')
+#: Where wires run, MuJoCo's arrays: points of the paths (P, 3) [m], −1 for a site or the geom that
+#: they wrap (P,), first point and number of points of each path (M,), the paths' sites in their
+#: order; of all sites (S,) the body, its turn (B, 9), the place in it, which is changed, the place
+#: without load (S, 3) [m], and how far they give [m/N].
+Guides = namedtuple('Guides', 'point kind start count site body turn place rest give')
 
 
 def make_wires(robot: Robot, springs: Springs, at_zero: Array, bend: Array, draw: Draw) -> Wires:
     """Draw the constants of wires that are bent by so much at mid-range [rad] (M,)."""
-    count, full = robot.muscle_count, robot.tension.max
-    rng = draw.rng('spool')
-    return Wires(
-        at_zero,
-        springs.pull,
-        springs.spacing,
-        springs.late,
-        draw.about('hysteresis', count),
-        draw.about('creep', count),
-        draw.about('guide_friction', count) / (GUIDES + bend),
-        draw.about('stiction', count),
-        draw.normal('tension_gain', count),
-        draw.normal('tension_zero', count),
-        full * draw.about('tension_bend', count, signed=True),
-        draw.about('tension_drift', count, signed=True),
-        full,
-        draw.about('spool_gain', count, signed=True),
-        draw.about('spool_layer', count),
-        rng.uniform(-0.1, 0.1, count),
-        draw.about('eccentricity', count),
-        rng.uniform(0.0, 2.0 * np.pi, count),
-    )
+    count, full, rng = robot.muscle_count, robot.tension.max, draw.rng('spool')
+    about = 'hysteresis', 'creep', 'stiction', 'spool_layer', 'eccentricity'
+    either = 'tension_bend', 'tension_drift', 'spool_gain'
+    drawn = {name: draw.about(name, count) for name in about}
+    drawn |= {name: draw.about(name, count, signed=True) for name in either}
+    drawn |= {name: draw.normal(name, count) for name in ('tension_gain', 'tension_zero')}
+    friction = draw.about('guide_friction', count) / (GUIDES + bend)
+    start, phase = rng.uniform(-0.1, 0.1, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    table = springs.pull, springs.spacing, springs.late
+    return Wires(at_zero, *table, friction, full, start, phase, **drawn)
 
 
 @njit(cache=True)
@@ -190,16 +147,18 @@ def spooled(wires: Wires, m: int, length: float) -> float:
     """Return what the length sensor makes of l [m], its errors of time and zero apart."""
     turned, phase = length / SPOOL, wires.phase[m]
     wider = min(0.0, length - wires.layer_start[m]) - min(0.0, -wires.layer_start[m])
-    off = wires.spool_gain[m] * length + wires.layer[m] * wider
+    off = wires.spool_gain[m] * length + wires.spool_layer[m] * wider
     return length + off + wires.eccentricity[m] * (math.sin(turned + phase) - math.sin(phase))
 
 
 @njit(cache=True)
 def load_cell(wires: Wires, m: int, tension: float, temperature: float) -> float:
     """Return what the tension sensor makes of T [N]."""
-    share = min(1.0, tension / wires.full_scale[m])
-    off = wires.cell_zero[m] + wires.cell_drift[m] * (temperature - AMBIENT)
-    return (1.0 + wires.cell_gain[m]) * tension + off + wires.cell_bend[m] * 4 * share * (1 - share)
+    full = wires.full_scale[m]
+    share = min(1.0, tension / full)
+    off = wires.tension_zero[m] + wires.tension_drift[m] * (temperature - AMBIENT)
+    bend = wires.tension_bend[m] * full * 4.0 * share * (1.0 - share)
+    return (1.0 + wires.tension_gain[m]) * tension + off + bend
 
 
 @njit(cache=True)
