@@ -38,7 +38,7 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
-    spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9  # links that weigh nothing
+    spec.compiler.boundmass = 1e-6  # of links that weigh nothing
     weight = np.abs(kin.holding_torque(robot.random_postures(200, draw.rng('weight')))).max()
     friction = weight * draw.about('joint_friction', robot.joint_count)
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
@@ -51,7 +51,7 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
         scale = np.exp(MASS_SPREAD * off[i, 1, 0])
         body.mass, body.explicitinertial = scale * inertia.mass, True
         body.ipos = inertia.lever + CENTRE_SPREAD * off[i, 2]
-        about = scale * inertia.inertia
+        about = scale * inertia.inertia + 1e-9 * np.eye(3)
         body.fullinertia = [*np.diag(about), about[0, 1], about[0, 2], about[1, 2]]
         axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.local_axis[i]
         kinds = mujoco.mjtJoint

@@ -99,8 +99,8 @@ class Springs:
 
 
 #: Constants of M wires, each (M,): l_abs(0) [m], table of `Springs` (M, K) and its spacing [m],
-#: late stretch [m/N], friction per radian, full scale of the load cell [N], l where the second layer
-#: begins [m], phase of the spool's eccentricity; the rest as in `Effects`.
+#: late stretch [m/N], friction per radian, full scale of the load cell [N], l where a second
+#: layer begins [m], phase of the spool's eccentricity; the rest as in `Effects`.
 Wires = namedtuple(
     'Wires',
     'length_at_zero pull spacing late friction full_scale layer_start phase hysteresis creep '
