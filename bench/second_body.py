@@ -8,7 +8,7 @@ no table shows, and before the learner was changed for this body (it is as of co
 that, without the error of the network itself,
 
 - least squares on the nominal geometry has 0.32–0.41 rad on the held-out motion,
-- l(θ_S-p) at no tension is off by up to about 40 mm,
+- l(θ_S-p) over the paper's −120…30° at no tension is off by up to 40 mm,
 - preset `paper` is left with 0.15–0.19 rad after ten minutes of learning,
 - and its simulator with about 90 N,
 
@@ -24,8 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Effects
 from musculoskeletal_ae.emulator.foreign import ForeignArm
+from musculoskeletal_ae.emulator.wires import spooled
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.body_change import SWEEP
 from musculoskeletal_ae.experiments.least_squares import nominal
@@ -46,7 +48,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 SEEDS = tuple(range(200, 210))
-HEAD = 'seed  least squares [rad]  l off [mm]  paper [rad]: before  after  simulator [N]'
+HEAD = 'seed  least squares [rad]  l off [mm]  paper [rad]: before  after  simulator [N]  refused'
 PAPER = 'Musashi      0.32–0.41        up to 40            0.41  0.15–0.19      92'
 
 
@@ -54,10 +56,11 @@ class Row(NamedTuple):
     """What is measured of one individual."""
 
     least_squares: float  # on the nominal geometry [rad]
-    off: float  # largest |l − f_geo| over the shoulder's sweep, each from its own mean [mm]
+    off: float  # largest |l − f_geo| over the shoulder's sweep, l as the sensor reads it [mm]
     before: float  # preset `paper` [rad]
-    after: float
+    after: float  # of its last network, whether the gate let it through or not
     simulated: float  # tension error of its simulator after learning [N]
+    refused: float  # share of the networks that the gate did not let through
 
 
 def measured(
@@ -74,10 +77,9 @@ def measured(
     follow(learner, exploring, held_out)
     swept = np.zeros((len(SWEEP), robot.joint_count))
     swept[:, shoulder(robot)] = SWEEP
-    swept = swept[((swept >= robot.lower) & (swept <= robot.upper))[:, shoulder(robot)]]
-    true = arm().individual
-    off = true.absolute_lengths(swept) - true.length_at_zero - robot.routes.relative_lengths(swept)
-    simulation, errors = Simulation(robot, learner.mae, 'paper'), []
+    off = true_lengths(arm(), swept) - robot.routes.relative_lengths(swept)
+    learned = paper if learner.last_update is None else learner.last_update.mae
+    simulation, errors = Simulation(robot, learned, 'paper'), []
     simulation.start_from(held_out.theta[:1])
     for command, tension in zip(held_out.command, held_out.tension):
         simulation.command = command[None]
@@ -86,8 +88,18 @@ def measured(
         nominal(robot).error(held_out),
         1e3 * float(np.abs(off).max()),
         estimation_error(paper, held_out),
-        estimation_error(learner.mae, held_out),
+        estimation_error(learned, held_out),
         float(np.mean(errors)),
+        learner.refused / max(learner.updates, 1),
+    )
+
+
+def true_lengths(arm: ForeignArm, theta: Array) -> Array:
+    """Return what the length sensors read at no tension [m] (N, M), at θ [rad] (N, D)."""
+    body = arm.individual
+    lengths = body.absolute_lengths(theta) - body.length_at_zero
+    return np.array(
+        [[spooled(arm.wires, m, each) for m, each in enumerate(row)] for row in lengths]
     )
 
 
@@ -120,7 +132,7 @@ def main(argv: list[str] | None = None) -> int:
 def line(name: str, row: Row) -> str:
     """Return a line of the table."""
     text = f'{name:>4}{row.least_squares:21.3f}{row.off:12.0f}'
-    return text + f'{row.before:21.3f}{row.after:7.3f}{row.simulated:15.0f}'
+    return text + f'{row.before:21.3f}{row.after:7.3f}{row.simulated:15.0f}{row.refused:9.2f}'
 
 
 if __name__ == '__main__':

@@ -30,7 +30,7 @@ class Effects:
     joint_friction: float = 0.02  # of each joint, share of the largest torque of the arm's weight
     links: float = 0.0  # in units of σ = 5 mm, 2° of axes, 15 % of masses, 20 mm of their centres
     # Elastic units of rubber
-    stiffness: float = 0.4  # σ of the logarithm
+    stiffness: float = 0.4  # at most this share more or less than the data sheet's
     laws: float = 1.0  # share of the muscles with another law than the data sheet's
     hysteresis: float = 0.15  # width of the loop, share of the elongation
     creep: float = 0.04  # per decade of time, share of the elongation

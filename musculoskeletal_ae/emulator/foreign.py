@@ -136,7 +136,7 @@ class ForeignArm(Arm):
         body.look(data, 0.5 * (robot.lower + robot.upper))
         guides_step(self._guides, np.zeros(muscles), self._memory.bend, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
-        self._wires = make_wires(robot, body.elastic, at_zero, bend, draw)
+        self.wires = make_wires(robot, body.elastic, at_zero, bend, draw)
         span = body.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - at_zero
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
         self._draw_sensors()
@@ -182,7 +182,7 @@ class ForeignArm(Arm):
         super().reset(theta)
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):
-            read(self._wires, self._muscle, self._memory, self._command, m)
+            read(self.wires, self._muscle, self._memory, self._command, m)
         self._history[:] = self._now()
         self._last: Readings | None = None
 
@@ -220,7 +220,7 @@ class ForeignArm(Arm):
         if self._steps % GUIDES_EVERY == 0:
             guides_step(self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP)
         wires_step(
-            self._wires, self._wound, muscle, self._memory, self._kind, self._command,
+            self.wires, self._wound, muscle, self._memory, self._kind, self._command,
             data.ten_length[self.individual.tendons], self._pull,
         )  # fmt: skip
         data.ctrl[self._control] = self._pull

@@ -41,7 +41,7 @@ SPOOL = 0.01  # [m] radius
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
 LATE = np.array([0.75, 0.25])  # share of each of the last two
 KNOTS = 200  # of the table of a law
-GIVING = 0.05  # [s] in which a route point follows its load
+GIVING = 0.1  # [s] in which a route point follows its load
 
 
 class Springs:
@@ -73,7 +73,8 @@ class Springs:
         # One is linear and one worn, the rest bilinear or cubic.
         law = rng.permutation(np.r_[1, 4, rng.choice([2, 3], max(count, 2) - 2)])[:count]
         law[rng.uniform(size=count) >= draw.sizes.laws] = 0
-        unit = laws[law, :, np.arange(count)].T * np.exp(draw.normal('stiffness', count))
+        stiffness = 1.0 + draw.sizes.stiffness * rng.uniform(-1.0, 1.0, count)
+        unit = laws[law, :, np.arange(count)].T / stiffness
         #: stretch of the whole wire, at once and late [m/N], (M,)
         stretch = sheet.wire_stretch * at_zero
         self.late: Array = stretch * draw.about('recovery', count)

@@ -105,9 +105,9 @@ def test_an_effect_that_is_switched_off_leaves_the_draws_of_the_others(robot):
     whole, part = (
         ForeignArm(robot, 1, effects) for effects in (Effects(), replace(Effects(), hysteresis=0.0))
     )
-    for name, values in whole._wires._asdict().items():
+    for name, values in whole.wires._asdict().items():
         if name != 'hysteresis':
-            np.testing.assert_array_equal(values, getattr(part._wires, name))
+            np.testing.assert_array_equal(values, getattr(part.wires, name))
     np.testing.assert_array_equal(whole._model.site_pos, part._model.site_pos)
 
 
@@ -118,7 +118,7 @@ def test_rubber_pulls_harder_on_the_way_out_than_on_the_way_back(robot):
         for each in tensions:
             arm.command_tension(np.full(robot.muscle_count, each))
             arm.step(0.02)
-        middle = [law(arm._wires, m, x) for m, x in enumerate(memory.elongation)]
+        middle = [law(arm.wires, m, x) for m, x in enumerate(memory.elongation)]
         assert np.all(side * memory.loop > 0.5)
         assert np.all(side * (tension - middle) > 0.5)
 
