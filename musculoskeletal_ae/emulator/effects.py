@@ -26,6 +26,7 @@ class Effects:
     # Mechanics of the body
     attachment: float = 0.0105  # σ of each coordinate of each route point [m]
     heads: float = 0.4  # share of the postures in which a bone's head bends a wire
+    slip_over: float = 0.005  # jump of a wire that slips over a ridge, in 5 % of its postures [m]
     give: float = 3.5e-5  # how far a route point moves under its load [m/N]
     joint_friction: float = 0.02  # of each joint, share of the largest torque of the arm's weight
     links: float = 0.0  # in units of σ = 5 mm, 2° of axes, 15 % of masses, 20 mm of their centres

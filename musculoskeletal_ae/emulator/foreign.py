@@ -136,8 +136,8 @@ class ForeignArm(Arm):
         body.look(data, 0.5 * (robot.lower + robot.upper))
         guides_step(self._guides, np.zeros(muscles), self._memory.bend, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
-        self.wires = make_wires(robot, body.elastic, at_zero, bend, draw)
         span = body.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - at_zero
+        self.wires = make_wires(robot, body.elastic, at_zero, span, bend, draw)
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
         self._draw_sensors()
         self._time, self._steps = 0.0, 0

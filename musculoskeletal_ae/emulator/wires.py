@@ -35,6 +35,7 @@ SLIDING = 0.0003  # [m] of sliding over which friction builds up
 BREAKING = 0.0005  # [m] of sliding that ends stiction …
 STICKING = 0.5  # [s] … and how long at rest it takes to come back
 LOOP = 0.003  # [m] of elongation over which rubber changes from one side of its loop to the other
+RIDGE, BACK = 5.0, 0.003  # [%] of the route's lengths beyond the ridge; [m] until it slips back
 GUIDES = 1.0  # [rad] by which the wire is bent between its motor and its first route point
 SPOOL = 0.01  # [m] radius
 # Creep at an even rate over four decades of time; a wire's late stretch [s].
@@ -101,17 +102,18 @@ class Springs:
 
 #: Constants of M wires, each (M,): l_abs(0) [m], table of `Springs` (M, K) and its spacing [m],
 #: late stretch [m/N], friction per radian, full scale of the load cell [N], l where a second
-#: layer begins [m], phase of the spool's eccentricity; the rest as in `Effects`.
+#: layer begins [m], phase of the spool's eccentricity, l_abs at the ridge [m] and on which side
+#: of it the wire is caught; the rest as in `Effects`.
 Wires = namedtuple(
     'Wires',
-    'length_at_zero pull spacing late friction full_scale layer_start phase hysteresis creep '
-    'stiction tension_gain tension_zero tension_bend tension_drift spool_gain spool_layer '
-    'eccentricity',
+    'length_at_zero pull spacing late friction full_scale layer_start phase ridge side '
+    'hysteresis creep stiction tension_gain tension_zero tension_bend tension_drift spool_gain '
+    'spool_layer eccentricity slip_over',
 )
 #: What wires remember beside `MuscleState`, each (M,): elongation x [m], side of the loop s_x, slow
 #: elongations e_i [m] (M, 6), share of stiction p, bend φ [rad], by how much they grew longer [m],
-#: and what the module's sensors read of l [m] and T [N].
-Memory = namedtuple('Memory', 'elongation loop slow rest bend longer reading cell')
+#: 1 beyond the ridge, and what the module's sensors read of l [m] and T [N].
+Memory = namedtuple('Memory', 'elongation loop slow rest bend longer over reading cell')
 #: Where wires run, MuJoCo's arrays: points of the paths (P, 3) [m], −1 for a site or the geom that
 #: they wrap (P,), first point and number of points of each path (M,), the paths' sites in their
 #: order; of all sites (S,) the body, its turn (B, 9), the place in it, which is changed, the place
@@ -119,18 +121,31 @@ Memory = namedtuple('Memory', 'elongation loop slow rest bend longer reading cel
 Guides = namedtuple('Guides', 'point kind start count site body turn place rest give')
 
 
-def make_wires(robot: Robot, springs: Springs, at_zero: Array, bend: Array, draw: Draw) -> Wires:
-    """Draw the constants of wires that are bent by so much at mid-range [rad] (M,)."""
+def make_wires(
+    robot: Robot, springs: Springs, at_zero: Array, span: Array, bend: Array, draw: Draw
+) -> Wires:
+    """Draw the constants of wires.
+
+    Args:
+        robot: Its data sheet.
+        springs: Laws of the elastic units.
+        at_zero: Lengths of the routes at θ = 0 [m], (M,).
+        span: How much longer they are in N postures, (N, M).
+        bend: By how much they are bent at mid-range [rad], (M,).
+        draw: Draws of the individual.
+    """
     count, full, rng = robot.muscle_count, robot.tension.max, draw.rng('spool')
     about = 'hysteresis', 'creep', 'stiction', 'spool_layer', 'eccentricity'
-    either = 'tension_bend', 'tension_drift', 'spool_gain'
+    either = 'tension_bend', 'tension_drift', 'spool_gain', 'slip_over'
     drawn = {name: draw.about(name, count) for name in about}
     drawn |= {name: draw.about(name, count, signed=True) for name in either}
     drawn |= {name: draw.normal(name, count) for name in ('tension_gain', 'tension_zero')}
     friction = draw.about('guide_friction', count) / (GUIDES + bend)
     start, phase = rng.uniform(-0.1, 0.1, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    side = rng.choice([-1.0, 1.0], count)
+    ridge = at_zero + side * np.percentile(side * span, 100.0 - RIDGE, axis=0)
     table = springs.pull, springs.spacing, springs.late
-    return Wires(at_zero, *table, friction, full, start, phase, **drawn)
+    return Wires(at_zero, *table, friction, full, start, phase, ridge, side, **drawn)
 
 
 @njit(cache=True)
@@ -187,7 +202,10 @@ def wires_step(
         muscle.sliding[m] = direction + (muscle.sliding[m] - direction) * keep
         rest = memory.rest[m] + STEP / STICKING * (1.0 - memory.rest[m])
         memory.rest[m] = rest * math.exp(-abs(slid) / BREAKING)
+        beyond = wires.side[m] * (absolute[m] - wires.ridge[m])
+        memory.over[m] = 1.0 if beyond > 0.0 else memory.over[m] * (beyond > -BACK)
         slack = command.slack[m] + memory.longer[m] + memory.slow[m].sum()
+        slack += wires.slip_over[m] * memory.over[m]
         x = absolute[m] - wires.length_at_zero[m] - muscle.length[m] - slack
         grown = x - memory.elongation[m]
         memory.elongation[m] = x
