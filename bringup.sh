@@ -26,6 +26,9 @@ doc/your_robot.md leads from a robot of your own to one that learns.
   --no-learner               no online learning
   --preset default|paper     the best we can measure, or as printed in the paper (default: default)
   --seed N                   which individual arm the emulator is (default: 0)
+  --reality kin|foreign|FILE.xml
+                             its body: the first, a second one whose mechanics are foreign to the
+                             learner, or a MuJoCo model with the robot's names (default: kin)
   --namespace NS             run everything under /NS
   --duration S               stop after S seconds, counted from when the system is up
                              (default: run until Ctrl-C)
@@ -52,6 +55,7 @@ checkpoint=
 explore= # on, but for hardware
 preset=default
 seed=0
+reality=kin
 namespace=
 learner=true
 controller=true
@@ -67,7 +71,7 @@ while [ $# -gt 0 ]; do
   # Both "--seed 1" and "--seed=1".
   if [[ $1 == --*=* ]]; then set -- "${1%%=*}" "${1#*=}" "${@:2}"; fi
   case $1 in
-    --robot | --checkpoint | --bag | --preset | --seed | --namespace | --duration | --record | --port)
+    --robot | --checkpoint | --bag | --preset | --seed | --reality | --namespace | --duration | --record | --port)
       if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
       ;;
   esac
@@ -86,12 +90,13 @@ while [ $# -gt 0 ]; do
     --no-controller) controller=false ;;
     --preset) preset=$2 && shift ;;
     --seed) seed=$2 && shift ;;
+    --reality) reality=$2 && shift ;;
     --namespace) namespace=$2 && shift ;;
     --duration) duration=$2 && shift ;;
     -h | --help) usage && exit ;;
     *)
       refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
- --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --namespace, --duration, --record, --view, --port,\
+ --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --namespace, --duration, --record, --view, --port,\
  --read-only, --help"
       ;;
   esac
@@ -130,6 +135,13 @@ case $preset in
 esac
 [[ $seed =~ ^[0-9]{1,9}$ ]] || refuse "--seed '$seed' must be a whole number from 0 to 999999999"
 seed=$((10#$seed))
+case $reality in
+  kin | foreign) ;;
+  *)
+    [ -f "$reality" ] || refuse "--reality '$reality' must be kin, foreign or an MJCF file"
+    reality=$(realpath "$reality")
+    ;;
+esac
 if [ -n "$duration" ]; then
   [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
     refuse "--duration '$duration' must be a number of seconds above 0, such as 30 or 2.5"
@@ -287,7 +299,7 @@ remap=()
 if [ -n "$bag" ]; then
   common+=(-p use_sim_time:=true)
 elif [ $hardware = false ]; then
-  start hardware_emulator hardware_emulator "${common[@]}"
+  start hardware_emulator hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")"
 fi
 
 [ -n "$checkpoint" ] || train_once

@@ -23,8 +23,9 @@ import numpy as np
 import torch
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import EmulatedArm, seen_by_camera
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.modules import seen_by_camera
 from musculoskeletal_ae.experiments.online_learning import See, follow
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,

@@ -28,8 +28,8 @@ from bench.learned_arm import initial, learned_arm, postures
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import DURATIONS, Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.mechanics import SPEED_LIMIT
 from musculoskeletal_ae.estimation import anomaly
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, NEAR, AnomalyDetector
 from musculoskeletal_ae.experiments.detection import (

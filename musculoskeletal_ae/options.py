@@ -123,6 +123,11 @@ class Parser(argparse.ArgumentParser):
         """Add `--seeds`, the individual arms."""
         self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
+    def add_reality(self) -> None:
+        """Add `--reality`, the body of the individual arms."""
+        text = 'the first body, or a second one, of MuJoCo, whose mechanics are foreign too'
+        self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
+
     def add_minutes(self, text: str, default: float | None) -> None:
         """Add `--minutes` of robot time; the text says what happens in them."""
         self.add_argument('--minutes', type=minutes, default=default, help=text)

@@ -52,6 +52,16 @@ def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
             assert not upward, file
 
 
+def test_the_second_body_shares_nothing_with_the_first_or_the_learner() -> None:
+    first = r'emulator\.(arm|individual|mechanics|wrapping)'
+    model = r'(learning|estimation|mae)\b|robot\.(routes|series_elastic|wrapping)'
+    for name in ('effects', 'foreign', 'mjcf', 'wires'):
+        file = PACKAGE / 'emulator' / f'{name}.py'
+        pattern = rf'musculoskeletal_ae\.({first}|{model})'
+        assert not [n for n in imported(file) if re.match(pattern, n)], file
+        assert 'robot.routes' not in file.read_text(encoding='utf-8'), file
+
+
 def test_every_source_file_names_its_licence() -> None:
     for file in sources(PACKAGE, ROOT / 'test', ROOT / 'bench', ROOT / 'bags'):
         assert '# SPDX-License-Identifier: Apache-2.0' in file.read_text(encoding='utf-8')[:120], (

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.emulator.mechanics import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES
 
+SPEED_LIMIT = 0.25  # [m/s] of a muscle module's motor; chosen
 SPIKE_SHARE = 0.05  # of the readings have a spike, one muscle each
 
 

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One millisecond of muscles, modules and friction, compiled by numba.
+"""One millisecond of muscles and friction, compiled by numba.
 
 Each muscle is a massless wire between a motor and an elastic unit at its far end:
 
     far end    L_e(l_abs, T_end) = f(θ) − l           elastic unit and wire, what pulls the bones
     friction   T = T_end exp(μ s),  |s| ≤ 1           s follows the wire's sliding (Dahl)
-    MSC        T_ref = T_bias + max(0, K (l − l_target))      (paper, eq. muscle stiffness control)
-    motor      dl/dt = −gain (T_ref − T), within the speed limit and the length limits
-    heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 
 Joint friction is Dahl's as well, so that the arm rests where it rubs, without creeping.
 """
@@ -20,6 +17,7 @@ from typing import NamedTuple
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState, heat, wind
 from musculoskeletal_ae.emulator.wrapping import (
     Tree,
     WrappedRoutes,
@@ -30,25 +28,11 @@ from musculoskeletal_ae.emulator.wrapping import (
     tree_poses,
 )
 
-STEP = 0.001  # [s]
-
-# What a module follows.
-SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
-
-# Muscle modules; chosen, plausible for Musashi's (not public).
-SPEED_LIMIT = 0.25  # [m/s]
-RELEASE_RATE = 100.0  # [N/s] at which a module that went safe approaches T_bias
-MOTOR_GAIN = 0.004  # [m/s/N]
 SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
 # Joints.
 STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up
 VISCOUS = 0.5  # [N·m·s/rad] or [N·s/m]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
-# Heat: 200 N for good settles at 85 °C at the housing and 105 °C in the winding.
-AMBIENT = 25.0  # [°C]
-LOSS = 5.0e-4  # [W/N²]
-WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
-WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
 
 
 class Body(NamedTuple):
@@ -62,37 +46,8 @@ class Body(NamedTuple):
     joint_friction: Array
     lower: Array
     upper: Array
-    length_low: Array
-    length_high: Array
-    stiffness: Array
-    tension_bias: Array
-    tension_max: Array
     sensor_gain: Array
     sensor_offset: Array
-
-
-class Command(NamedTuple):
-    """What the modules follow and what is wrong with them, each of shape (M,)."""
-
-    value: Array  # target lengths [m] or tensions [N]
-    length_error: Array  # reading of the length sensor minus the true l [m]
-    stuck: Array  # share of its speed that the motor lacks
-    slack: Array  # by how much the wire is too long [m]
-    zero: Array  # by how much more the length sensor is off [m]
-    hot: Array  # least temperature of the housing [°C]
-
-
-class MuscleState(NamedTuple):
-    """What changes, each of shape (M,); the compiled step writes into it."""
-
-    length: Array  # l at the motor, true [m]
-    tension: Array  # T at the motor, true [N]
-    end_tension: Array  # T at the elastic unit [N]
-    sliding: Array  # friction state s in [−1, 1]
-    winding: Array  # c₁ [°C]
-    housing: Array  # c₂ [°C]
-    reference: Array  # T_ref of the module [N]
-    ruptured: Array  # 1 where the wire is cut
 
 
 class JointState(NamedTuple):
@@ -140,25 +95,11 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 
 @njit(cache=True)
-def module_reference(
-    kind: int, command: float, length: float, before: float, body: Body, m: int
-) -> float:
-    """Return T_ref [N] of module m that reads `length` [m] and had T_ref `before`."""
-    if kind == FOLLOW_LENGTH:
-        desired = body.tension_bias[m] + max(0.0, body.stiffness[m] * (length - command))
-    elif kind == FOLLOW_TENSION:
-        desired = max(0.0, command)
-    else:
-        change = STEP * RELEASE_RATE
-        desired = before + min(change, max(-change, body.tension_bias[m] - before))
-    return min(body.tension_max[m], desired)
-
-
-@njit(cache=True)
 def muscle_step(
     tree: Tree,
     routes: WrappedRoutes,
     body: Body,
+    modules: Modules,
     muscle: MuscleState,
     joint: JointState,
     scratch: Scratch,
@@ -175,6 +116,7 @@ def muscle_step(
         tree: Kinematic tree.
         routes: True routes.
         body: Constants of the individual.
+        modules: Constants of its muscle modules.
         muscle: Muscle state, changed.
         joint: Joint state, changed.
         scratch: Work arrays.
@@ -197,7 +139,7 @@ def muscle_step(
         scratch.absolute[routes.muscle[s]] += route_segment(
             routes, s, scratch.rotation, translation, world, leave[s], arrive[s]
         )
-    _wires_and_modules(body, muscle, kind, command, scratch.absolute)
+    _wires_and_modules(body, modules, muscle, kind, command, scratch.absolute)
     joint.torque[:] = 0.0
     _friction_and_stops(body, joint)
     for s in range(routes.first.shape[0]):
@@ -210,25 +152,13 @@ def muscle_step(
 
 @njit(cache=True)
 def _wires_and_modules(
-    body: Body, muscle: MuscleState, kind: int, command: Command, absolute: Array
+    body: Body, modules: Modules, muscle: MuscleState, kind: int, command: Command, absolute: Array
 ) -> None:
     for m in range(absolute.shape[0]):
         route = absolute[m] - body.length_at_zero[m]
-        before = muscle.length[m]
-        reading = before + command.length_error[m] + command.zero[m]
-        muscle.reference[m] = module_reference(
-            kind, command.value[m], reading, muscle.reference[m], body, m
-        )
-        if muscle.ruptured[m] > 0.0:
-            speed = -SPEED_LIMIT
-        else:
-            pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
-            speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
-        most = SPEED_LIMIT * (1.0 - command.stuck[m])
-        speed = min(most, max(-most, speed))
-        after = min(body.length_high[m], max(body.length_low[m], before + STEP * speed))
-        muscle.length[m] = after
-        slid = before - after
+        reading = muscle.length[m] + command.length_error[m] + command.zero[m]
+        pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
+        slid = wind(modules, muscle, kind, command, m, reading, pull)
         direction = 1.0 if slid > 0.0 else -1.0
         keep = math.exp(-abs(slid) / SLIDING_DISTANCE)
         muscle.sliding[m] = direction + (muscle.sliding[m] - direction) * keep
@@ -236,7 +166,7 @@ def _wires_and_modules(
             muscle.end_tension[m] = 0.0
         else:
             muscle.end_tension[m] = tension_from_elongation(
-                route - after - command.slack[m],
+                route - muscle.length[m] - command.slack[m],
                 body.force[m],
                 body.rate[m],
                 body.wire_stretch[m] * absolute[m],
@@ -244,12 +174,7 @@ def _wires_and_modules(
         muscle.tension[m] = muscle.end_tension[m] * math.exp(
             body.cable_friction[m] * muscle.sliding[m]
         )
-        inner = (muscle.winding[m] - muscle.housing[m]) / WINDING_RESISTANCE
-        outer = (muscle.housing[m] - AMBIENT) / HOUSING_RESISTANCE
-        heat = LOSS * muscle.tension[m] * muscle.tension[m]
-        muscle.winding[m] += STEP * (heat - inner) / WINDING_CAPACITY
-        muscle.housing[m] += STEP * (inner - outer) / HOUSING_CAPACITY
-        muscle.housing[m] = max(muscle.housing[m], command.hot[m])
+        heat(muscle, command, m)
 
 
 @njit(cache=True)

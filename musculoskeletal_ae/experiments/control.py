@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import ClosedLoop
@@ -69,7 +69,7 @@ class Approaches(NamedTuple):
     bound_there: dict[str, Array]
 
 
-def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
+def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
     """Approach `count` random targets from as many random starts each, by every method.
 
     The seed draws targets and starts; networks are by preset.
@@ -94,7 +94,7 @@ def protocol(arm: EmulatedArm, networks: Mapping[str, Mae], seed: int, count: in
     return Approaches(np.array([theta for theta, _ in held]), bound, offset, tension, there)
 
 
-def _bound(arm: EmulatedArm) -> float:
+def _bound(arm: Arm) -> float:
     jacobian = arm.individual.muscle_jacobian(arm.theta[None])[0]
     try:
         return float(np.linalg.norm(holding_tension(arm.robot, arm.theta, jacobian=jacobian)))
@@ -129,7 +129,7 @@ def measure(study: Study, seed: int) -> Measured:
     return Measured(numbers, {'errors': errors, 'tensions': ended.tension, 'bound': ended.bound})
 
 
-def _causes(smooth: EmulatedArm, mae: Mae, ended: Approaches) -> dict[str, float]:
+def _causes(smooth: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
     """Return what `proposed` plans, and what comes of it on the same body without friction.
 
     The plan's ‖T‖ beside the bound is the learned body's error; what the frictionless arm has

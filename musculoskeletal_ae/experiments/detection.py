@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM, AnomalyDetector
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, columns, rows_between
 from musculoskeletal_ae.mae.mae import Mae
@@ -70,7 +70,7 @@ class GraspAndCut:
             disturbed[rows_between(cut, cut + CUT_TIME + RECOVERED)] = True
         return disturbed
 
-    def __call__(self, arm: EmulatedArm, time: float) -> Bools | None:
+    def __call__(self, arm: Arm, time: float) -> Bools | None:
         """Grasp, cut or mend, if it is time to; see `recording.Script`."""
         if abs(time - self.grasp) < 0.5 * SAMPLE_TIME:
             arm.set_payload(PAYLOAD)
@@ -92,7 +92,7 @@ class GraspAndCut:
         return None
 
 
-def grasp_and_release(arm: EmulatedArm, time: float) -> None:
+def grasp_and_release(arm: Arm, time: float) -> None:
     """Grasp and release every minute; see `recording.Script`."""
     turn, since = divmod(round(time / SAMPLE_TIME), round(GRASPING / SAMPLE_TIME))
     if since == 0:

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import LENGTH_NOISE, TENSION_NOISE, EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE, Arm
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.robot.robot import Robot
@@ -103,7 +103,7 @@ def learned(robot: Robot, body: CorrectedBody) -> LeastSquares:
     return LeastSquares(robot, lengths, jacobian, at_zero, elastic)
 
 
-def oracle_errors(arm: EmulatedArm, seed: int, recording: Recording) -> dict[str, float]:
+def oracle_errors(arm: Arm, seed: int, recording: Recording) -> dict[str, float]:
     """Return the errors of least squares on an arm's true body [rad].
 
     `oracle_rad` is on the messages as they came; `sensor_rad` on messages made anew without

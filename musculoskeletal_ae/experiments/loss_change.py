@@ -18,7 +18,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import geometric_command, proposed
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import Motion, columns
 from musculoskeletal_ae.experiments.roles import elbow, flexed, plotted, shoulder, within
@@ -107,7 +107,7 @@ def _simulated(simulated: Simulation, robot: Robot, command: Array) -> Motion:
     return Motion(*columns(rows))
 
 
-def _pushed(arm: EmulatedArm, command: Array) -> Motion:
+def _pushed(arm: Arm, command: Array) -> Motion:
     rows = []
     for phase in (SETTLING, *PHASES):
         arm.set_wrench(np.array([*phase.force, 0.0, 0.0, 0.0]))

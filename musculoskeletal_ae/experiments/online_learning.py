@@ -25,7 +25,7 @@ from scipy.optimize import curve_fit
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import learned, oracle_errors
 from musculoskeletal_ae.experiments.recording import (
@@ -125,7 +125,7 @@ def train_initial(study: Study, preset: str) -> None:
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 
-def beginner(study: Study, arm: EmulatedArm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
+def beginner(study: Study, arm: Arm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
     """Return a learner that begins with the initial network, and the arm that it is to explore."""
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     learner = Learner(study.robot, initial, preset, seed, steps=steps)

@@ -15,7 +15,7 @@ from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 
@@ -25,7 +25,7 @@ EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
 #: told the arm and the time [s] before every step; may put weights into its hand or cut muscles,
 #: and says which ones (M,) are switched off, if any are
-Script = Callable[[EmulatedArm, float], Bools | None]
+Script = Callable[[Arm, float], Bools | None]
 
 
 class Recording(NamedTuple):
@@ -55,9 +55,7 @@ class ClosedLoop:
     sense → estimate → control → command
     """
 
-    def __init__(
-        self, arm: EmulatedArm, mae: Mae, settings: Settings | None = None, seed: int = 0
-    ) -> None:
+    def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
         """Connect an arm where it is; the random seed is that of the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self._read, self._now = arm.sense(), 0.0
@@ -107,7 +105,7 @@ class ClosedLoop:
 
 
 def record(
-    arm: EmulatedArm,
+    arm: Arm,
     mae: Mae,
     stream: int | Iterable[Step],
     duration: float,

@@ -80,6 +80,7 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
     about = {
         'robot': study.robot.description.directory.name,
         'preset': study.preset,
+        'reality': study.reality,
         'minutes': study.minutes,
         'quick': study.quick,
         'seeds': list(study.seeds),

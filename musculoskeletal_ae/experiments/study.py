@@ -19,8 +19,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.experiments.table import Row
 from musculoskeletal_ae.mae import checkpoint
@@ -46,22 +46,16 @@ class Study:
     minutes: float  # duration of the exploration
     quick: bool  # a fraction of everything, to try things out
     folder: Path  # where streams and networks are kept
+    reality: str = 'kin'  # the body of the individuals, see `make_arm`
 
     @property
     def held_out_time(self) -> float:
         """Duration of the motion never used for learning [s]."""
         return 20.0 if self.quick else 300.0
 
-    def arm(self, seed: int, friction: bool = True) -> EmulatedArm:
-        """Return an individual at rest; this is the one place where experiments get their arms.
-
-        Without friction, in wires and joints, it is the same body otherwise.
-        """
-        individual = Individual(self.robot, seed)
-        if not friction:
-            individual.cable_friction[:] = 0.0
-            individual.joint_friction[:] = 0.0
-        return EmulatedArm(self.robot, seed, individual)
+    def arm(self, seed: int, friction: bool = True) -> Arm:
+        """Return an individual at rest; without friction it is the same body otherwise."""
+        return make_arm(self.robot, seed, self.reality, friction)
 
     def network_file(self, preset: str, seed: int | None) -> Path:
         """Return the file of a network: initial (None), or learned on an individual."""

@@ -13,32 +13,28 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import Source, SourceError, refuse, safe_name
+from musculoskeletal_ae.importing.source import Source, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 
 
 def read_mjcf(file: Path, _root: ET.Element) -> Source:
-    """Read an MJCF file; a SourceError says if `mujoco` is not installed, or does not load it."""
-    try:
-        import mujoco
-    except ImportError as error:
-        told = "MJCF is read by MuJoCo's own package: pip install mujoco==3.10.0"
-        raise SourceError(told) from error
+    """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
-    return _Reader(mujoco, model, file.stem).source
+    return _Reader(model, file.stem).source
 
 
 class _Reader:
-    def __init__(self, mujoco: Any, model: Any, name: str) -> None:
-        self.mj, self.model, self.source = mujoco, model, Source(safe_name(name, 'robot'))
+    def __init__(self, model: Any, name: str) -> None:
+        self.model, self.source = model, Source(safe_name(name, 'robot'))
         self.source.model.gravity.linear = model.opt.gravity.copy()
         self.start = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.start)
@@ -61,7 +57,7 @@ class _Reader:
         for i in range(m.nbody):
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
             for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
-                if m.jnt_type[j] == self.mj.mjtJoint.mjJNT_FREE:
+                if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
                     told = f'free joint {self.name("joint", j)}, where the file puts it'
                     self.source.note('held fixed', told)
                     continue
@@ -76,7 +72,7 @@ class _Reader:
 
     def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
         """Add a joint that stands at a pose in the carrier at the start; return its number."""
-        m, source, types, name = self.model, self.source, self.mj.mjtJoint, self.name('joint', j)
+        m, source, types, name = self.model, self.source, mujoco.mjtJoint, self.name('joint', j)
         low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
         kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
         axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
@@ -94,7 +90,7 @@ class _Reader:
     def _couplings(self) -> None:
         m, source = self.model, self.source
         for e in np.flatnonzero(m.eq_active0).tolist():
-            if m.eq_type[e] != self.mj.mjtEq.mjEQ_JOINT:
+            if m.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT:
                 source.note('dropped', f'equality {self.name("equality", e)}: not of joints')
                 continue
             slave, master, terms = int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e][4::-1]
@@ -109,16 +105,16 @@ class _Reader:
             source.couple(name, self.name('joint', master), value)
 
     def _tendons(self) -> None:
-        m, mj, source = self.model, self.mj, self.source
+        m, source = self.model, self.source
         driven = defaultdict(list)
         for a in range(m.nu):
-            if m.actuator_trntype[a] == mj.mjtTrn.mjTRN_TENDON:
+            if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
                 driven[int(m.actuator_trnid[a][0])].append(self._strength(a))
             else:
                 source.note('dropped', f'actuator {self.name("actuator", a)}: on no tendon')
         for t in range(m.ntendon):
             name, first = self.name('tendon', t), m.tendon_adr[t]
-            if m.wrap_type[first] == mj.mjtWrap.mjWRAP_JOINT:
+            if m.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT:
                 source.note('dropped', f'tendon {name}: a fixed one, which has no route')
             elif driven and t not in driven:
                 source.note('dropped', f'tendon {name}: no actuator pulls it')
@@ -130,13 +126,13 @@ class _Reader:
     def _strength(self, a: int) -> float:
         m = self.model
         gain = m.actuator_gainprm[a]
-        if m.actuator_gaintype[a] == self.mj.mjtGain.mjGAIN_MUSCLE:
+        if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
             return float(gain[2] if gain[2] > 0.0 else gain[3] / m.actuator_acc0[a])
         limited = m.actuator_forcelimited[a]
         return float(np.abs(m.actuator_forcerange[a]).max()) if limited else 0.0
 
     def _route(self, name: str, wraps: range) -> None:
-        m, types = self.model, self.mj.mjtWrap
+        m, types = self.model, mujoco.mjtWrap
         branches: list[list[RoutePoint | Wrap]] = [[]]
         for w in wraps:
             kind, i = m.wrap_type[w], m.wrap_objid[w]
@@ -170,7 +166,7 @@ class _Reader:
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
         """Return MuJoCo's own lengths."""
-        m, mj, data, start = self.model, self.mj, self.mj.MjData(self.model), self.model.qpos0
+        m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
         address = {self.name('joint', j): at for j, at in enumerate(m.jnt_qposadr.tolist())}
         lengths = []
         for n in range(len(next(iter(values.values())))):
@@ -189,8 +185,8 @@ class _Reader:
                     at = m.jnt_qposadr[[slave, master]]
                     moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0
                     data.qpos[at[0]] = start[at[0]] + np.polyval(terms, moved)
-            mj.mj_kinematics(m, data)
-            mj.mj_comPos(m, data)
-            mj.mj_tendon(m, data)
+            mujoco.mj_kinematics(m, data)
+            mujoco.mj_comPos(m, data)
+            mujoco.mj_tendon(m, data)
             lengths.append(data.ten_length.copy())
         return dict(zip(self.tendons, np.array(lengths)[:, list(self.tendons.values())].T))

@@ -14,7 +14,7 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.report import Report
@@ -26,7 +26,7 @@ class HardwareEmulator(Arm):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('hardware_emulator', **options)
-        self.arm = EmulatedArm(self.robot, self.parameter('seed'))
+        self.arm = make_arm(self.robot, self.parameter('seed'), self.parameter('reality'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0

@@ -75,6 +75,11 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     'hardware_emulator': {
         **SHARED,
         'seed': SEED,
+        'reality': Parameter(
+            'kin',
+            'the body: kin (the first), foreign (a second one, of MuJoCo), or an MJCF file whose '
+            'joints and tendons have the names of the joints and muscles',
+        ),
         'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(

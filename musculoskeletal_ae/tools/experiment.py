@@ -30,6 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_robot()
     parser.add_preset('networks to measure; preset paper is always shown beside them')
     parser.add_seeds(None, 'individual arms (default: 0,1,2,3,4; quick: 0)')
+    parser.add_reality()
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
     parser.add_quick('a taste of everything, in a minute')
     parser.add_out('DIR', 'results and report', Path('experiments'))

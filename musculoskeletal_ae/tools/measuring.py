@@ -27,7 +27,9 @@ def measure(args: Namespace) -> None:
     robot = Robot.load(args.robot)
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
-        study = Study(robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder))
+        study = Study(
+            robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder), args.reality
+        )
         with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
 
             def report(share: float, running: str) -> None:

@@ -174,6 +174,7 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
         (['--view', '--port', '65536'], '65536'),
         (['--seed', '-1'], '-1'),
         (['--preset', 'best'], 'default or paper'),
+        (['--reality', 'dream'], 'kin, foreign or an MJCF file'),
         (['--namespace', '1st'], '1st'),
         (['--checkpoint', '/no/such/file'], '/no/such/file'),
         (['--fly'], '--robot'),

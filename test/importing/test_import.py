@@ -30,7 +30,6 @@ def put(directory, name, text):
 
 @pytest.fixture
 def mjcf(tmp_path):
-    pytest.importorskip('mujoco')
     return put(tmp_path, 'own.xml', bodies.MJCF)
 
 

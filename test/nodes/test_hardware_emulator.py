@@ -12,6 +12,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
@@ -192,3 +193,21 @@ def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):
     graph.next('marker_pose', 2)
     assert graph.set_parameter('hardware_emulator', 'marker_rate', 0.0)[0]
     assert emulator.marker_pose_rate == 0.0
+
+
+def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
+    graph.listen(Float64MultiArray, 'muscle_states')
+    graph.listen(JointState, 'joint_states')
+    graph.listen(MarkerArray, 'hardware_emulator/markers')
+    graph.emulator = graph.host(HardwareEmulator, robot='arm26', reality='foreign')
+    start = rows(graph, arm26)[0]
+    drive(graph, start - 0.02, lambda: rows(graph, arm26)[1].max() > 60.0, 'tension')
+    assert tuple(graph.next('joint_states').name) == arm26.joints
+    assert graph.next('hardware_emulator/markers').markers
+    for wrong in (['front'], [arm26.muscles[0], 'front']):
+        assert not graph.set_parameter('hardware_emulator', 'ruptured_muscles', wrong)[0]
+
+
+def test_no_such_reality_ends_it_with_a_reason(graph):
+    with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
+        graph.host(HardwareEmulator, robot='arm26', reality='no/such.xml')

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The second body: a reality that shares nothing with what the learner knows of bodies.
+
+Rigid bodies, wrapping, stops and joint friction by MuJoCo; wires, rubber and spools by `wires`; the
+muscle modules are those of every arm. It imports nothing of learning, of the geometric routes or of
+the series-elastic class (`test/test_house.py`).
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.emulator import mjcf
+from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
+from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.modules import STEP, Arm
+from musculoskeletal_ae.emulator.wires import (
+    TIMES,
+    Guides,
+    Memory,
+    Springs,
+    guides_step,
+    make_wires,
+    read,
+    wires_step,
+)
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+
+GUIDES_EVERY = 5  # steps
+HISTORY = 64  # steps that sensors may be late
+HOUR = 3600.0  # [s]
+BEDDING_TIME = 2.0 * HOUR  # [s]
+SLIP_TIME = 5.0 * HOUR  # [s] between two slips of a wire on its spool
+
+
+class ForeignBody:
+    """True lengths, moment arms, elastic laws and sensor errors of one arm, at rest and new."""
+
+    def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
+        """Look at a model whose joints and tendons have the robot's names."""
+        self._robot, self._model = robot, model
+        self._data = mujoco.MjData(model)
+        names, count = robot.kinematics.model.names[1:], robot.muscle_count
+        #: where the joints of the tree stand in qpos and qvel, and muscles among tendons
+        self.tree = np.array([model.joint(name).id for name in names])
+        self.tendons = np.array([model.tendon(name).id for name in robot.muscles])
+        self.length_at_zero = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
+        self.elastic = Springs(robot, self.length_at_zero, draw)
+        self.tension_gain: Array = 1.0 + draw.normal('tension_gain', count)
+        self.tension_bias: Array = draw.normal('tension_zero', count)
+        self.length_bias: Array = np.zeros(count)
+
+    def look(self, data: Any, theta: Array) -> None:
+        """Put the bones of some MjData at θ [rad] (D,) and find lengths and moment arms."""
+        data.qpos[self.tree] = self._robot.kinematics.tree_angles(theta)
+        mujoco.mj_fwdPosition(self._model, data)
+
+    def absolute_lengths(self, theta: Array) -> Array:
+        """Return the lengths of the routes [m], θ (N, D) gives (N, M)."""
+        lengths = np.empty((len(theta), len(self.tendons)))
+        for row, angles in zip(lengths, theta, strict=True):
+            self.look(self._data, angles)
+            row[:] = self._data.ten_length[self.tendons]
+        return lengths
+
+    def muscle_jacobian(self, theta: Array) -> Array:
+        """Return G [m/rad], θ (N, D) gives (N, M, D)."""
+        model, data = self._model, self._data
+        jacobian = np.empty((len(theta), model.ntendon, model.nv))
+        for dense, angles in zip(jacobian, theta, strict=True):
+            self.look(data, angles)
+            rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
+            mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
+        return self._robot.kinematics.of_theta(jacobian[:, self.tendons][:, :, self.tree])
+
+    def muscle_lengths(self, theta: Array, tension: Array) -> Array:
+        """Return l [m] without friction, loops, give and sensor errors, θ (N, D), T (N, M)."""
+        relative = self.absolute_lengths(theta) - self.length_at_zero
+        return relative - self.elastic.elongation(tension)
+
+
+class ForeignArm(Arm):
+    """An arm of MuJoCo.
+
+    Attributes:
+        individual: The true body that `seed` picked.
+        effects: How much is wrong with it.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int = 0,
+        effects: Effects | None = None,
+        file: Path | None = None,
+    ) -> None:
+        """Build an arm at rest, modules safe.
+
+        Args:
+            robot: The description's nominal body.
+            seed: Which individual, and its sensor noise.
+            effects: How much is wrong with it; as calibrated by default.
+            file: A user's own MJCF arm instead, which has its own effects and none of ours.
+
+        Raises:
+            MusculoskeletalError: If the robot or the file cannot be built.
+        """
+        self.effects = (effects or Effects()) if file is None else NONE
+        draw = self._draw = Draw(seed, self.effects)
+        spec = mjcf.from_file(robot, file) if file else mjcf.from_directory(robot, draw)
+        try:
+            model = self._model = spec.compile()
+        except ValueError as error:
+            told = ' '.join(str(error).split())
+            raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
+        data = self._data = mujoco.MjData(model)
+        self.individual = body = ForeignBody(robot, copy.copy(model), draw)
+        super().__init__(robot, seed, body.length_bias)
+        self._angles, self._rates = data.qpos, data.qvel
+        self._order = np.array([model.joint(name).id for name in robot.joints])
+        self._hand = model.body(mjcf.HAND).id
+        names = [model.body(i).name for i in range(model.nbody)]
+        self._root = names.index(robot.root_link) if file and robot.root_link in names else 0
+        self._guides = self._make_guides()
+        muscles = robot.muscle_count
+        self._memory = Memory(*(np.zeros(muscles) for _ in Memory._fields))
+        self._memory = self._memory._replace(slow=np.zeros((muscles, len(TIMES))))
+        body.look(data, 0.5 * (robot.lower + robot.upper))
+        guides_step(self._guides, np.zeros(muscles), self._memory.bend, 0.0)
+        at_zero, bend = body.length_at_zero, self._memory.bend
+        span = body.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - at_zero
+        self.wires = make_wires(robot, body.elastic, at_zero, span, bend, draw)
+        self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
+        self._draw_sensors()
+        self._time, self._steps = 0.0, 0
+        self._pull = np.zeros(muscles)
+        self._control = np.array([model.actuator(name).id for name in robot.muscles])
+        self._history = np.zeros((HISTORY, robot.joint_count + 3 * muscles))
+        self.reset()
+
+    def _make_guides(self) -> Guides:
+        model, data, sites = self._model, self._data, []
+        for t in self.individual.tendons:
+            path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+            of_sites = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
+            sites.append(model.wrap_objid[path][of_sites])
+        place, give = model.site_pos, self._draw.about('give', model.nsite)
+        runs = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.ravel(), data.ten_wrapadr
+        site = np.concatenate(sites), model.site_bodyid, data.xmat.reshape(-1, 9)
+        return Guides(*runs, data.ten_wrapnum, *site, place, place.copy(), give)
+
+    def _draw_sensors(self) -> None:
+        """Draw what is wrong with joint sensors and messages, and when wires slip."""
+        draw, joints, muscles = self._draw, self.robot.joint_count, self.robot.muscle_count
+        self._joint_zero = draw.normal('joint_zero', joints)
+        self._joint_bend = draw.about('joint_bend', joints, signed=True)
+        self._backlash = draw.about('backlash', joints)
+        self._delays = draw.about('delay', 2)
+        self._drift = draw.normal('length_drift', muscles) / HOUR
+        self._bedding = draw.about('bedding', muscles)
+        rng, knot = draw.rng('slips'), np.zeros(muscles)
+        self._knot_time, knot[rng.integers(muscles)] = rng.uniform(0.0, HOUR), 1.0
+        self._knot = knot * draw.about('knot', 1)
+        self._slips, self._slipped = rng, np.zeros(muscles)
+
+    def _stand(self, theta: Array) -> None:
+        mujoco.mj_resetData(self._model, self._data)
+        self._guides.place[:] = self._guides.rest
+        self.individual.look(self._data, theta)
+        self._play = theta + self._joint_zero
+
+    def reset(self, theta: Array | None = None) -> None:
+        """Put the arm at rest at θ, as `Arm.reset`; it gets no younger by that."""
+        super().reset(theta)
+        self._memory.rest[:] = 1.0
+        for m in range(self.robot.muscle_count):
+            read(self.wires, self._muscle, self._memory, self._command, m)
+        self._history[:] = self._now()
+        self._last: Readings | None = None
+
+    def _attach(self, which: Bools) -> None:
+        super()._attach(which)
+        memory, bias = self._memory, self.robot.tension.bias
+        self._muscle.length[which] -= memory.longer[which]
+        memory.elongation[which] = self.individual.elastic.elongation(bias)[which]
+        memory.slow[which], memory.loop[which] = 0.0, 0.0
+
+    def set_payload(self, mass: float) -> None:
+        """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
+        self._model.body_mass[self._hand] = mass
+        self._model.body_inertia[self._hand] = 0.4 * mass * 0.05**2
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+
+    def step(self, duration: float) -> None:
+        """Let time pass [s], in whole steps of `STEP`."""
+        age = self._time / BEDDING_TIME
+        longer = self._bedding * -np.expm1(-age) + self._knot * (self._time > self._knot_time)
+        slipping = self._slips.uniform(size=len(longer)) < duration / SLIP_TIME
+        self._slipped = self._slipped + slipping * self._slips.choice([-1.0, 1.0], len(longer))
+        self._memory.longer[:] = longer + self.effects.spool_slip * self._slipped
+        # The sensors drift until somebody zeroes them, as `set_length_offset` does.
+        self._command.length_error[:] += self._drift * duration
+        super().step(duration)
+        self._time += duration
+
+    def _step(self) -> None:
+        model, data, muscle = self._model, self._data, self._muscle
+        if self.broken:
+            return
+        mujoco.mj_step1(model, data)
+        self._steps += 1
+        if self._steps % GUIDES_EVERY == 0:
+            guides_step(self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP)
+        wires_step(
+            self.wires, self._wound, muscle, self._memory, self._kind, self._command,
+            data.ten_length[self.individual.tendons], self._pull,
+        )  # fmt: skip
+        data.ctrl[self._control] = self._pull
+        data.qfrc_applied[:] = 0.0
+        if self._wrench.any():
+            turn = data.xmat[self._root].reshape(3, 3)
+            push, twist = turn @ self._wrench[:3], turn @ self._wrench[3:]
+            at = data.xpos[self._hand]
+            mujoco.mj_applyFT(model, data, push, twist, at, self._hand, data.qfrc_applied)
+        mujoco.mj_step2(model, data)
+        self._history[self._steps % HISTORY] = self._now()
+
+    def _now(self) -> Array:
+        """Return what is to be sensed: θ, l and T as the modules' sensors have them, heat."""
+        memory, muscle = self._memory, self._muscle
+        return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
+
+    def _sensed(self) -> tuple[Array, Array, Array, Array]:
+        joints, jitter = self.robot.joint_count, self.effects.jitter * self._rng.uniform(-0.5, 0.5)
+        late = np.maximum(self._delays + jitter, 0.0) / STEP
+        seen = [self._history[(self._steps - round(steps)) % HISTORY] for steps in late]
+        half, span = 0.5 * self._backlash, self.robot.upper - self.robot.lower
+        theta = seen[0][:joints] + self._joint_zero
+        theta = theta + self._joint_bend * span * np.sin(2.0 * np.pi * theta / span)
+        self._play = np.clip(self._play, theta - half, theta + half)
+        return self._play, *seen[1][joints:].reshape(3, -1)
+
+    def sense(self) -> Readings:
+        """Read all sensors once, late, with their noise, errors, resolution and faults."""
+        now = super().sense()
+        last = self._last or now
+        lost = self._rng.uniform(size=len(now.length)) < self.effects.dropouts
+        length, tension = (np.where(lost, old, new) for old, new in zip(last[1:3], now[1:3]))
+        self._last = now._replace(length=length, tension=tension)
+        return self._last
+
+    @property
+    def hand(self) -> pin.SE3:
+        """True pose of the end effector in the root link's frame."""
+        data = self._data
+        root, hand = (
+            pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i]) for i in (self._root, self._hand)
+        )
+        return root.actInv(hand)
+
+    def route_points(self) -> Array:
+        """True route points in the root link's frame [m], shape (P, 3)."""
+        root, data = self._root, self._data
+        points: Array = data.site_xpos[self._guides.site] - data.xpos[root]
+        return points @ data.xmat[root].reshape(3, 3)

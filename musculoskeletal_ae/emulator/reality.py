@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which body plays reality; the one place where nodes and experiments get their arms from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+
+KIN, FOREIGN = 'kin', 'foreign'
+
+
+def make_arm(robot: Robot, seed: int = 0, reality: str = KIN, friction: bool = True) -> Arm:
+    """Return an arm at rest.
+
+    Args:
+        robot: The description's nominal body.
+        seed: Which individual.
+        reality: 'kin', the first body, which differs from its model in what the learner fits;
+            'foreign', the second one, whose mechanics are foreign too; or a user's MJCF file, whose
+            joints and tendons have the names of the robot's joints and muscles.
+        friction: False: the same body otherwise, without friction in wires and joints.
+
+    Raises:
+        MusculoskeletalError: If there is no such reality, or the robot's names are not in the file.
+    """
+    if reality == KIN:
+        individual = Individual(robot, seed)
+        if not friction:
+            individual.cable_friction[:] = 0.0
+            individual.joint_friction[:] = 0.0
+        return EmulatedArm(robot, seed, individual)
+    file = None if reality == FOREIGN else Path(reality).expanduser()
+    if file is not None and not file.is_file():
+        legal = f'{KIN}, {FOREIGN} or an MJCF file'
+        raise MusculoskeletalError(f'reality {reality!r} is no such file; legal: {legal}')
+    # Only here, so that the first body does not wait for MuJoCo.
+    from musculoskeletal_ae.emulator.effects import Effects
+    from musculoskeletal_ae.emulator.foreign import ForeignArm
+
+    effects = Effects()
+    if not friction:
+        effects = replace(effects, guide_friction=0.0, joint_friction=0.0)
+    return ForeignArm(robot, seed, effects, file)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The second body: without effects it is the described one, each effect does what it is named."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import bodies
+import numpy as np
+import pytest
+from robots import read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.emulator import foreign
+from musculoskeletal_ae.emulator.effects import NONE, Effects
+from musculoskeletal_ae.emulator.foreign import ForeignArm
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.emulator.wires import law
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.robot.robot import Robot
+
+WRAP = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, -0.3], 'axis': [0, 1, 0], 'radius': 0.02}
+EFFECTS = {field.name: getattr(Effects(), field.name) or 1.0 for field in fields(Effects)}
+
+
+@pytest.fixture(scope='module')
+def robot():
+    return Robot.load('arm26')
+
+
+@pytest.fixture(scope='module')
+def coupled(tmp_path_factory):
+    """Return an arm with a coupled joint and a described wrap."""
+    directory = write_robot(tmp_path_factory.mktemp('coupled'), finger=True)
+    document = read_muscles(directory)
+    document['couplings'] = [{'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}]
+    document['muscles'][4]['route'].append({'link': 'fingertip', 'xyz': [0.02, 0.01, 0.0]})
+    route = next(m['route'] for m in document['muscles'] if m['route'][-1]['link'] == 'lower')
+    route.insert(len(route) - 1, WRAP)
+    return Robot.load(write_muscles(directory, document))
+
+
+@pytest.fixture(scope='module')
+def imported(tmp_path_factory):
+    """Return a user's MJCF file, and the robot that `import_robot` makes of it."""
+    folder = tmp_path_factory.mktemp('imported')
+    file = folder / 'own.xml'
+    file.write_text(bodies.MJCF, encoding='utf-8')
+    return file, import_robot(file, folder / 'own').robot
+
+
+def drive(arm, seconds=0.3, tension=80.0):
+    """Drive an arm to mid-range and return what happened on the way, (N, 2D + 3M)."""
+    robot, rows = arm.robot, []
+    theta = 0.5 * (robot.lower + robot.upper)
+    tensions = np.full(robot.muscle_count, tension)
+    command = robot.muscle_lengths(theta, tensions) - (tension - 30.0) / robot.stiffness
+    for _ in range(round(seconds / 0.02)):
+        arm.command_length(command)
+        arm.step(0.02)
+        read = arm.sense()
+        rows.append(np.concatenate([arm.theta, arm.tension, *read[:3]]))
+    return np.array(rows)
+
+
+def test_without_effects_it_is_the_described_body(robot, coupled, imported):
+    for model in (robot, Robot.load('musashi_left_arm'), coupled, imported[1]):
+        true = ForeignArm(model, 0, NONE).individual
+        theta = model.random_postures(20, np.random.default_rng(0))
+        lengths, jacobian = true.absolute_lengths(theta), true.muscle_jacobian(theta)
+        np.testing.assert_allclose(lengths, model.routes.absolute_lengths(theta), atol=1e-9)
+        if model.kinematics.transmission is None or model is coupled:
+            slopes = model.routes.muscle_jacobian(theta)
+            np.testing.assert_allclose(jacobian, slopes, atol=1e-6)
+        tension = np.broadcast_to(model.tension.limit, lengths.shape)
+        off = true.muscle_lengths(theta, tension) - model.muscle_lengths(theta, tension)
+        # Its wire stretches as it does at θ = 0, wherever the arm is.
+        stretch = model.series_elastic.wire_stretch * tension * (lengths - true.length_at_zero)
+        np.testing.assert_allclose(off, stretch, atol=2e-5)
+
+
+def test_a_coupled_joint_follows_its_master(coupled):
+    arm = ForeignArm(coupled, 0, NONE)
+    drive(arm, 3.0)
+    names = list(coupled.kinematics.model.names[1:])
+    finger, bend = (arm._data.joint(name).qpos[0] for name in ('finger', 'bend'))
+    assert {'finger', 'bend'} <= set(names)
+    assert finger == pytest.approx(-0.5 * bend + 0.2, abs=0.02)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_each_effect_alone_makes_another_arm_of_it(robot, name, monkeypatch):
+    monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
+    monkeypatch.setattr(foreign, 'HOUR', 0.1)
+    size = EFFECTS[name] if name != 'dropouts' else 0.5
+    # Stiction is of friction, late stretch of a wire, and a heavy creep shows at once.
+    others = {'stiction': {'guide_friction': 0.25}, 'jitter': {'delay': 0.0125}}.get(name, {})
+    bare = replace(NONE, **others)
+    lives = [drive(ForeignArm(robot, 1, e)) for e in (bare, bare, replace(bare, **{name: size}))]
+    np.testing.assert_array_equal(lives[0], lives[1])
+    assert np.abs(lives[2] - lives[0]).max() > 1e-6
+
+
+def test_an_effect_that_is_switched_off_leaves_the_draws_of_the_others(robot):
+    whole, part = (
+        ForeignArm(robot, 1, effects) for effects in (Effects(), replace(Effects(), hysteresis=0.0))
+    )
+    for name, values in whole.wires._asdict().items():
+        if name != 'hysteresis':
+            np.testing.assert_array_equal(values, getattr(part.wires, name))
+    np.testing.assert_array_equal(whole._model.site_pos, part._model.site_pos)
+
+
+def test_rubber_pulls_harder_on_the_way_out_than_on_the_way_back(robot):
+    arm = ForeignArm(robot, 1, replace(NONE, hysteresis=0.15))
+    memory, tension = arm._memory, arm._muscle.end_tension
+    for tensions, side in ((np.linspace(30.0, 200.0, 60), 1.0), (np.linspace(200.0, 40.0, 30), -1)):
+        for each in tensions:
+            arm.command_tension(np.full(robot.muscle_count, each))
+            arm.step(0.02)
+        middle = [law(arm.wires, m, x) for m, x in enumerate(memory.elongation)]
+        assert np.all(side * memory.loop > 0.5)
+        assert np.all(side * (tension - middle) > 0.5)
+
+
+def test_rubber_creeps_as_much_in_every_decade_of_time(robot):
+    arm, crept = ForeignArm(robot, 1, replace(NONE, creep=0.04)), []
+    arm.command_timeout = np.inf
+    arm.command_tension(np.full(robot.muscle_count, 150.0))
+    for seconds in (1.0, 9.0, 40.0):
+        arm.step(seconds)
+        crept.append(arm._memory.slow[:, :4].sum(axis=1) / arm._memory.elongation)
+    decades = np.diff(crept, axis=0) / [[1.0], [np.log10(5.0)]]
+    # Of 2/3 to 4/3 of 4 % of the elongation, and half of that for so few elements.
+    assert np.all((decades > 0.5 * 0.04 * 2.0 / 3.0) & (decades < 1.5 * 0.04 * 4.0 / 3.0))
+
+
+def test_friction_grows_with_the_bends_of_the_wire(robot):
+    arm = ForeignArm(robot, 1, replace(NONE, heads=0.4, guide_friction=0.25))
+    bends, losses = [], []
+    for theta in (robot.lower, robot.upper):
+        arm.reset(theta)
+        for _ in range(20):  # winding in, so that every wire slides
+            arm.command_tension(np.full(robot.muscle_count, 150.0))
+            arm.step(0.01)
+        muscle = arm._muscle
+        bends.append(arm._memory.bend.copy())
+        losses.append(np.log(muscle.tension / muscle.end_tension) / muscle.sliding)
+    bends, losses = np.array(bends), np.array(losses)
+    bent = np.abs(bends[1] - bends[0]) > 0.2
+    assert bent.any()
+    steeper = (losses[1] - losses[0]) * (bends[1] - bends[0])
+    assert np.all(steeper[bent] > 0.0)
+
+
+def test_a_users_model_plays_the_robot(imported):
+    file, robot = imported
+    arm = make_arm(robot, 0, str(file))
+    described = ForeignArm(robot, 0, NONE)
+    theta = robot.random_postures(5, np.random.default_rng(0))
+    lengths = arm.individual.absolute_lengths(theta)
+    np.testing.assert_allclose(lengths, described.individual.absolute_lengths(theta), atol=1e-6)
+    motions = [drive(each, 2.0)[:, : robot.joint_count] for each in (arm, described)]
+    assert np.ptp(motions[0], axis=0).max() > 0.1
+    assert np.isfinite(motions[0]).all()
+    hand = robot.kinematics.end_effector_pose(arm.theta).translation
+    np.testing.assert_allclose(arm.hand.translation, hand, atol=1e-3)  # a step earlier
+    assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('name="swing"', 'name="swung"', "joint 'swing'"),
+        ('name="front"', 'name="ahead"', "tendon 'front'"),
+        ('<mujoco', '<mujoko', 'MuJoCo does not load it'),
+    ],
+)
+def test_a_model_that_does_not_fit_the_robot_is_refused(imported, tmp_path, old, new, told):
+    other = tmp_path / 'other.xml'
+    text = bodies.MJCF.replace(old, new, 1).replace(f'tendon="{old[6:-1]}"', 'tendon="ahead"')
+    other.write_text(text, encoding='utf-8')
+    with pytest.raises(MusculoskeletalError, match=told):
+        make_arm(imported[1], 0, str(other))
+
+
+def test_no_such_reality_is_refused(robot):
+    with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
+        make_arm(robot, 0, 'dream')
