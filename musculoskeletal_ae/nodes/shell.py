@@ -55,6 +55,8 @@ LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of 
 class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
 
+    core: Any = None  # what computes
+
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
         super().__init__(name, **options)
@@ -91,11 +93,13 @@ class Shell(Node):
     # -- what a node overrides ------------------------------------------------------------------
 
     def report(self) -> Report:
-        """Return what /diagnostics shows."""
-        return Report('ok', 'running', {})
+        """Return what /diagnostics shows: what the core says, where there is one."""
+        return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
+        if self.core:
+            self.core.clock_jumped_back()
 
     # -- what must not end the node -------------------------------------------------------------
 
