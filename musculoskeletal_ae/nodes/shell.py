@@ -40,8 +40,8 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
-from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.parameters import Parameter
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
@@ -73,7 +73,8 @@ class Shell(Node):
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         #: name of the root link's frame in messages that are published
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
-        self._reception = Reception(lambda text: self.get_logger().warning(text))
+        warn = self.get_logger().warning
+        self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
