@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
+from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.methods import first_command
+from musculoskeletal_ae.control.posture import RAMP_SHARE, Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
 
