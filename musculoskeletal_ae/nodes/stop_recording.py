@@ -79,11 +79,12 @@ class StopRecording:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
             with BagWriter(bag) as writer:
-                for when, relative, message in messages:
-                    name, topic = self._resolve(relative), TOPICS[relative]
-                    if name not in writer.topics:
-                        writer.add_topic(name, topic.type, [offered_qos(topic.latched)])
-                    writer.write(name, when, when, serialize_message(message))
+                names = {t: self._resolve(t) for t in dict.fromkeys(m.topic for m in messages)}
+                for topic, name in names.items():
+                    kind, latched, _ = TOPICS[topic]
+                    writer.add_topic(name, kind, [offered_qos(latched)])
+                for when, topic, message in messages:
+                    writer.write(names[topic], when, when, serialize_message(message))
             (bag / FILE).write_text(f'{cause}\n', encoding='utf-8')
             for old in sorted(self._directory.glob(f'stop_*/{FILE}'))[:-most]:
                 shutil.rmtree(old.parent)
