@@ -31,9 +31,9 @@ class Spread:
     wrap: float = 0.4
     elastic: float = 0.15  # standard deviation of the logarithm of each elastic constant
     cable_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
-    #: mean Coulomb torque of a joint, as a share of the largest torque that the arm's weight puts
-    #: on any joint
-    joint_friction: float = 0.02
+    #: mean Coulomb torque of a joint, as a share of its own load: the largest torque that the arm's
+    #: weight puts on it, and the most that muscles at T_bias do, pulling either way
+    joint_friction: float = 0.0133
     length_bias: float = 0.0005  # standard deviation of each length sensor's zero error [m]
     tension_bias: float = 1.0  # of each tension sensor's zero error [N]
     tension_gain: float = 0.01  # of each tension sensor's relative gain error
@@ -79,9 +79,11 @@ class Individual:
         )
         #: of muscles (M,) and joints [N·m], (D,) in the order of θ
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
-        largest = np.abs(kin.holding_torque(robot.random_postures(200, rng))).max()
+        theta = robot.random_postures(200, rng)
+        pulls = np.abs(nominal.muscle_jacobian(theta)) * robot.tension.bias[:, None]
+        load = np.abs(kin.holding_torque(theta)).max(axis=0) + pulls.sum(axis=1).max(axis=0)
         self.joint_friction: Array = (
-            spread.joint_friction * largest * rng.uniform(0.5, 1.5, robot.joint_count)
+            spread.joint_friction * load * rng.uniform(0.5, 1.5, robot.joint_count)
         )
         #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The site of these pages, with a reference made from the docstrings.
+
+.venv/bin/pip install -r doc/requirements.txt
+.venv/bin/python -m sphinx -W doc build/doc      # then open build/doc/index.html
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.ext import apidoc
+
+FOLDER = Path(__file__).resolve().parent
+PACKAGE = FOLDER.parent / 'musculoskeletal_ae'
+sys.path.insert(0, str(PACKAGE.parent))
+
+project = 'musculoskeletal_ae'
+author = 'the authors of musculoskeletal_ae'
+extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'sphinx.ext.viewcode']
+exclude_patterns = ['requirements.txt']
+html_theme = 'furo'
+html_title = project
+myst_heading_anchors = 3
+autodoc_member_order = 'bysource'
+autodoc_typehints = 'description'
+# Only nodes/ and the page need them, and neither is part of the reference.
+autodoc_mock_imports = ['rclpy', 'viser', 'rich', 'mujoco']
+#: fields of records are explained where they are defined; napoleon would list them twice
+napoleon_use_ivar = True
+suppress_warnings = ['autodoc.mocked_object', 'ref.python', 'myst.xref_missing']
+
+
+def write_reference(_: Sphinx) -> None:
+    """Write one page for each room of the package, those that nobody builds on excepted."""
+    left_out = [str(PACKAGE / room) for room in ('nodes', 'tools', 'view', 'importing')]
+    out = str(FOLDER / 'reference')
+    apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
+
+
+def as_written(*event: Any) -> None:
+    """Keep bars, stars and `code` what they are, and indented blocks as equations."""
+    lines: list[str] = event[-1]
+    text = re.sub(r'(?<!`)`([^`]+)`(?!`)', r'``\1``\ ', '\n'.join(lines))
+    equation = False
+    new: list[str] = []
+    for line in text.split('\n'):
+        begins = line.startswith('    ') and new[-1:] == [''] and not equation
+        equation = begins or (equation and line[:1] in ('', ' '))
+        if begins:
+            new += ['::', '']
+        new.append(line if equation else re.sub(r'(?<!\*)([|*])(?!\*)', r'\\\1', line))
+    lines[:] = new
+
+
+def setup(app: Sphinx) -> None:
+    """Let Sphinx write the reference before it reads the pages."""
+    app.connect('builder-inited', write_reference)
+    app.connect('autodoc-process-docstring', as_written, priority=400)  # before napoleon
