@@ -93,14 +93,11 @@ def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
 def write_ours(path: Path, content: list[Sample], compression: str, finish: bool) -> None:
     """Write with our recorder's writer, chunks of ten messages; unfinished: as after SIGKILL."""
     writer = BagWriter(path, compression)
-    numbers: dict[str, int] = {}
     for i, sample in enumerate(content):
-        if sample.topic not in numbers:
+        if sample.topic not in writer.topics:
             latched = TOPICS[interface_name(sample.topic)].latched
-            numbers[sample.topic] = writer.add_topic(
-                sample.topic, sample.type, [offered_qos(latched)]
-            )
-        writer.write(numbers[sample.topic], *sample[2:])
+            writer.add_topic(sample.topic, sample.type, [offered_qos(latched)])
+        writer.write(sample.topic, *sample[2:])
         if i % 10 == 9:
             writer.flush()
     if finish:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import Exploration, Step
+from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.posture import Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,

@@ -26,7 +26,8 @@ import torch
 
 from bench.learned_arm import initial, learned_arm, postures
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import DURATIONS, Step
+from musculoskeletal_ae.control.exploration import DURATIONS
+from musculoskeletal_ae.control.posture import Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import Individual

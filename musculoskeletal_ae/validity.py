@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which messages are used: the rules of validity and of order (doc/interface.md), without ROS.
+"""Which messages are used: the rules of validity (doc/interface.md), without ROS.
 
 Messages are told by their fields, so that the rules hold for a live message and for one of a bag
 alike. What breaks a rule raises `MessageError` with a short reason; who reads counts it and lives
@@ -25,32 +25,6 @@ MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
 MOST_EFFORT = 1000.0  # [N·m] asked of one joint
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
-
-# A source time that lies further back than this is another publisher's clock, not a reordering.
-REORDERING = 1_000_000_000  # [ns]
-LATE = 'repeated or reordered'
-
-
-class SourceOrder:
-    """Of the messages of one publisher, those that come twice or late are not used."""
-
-    def __init__(self) -> None:
-        self._last = 0, 0
-
-    def is_late(self, time: int, number: int = 0) -> bool:
-        """Say whether a message was sent no later than the last one that was taken.
-
-        At `time` [ns] as the publisher's `number`th, which goes on when its clock steps back; 0
-        where that is not known.
-        """
-        last_time, last_number = self._last
-        return time > 0 and 0 <= last_time - time < REORDERING and number <= last_number
-
-    def take(self, time: int, number: int = 0) -> bool:
-        """Compare with this message from now on; say whether it is numbered lower than the last."""
-        lower = number < self._last[1]
-        self._last = time, number
-        return lower
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:

@@ -16,7 +16,6 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.validity import (
-    SourceOrder,
     read_array,
     read_joints,
     read_posture,
@@ -24,7 +23,6 @@ from musculoskeletal_ae.validity import (
 )
 
 JOINTS = ('a', 'b')
-SECOND = 1_000_000_000  # [ns]
 
 
 def muscle_array(data, sizes=None, strides=None, offset=0):
@@ -175,21 +173,3 @@ def test_messages_are_told_by_their_fields_whatever_library_made_them():
         read_array(recorded, 2, 2)
     recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
     assert read_posture(recorded, JOINTS).tolist() == [1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ('time', 'number', 'late'),
-    [
-        (100 * SECOND, 7, True),  # twice
-        (100 * SECOND - 1, 6, True),  # reordered
-        (100 * SECOND + 1, 8, False),
-        (100 * SECOND - 1, 8, False),  # the publisher's clock stepped back
-        (99 * SECOND, 6, False),  # another publisher's clock
-        (0, 0, False),  # not known
-    ],
-)
-def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number, late):
-    order = SourceOrder()
-    assert not order.is_late(100 * SECOND, 7)
-    order.take(100 * SECOND, 7)
-    assert order.is_late(time, number) == late

@@ -15,10 +15,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import interface_topics
-from musculoskeletal_ae.exceptions import BagError, MessageError
+from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import LATE, QUANTITIES, SourceOrder, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
 
 class Series(NamedTuple):
@@ -67,14 +68,17 @@ class Streams(NamedTuple):
 
 @dataclass
 class _Stream:
-    """A topic that is being read: the shape of its values, and what was wrong with the last one."""
+    """A topic that is being read, and the shape of its values."""
 
     shape: tuple[int, ...]
     read: Callable[[Any], Array]
-    order: SourceOrder = field(default_factory=SourceOrder)
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
-    problem: str = ''
+
+    def take(self, message: tuple[float, Any]) -> None:
+        """Take the time and the content of a message."""
+        self.values.append(self.read(message[1]))
+        self.times.append(message[0])
 
 
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
@@ -91,25 +95,20 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     }
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
-    start, rejected = bag.start, Counter[str]()
+    start, told = bag.start, list[str]()
+    reception = Reception(told.append)
+    receive = {name: reception.of(name, topic.take, lambda: 1) for name, topic in topics.items()}
     for message in bag.messages(topics):
-        topic, stream = message.topic, topics[message.topic]
-        if stream.order.is_late(message.publish_time):
-            rejected[f'{topic}: {LATE}'] += 1
-            continue
-        stream.order.take(message.publish_time)
-        try:
-            stream.values.append(stream.read(bag.decode(message)))
-            stream.times.append((message.log_time - start) / 1e9)
-        except MessageError as error:
-            rejected[f'{topic}: {error.reason}'] += 1
-            stream.problem = str(error)
+        content = (message.log_time - start) / 1e9, bag.decode(message)
+        sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
+        receive[message.topic](content, sent)
     for topic, stream in topics.items():
-        if stream.problem and not stream.values:
-            problem = f'no message of {topic} fits the robot ({stream.problem})'
+        why = [each.partition(f' {topic}: ')[2] for each in told if f' {topic}: ' in each]
+        if why and not stream.values:
+            problem = f'no message of {topic} fits the robot ({why[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
     joints, states, lengths, tensions = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
-    return Streams(joints, states, lengths, tensions, rejected)
+    return Streams(joints, states, lengths, tensions, reception.rejected)

@@ -36,11 +36,12 @@ class BagWriter:
         """Create the directory; one that exists must be empty, else there is a BagError."""
         self.directory = Path(directory)
         self._name = f'{self.directory.resolve().name}_0.mcap'
-        self._topics: dict[int, metadata.Topic] = {}
+        self.topics: dict[str, metadata.Topic] = {}
+        self._numbers: dict[str, int] = {}  # of topics
         self._schemas: dict[str, int] = {}
-        self._pending: list[tuple[int, int, int, bytes]] = []
+        self._pending: list[tuple[int, str, int, bytes]] = []
         self._pending_size = 0
-        self._counts: Counter[int] = Counter()
+        self._counts: Counter[str] = Counter()
         self._times: list[int] = []  # the earliest and the latest
         with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -59,8 +60,8 @@ class BagWriter:
 
     def add_topic(
         self, name: str, type_name: str, qos: Sequence[metadata.Qos], schema: Schema = NO_SCHEMA
-    ) -> int:
-        """Add a topic by its absolute name and return its number.
+    ) -> None:
+        """Add a topic by its absolute name.
 
         The schema is a definition to copy as it is, for a type that is not of ROS 2 Jazzy.
         """
@@ -72,12 +73,12 @@ class BagWriter:
             self._schemas[type_name] = self._mcap.register_schema(type_name, encoding, text)
         extra = {'offered_qos_profiles': metadata.qos_text(qos), 'topic_type_hash': type_hash}
         number = self._mcap.register_channel(name, 'cdr', self._schemas[type_name], extra)
-        self._topics[number] = metadata.Topic(name, type_name, 'cdr', qos, type_hash)
+        self._numbers[name] = number
+        self.topics[name] = metadata.Topic(name, type_name, 'cdr', qos, type_hash)
         self._write_metadata(finished=False)
-        return number
 
-    def write(self, topic: int, log_time: int, publish_time: int, data: bytes) -> None:
-        """Add a serialized message to a topic by number; the next `flush` puts it into the file."""
+    def write(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
+        """Add a serialized message to a topic; the next `flush` puts it into the file."""
         self._pending.append((log_time, topic, publish_time, data))
         self._pending_size += len(data)
         if self._pending_size > _LARGEST_CHUNK:
@@ -90,7 +91,7 @@ class BagWriter:
         self._pending, self._pending_size = [], 0
         with self._writing():
             for log_time, topic, publish_time, data in pending:
-                self._mcap.add_message(topic, log_time, data, publish_time)
+                self._mcap.add_message(self._numbers[topic], log_time, data, publish_time)
                 self._counts[topic] += 1
             self._mcap.flush()
         if pending:
@@ -122,8 +123,8 @@ class BagWriter:
 
     def _write_metadata(self, finished: bool) -> None:
         # Counts come with the end: until then readers go by what is in the mcap file.
-        counts, times = (self._counts, self._times) if finished else (Counter[int](), [])
-        topics = [metadata.TopicCount(topic, counts[n]) for n, topic in self._topics.items()]
+        counts, times = (self._counts, self._times) if finished else (Counter[str](), [])
+        topics = [metadata.TopicCount(topic, counts[name]) for name, topic in self.topics.items()]
         with self._writing():
             metadata.write_metadata(self.directory, self._name, topics, times, finished)
 
@@ -179,12 +180,10 @@ def _open(path: Path) -> tuple[Bag, bool]:
 def _copy(bag: Bag, target: Path) -> int:
     """Write a bag anew and read it again; return its number of messages."""
     with BagWriter(target) as writer:
-        numbers = {
-            name: writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
-            for name, topic in bag.topics.items()
-        }
-        for topic, log_time, publish_time, data, *_ in bag.messages():
-            writer.write(numbers[topic], log_time, publish_time, data)
+        for name, topic in bag.topics.items():
+            writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
+        for message in bag.messages():
+            writer.write(*message[:4])
     return Bag.open(target).message_count
 
 

@@ -24,8 +24,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
-from musculoskeletal_ae.control.exploration import Exploration
-from musculoskeletal_ae.control.gentle import GentleMotion, gentle_limit
+from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.methods import TorqueControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter

@@ -21,7 +21,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
-from musculoskeletal_ae.control.exploration import RAMP_SHARE, Step
 from musculoskeletal_ae.control.methods import Solution, stiffness_command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
@@ -29,6 +28,8 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
+# Share of a movement in which the command moves; the arm settles and is sampled in the rest.
+RAMP_SHARE = 0.6
 PEAK = 1.5  # fastest over mean speed of a ramp
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
 CORRECTION = 0.3  # [rad] at most
@@ -121,6 +122,17 @@ class Goal(NamedTuple):
     method: str
     duration: float
     tension: Array | None = None
+
+
+class Step(NamedTuple):
+    """One step of the exploration."""
+
+    method: str  # 'first' or 'second'
+    theta: Array  # θ_target [rad], (D,)
+    # T_const [N] of `first`, (M,); of `second`, which takes the tension of the moment, what the
+    # geometric model expects that to be
+    tension: Array
+    duration: float  # [s]
 
 
 class PostureControl:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import permutations
 
 import numpy as np
@@ -70,25 +71,25 @@ class Listening:
         """How many messages of muscle_states came, whatever they said."""
         return len(self._times)
 
-    def muscles(self, message: object, now: float) -> Array | None:
-        """Take a message of muscle_states; return what it says (3, M), if it can be read."""
+    def muscles(self, message: object, now: float) -> None:
+        """Take a message of muscle_states."""
         self._times.append(now)
-        try:
+        with self._rejecting('muscle_states'):
             states = read_array(message, len(QUANTITIES), self._robot.muscle_count)
-        except MessageError as error:
-            self._rejected.setdefault(('muscle_states', error.reason), []).append(error)
-            return None
-        self._read.append((states, self._theta))
-        return states
+            self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:
         """Take a message of joint_states."""
-        try:
+        with self._rejecting('joint_states'):
             theta = read_posture(message, self._robot.joints)
-        except MessageError as error:
-            self._rejected.setdefault(('joint_states', error.reason), []).append(error)
-        else:
             self._theta = self._theta if self._stated else theta
+
+    @contextmanager
+    def _rejecting(self, topic: str) -> Iterator[None]:
+        try:
+            yield
+        except MessageError as error:
+            self._rejected.setdefault((topic, error.reason), []).append(error)
 
     def verdict(self) -> Verdict:
         """Judge what came."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.exploration import RAMP_SHARE, Exploration, Step
+from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.methods import first_command
+from musculoskeletal_ae.control.posture import RAMP_SHARE, Step
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm

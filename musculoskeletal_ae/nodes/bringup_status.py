@@ -3,8 +3,8 @@
 
 On a terminal, where rich is installed (`--view` brings it), one screen instead, with muscles.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, mae_checkpoint, muscle_states,
-/diagnostics → stdout.
+joint_states, estimated_joint_states, anomaly, anomaly_detected, muscle_states, /diagnostics →
+stdout.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
-from std_msgs.msg import Bool, Float64, UInt8MultiArray
+from std_msgs.msg import Bool, Float64
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
@@ -43,14 +43,12 @@ class BringupStatus(Shell):
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
-        self.checkpoints = 0
         self.started: float | None = None
         self.follow_posture('joint_states', partial(setattr, self, 'theta'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
         detected = partial(setattr, self.situation, 'detected')
         self.listen(Bool, 'anomaly_detected', lambda m: detected(m.data), LATCHED)
-        self.listen(UInt8MultiArray, 'mae_checkpoint', self._count_checkpoint, LATCHED)
         self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
         self.states: Array | None = None
         self.screen = open_screen()
@@ -68,9 +66,6 @@ class BringupStatus(Shell):
         if self.theta is not None:
             self.errors.append(float(np.linalg.norm(theta - self.theta)))
 
-    def _count_checkpoint(self, _: UInt8MultiArray) -> None:
-        self.checkpoints += 1
-
     def _print(self) -> None:
         now = time.monotonic()
         if self.started is None and not self.anomalies:
@@ -82,7 +77,7 @@ class BringupStatus(Shell):
         told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  {known}'
-        line += f'  samples {told.samples or 0}  checkpoints {self.checkpoints}'
+        line += f'  samples {told.samples or 0}  checkpoints {told.checkpoints or 0}'
         more = told.trouble() or told.hint()
         if self.screen is None:
             print(printable(f'{line}  {more}'.rstrip()), flush=True)

@@ -141,13 +141,9 @@ class Controller(Shell):
         if self.latched and not before:
             self.recording.save(safety.cause, self.parameter('stop_recordings'))
 
-    def clock_jumped_back(self) -> None:
-        """Count time from here; latches stay."""
-        self.core.clock_jumped_back()
-
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
-        report = self.core.report(time.monotonic())
+        report = super().report()
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
         stopped = [report.message] if self.core.safety.cause else []

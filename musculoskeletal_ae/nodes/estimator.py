@@ -37,7 +37,6 @@ from musculoskeletal_ae.nodes.messages import (
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
-from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.validity import read_pose
 
@@ -161,11 +160,3 @@ class Estimator(Shell):
         self.take_anomaly(False)
         self.detected.publish(Bool(data=False))
         return f'cleared: {cause}' if cause else 'nothing was detected'
-
-    def clock_jumped_back(self) -> None:
-        """Start the detector's counts anew; what was detected stays."""
-        self.core.clock_jumped_back()
-
-    def report(self) -> Report:
-        """Return what /diagnostics shows."""
-        return self.core.report(time.monotonic())

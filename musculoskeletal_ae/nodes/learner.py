@@ -13,7 +13,6 @@ from typing import Any
 from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
@@ -48,12 +47,14 @@ class Learner(Shell):
         self.running = self.troubled = False
         self.follow_parameter('fresh', self._start_fresh)
         self.follow_parameter('checkpoint', self._take_checkpoint)
-        self.follow_parameter('relearn_muscles', self._relearn)
+        indices, core = self.robot.muscle_indices, self.core
+        self.follow_parameter('relearn_muscles', lambda names: core.relearn(indices(names)))
         self.running = True
         self.needed = [JOINT_TOPICS[value('joint_source')], 'muscle_states']
-        self.follow_posture(self.needed[0], self._joints)
-        self.follow_zeros(lambda known, _: self.core.zeros(known))
-        self.follow_muscle_states(self._muscles)
+        self.follow_posture(self.needed[0], lambda theta: core.joints(self._now(), theta))
+        self.follow_zeros(lambda known, _: core.zeros(known))
+        # length, tension, temperature
+        self.follow_muscle_states(lambda states: core.muscles(self._now(), *states[1::-1]))
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
@@ -85,20 +86,10 @@ class Learner(Shell):
         elif path and self.core.checkpoint is None:
             self.core.begin(checkpoint.load(path, self.robot))
 
-    def _relearn(self, names: tuple[str, ...]) -> None:
-        self.core.relearn(self.robot.muscle_indices(names))
-
     # -- messages -------------------------------------------------------------------------------
 
     def _now(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
-
-    def _joints(self, theta: Array) -> None:
-        self.core.joints(self._now(), theta)
-
-    def _muscles(self, states: Array) -> None:
-        length, tension, _ = states
-        self.core.muscles(self._now(), tension, length)
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)
@@ -122,6 +113,6 @@ class Learner(Shell):
 
     def destroy_node(self) -> None:
         """End the training process with the node."""
-        if hasattr(self, 'core'):
+        if self.core:
             self.core.close()
         super().destroy_node()

@@ -38,7 +38,6 @@ class Record(Node):
         super().__init__('record')
         self.writer = writer
         self.received = 0
-        self._numbers: dict[str, int] = {}
         self._sim_time = self.get_parameter('use_sim_time').value
         for name in topics:
             topic = TOPICS[name]
@@ -51,10 +50,9 @@ class Record(Node):
 
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
-        if name not in self._numbers:
-            offered = self._offered(name, topic)
-            self._numbers[name] = self.writer.add_topic(name, topic.type, offered)
-        self.writer.write(self._numbers[name], now, info['source_timestamp'], data)
+        if name not in self.writer.topics:
+            self.writer.add_topic(name, topic.type, self._offered(name, topic))
+        self.writer.write(name, now, info['source_timestamp'], data)
         self.received += 1
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:

@@ -40,8 +40,8 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
-from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.parameters import Parameter
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
@@ -54,6 +54,8 @@ LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of 
 
 class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
+
+    core: Any = None  # what computes
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
@@ -71,7 +73,8 @@ class Shell(Node):
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
         #: name of the root link's frame in messages that are published
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
-        self._reception = Reception(lambda text: self.get_logger().warning(text))
+        warn = self.get_logger().warning
+        self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
@@ -91,11 +94,13 @@ class Shell(Node):
     # -- what a node overrides ------------------------------------------------------------------
 
     def report(self) -> Report:
-        """Return what /diagnostics shows."""
-        return Report('ok', 'running', {})
+        """Return what /diagnostics shows: what the core says, where there is one."""
+        return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
+        if self.core:
+            self.core.clock_jumped_back()
 
     # -- what must not end the node -------------------------------------------------------------
 

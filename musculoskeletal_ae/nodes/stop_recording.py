@@ -79,13 +79,12 @@ class StopRecording:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
             with BagWriter(bag) as writer:
-                numbers: dict[str, int] = {}
-                for when, name, message in messages:
-                    if name not in numbers:
-                        topic = TOPICS[name]
-                        qos = [offered_qos(topic.latched)]
-                        numbers[name] = writer.add_topic(self._resolve(name), topic.type, qos)
-                    writer.write(numbers[name], when, when, serialize_message(message))
+                names = {t: self._resolve(t) for t in dict.fromkeys(m.topic for m in messages)}
+                for topic, name in names.items():
+                    kind, latched, _ = TOPICS[topic]
+                    writer.add_topic(name, kind, [offered_qos(latched)])
+                for when, topic, message in messages:
+                    writer.write(names[topic], when, when, serialize_message(message))
             (bag / FILE).write_text(f'{cause}\n', encoding='utf-8')
             for old in sorted(self._directory.glob(f'stop_*/{FILE}'))[:-most]:
                 shutil.rmtree(old.parent)

@@ -32,10 +32,10 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.reception import Reception
 from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.options import Parser, whole
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.start import load

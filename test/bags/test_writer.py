@@ -23,8 +23,8 @@ LATCHED = ('robot_description', 'anomaly_detected', 'mae_checkpoint', 'muscle_le
 def test_a_message_of_each_type_comes_back_as_it_was_written(type_name, tmp_path):
     data = samples.encode(samples.filled(type_name, random.Random(1)), type_name)
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic('/topic', type_name, [offered_qos(latched=False)])
-        writer.write(number, 20, 10, data)
+        writer.add_topic('/topic', type_name, [offered_qos(latched=False)])
+        writer.write('/topic', 20, 10, data)
     bag = Bag.open(tmp_path / 'bag')
     (message,) = bag.messages()
     assert message[:4] == ('/topic', 20, 10, data)
@@ -73,13 +73,13 @@ def test_qos_in_the_mcap_file_can_be_read_again(bag):
 
 def test_messages_are_ordered_by_time_whatever_order_they_came_in(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic('/anomaly', 'std_msgs/msg/Float64', [])
+        writer.add_topic('/anomaly', 'std_msgs/msg/Float64', [])
         data = samples.encode(
             samples.filled('std_msgs/msg/Float64', random.Random(0)), 'std_msgs/msg/Float64'
         )
         for times in ((5, 3, 9), (2, 7, 4), (1, 8, 6)):
             for time in times:
-                writer.write(number, time, 0, data)
+                writer.write('/anomaly', time, 0, data)
             writer.flush()
     read = [message.log_time for message in Bag.open(tmp_path / 'bag').messages()]
     assert read == sorted(read) == list(range(1, 10))

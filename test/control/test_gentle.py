@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.gentle import SPEED, gentle_limit
+from musculoskeletal_ae.control.exploration import SPEED, gentle_limit
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot

@@ -193,6 +193,20 @@ def test_what_is_wrong_shows_when_a_muscle_is_wound_in(name):
     assert told in str(verdict)
 
 
+def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
+    driver = Driver(ROBOT)
+    driver.listen(2.0)
+    home = driver.arm.sense().length
+
+    def mirrored(rows):  # at the length from which it is wound in, so that the law seems to hold
+        return np.stack([2.0 * home - rows[0], *rows[1:]])
+
+    driver.publish = mirrored
+    verdict = driver.wind((BICEPS,))
+    assert 'sign' in verdict.wrong, str(verdict)
+    assert 'l rose by' in str(verdict)
+
+
 @pytest.mark.parametrize('clip', [True, False])
 def test_the_clip_is_tried_where_it_is_low_enough(clip):
     robot = Robot(LOW)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a message that arrives: used, or rejected and counted by reason."""
+"""What becomes of a message, live or of a bag: used, or rejected and counted by reason."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.validity import LATE, SourceOrder
 
 LONGEST_TEXT = 500
+# A source time that lies further back than this is another publisher's clock, not a reordering.
+REORDERING = 1_000_000_000  # [ns]
 
 
 class Reception:
-    """Counts what a node receives."""
+    """Counts what is received."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         """Nothing has come yet; `warn` is told of the first rejection for each reason."""
@@ -31,17 +32,22 @@ class Reception:
     ) -> Callable[[Any, dict[str, Any]], None]:
         """Return what to subscribe with: calls `callback` unless the message comes twice or late.
 
-        It raises a `MusculoskeletalError` to reject the message. `publishers` counts who publishes
-        there: a message does not say who sent it, and two clocks or counters cannot be compared.
+        That is, of one publisher, one sent no later than the last that was taken, and numbered no
+        higher: numbers go on when its clock steps back. 0 is not known. The callback raises a
+        `MusculoskeletalError` to reject the message. `publishers` counts who publishes there: a
+        message does not say who sent it, and two clocks or counters cannot be compared.
         """
-        order = SourceOrder()
+        before, last = 0, 0  # when the last one was sent [ns], and its number
 
         def receive(message: Any, info: dict[str, Any]) -> None:
-            sent = info['source_timestamp'], info['publication_sequence_number']
-            if order.is_late(*sent) and publishers() == 1:
-                self.rejected[f'{topic}: {LATE}'] += 1
+            nonlocal before, last
+            sent, number = info['source_timestamp'], info['publication_sequence_number']
+            late = sent > 0 and 0 <= before - sent < REORDERING and number <= last
+            if late and publishers() == 1:
+                self.rejected[f'{topic}: repeated or reordered'] += 1
                 return
-            self.turns[topic] += order.take(*sent)
+            self.turns[topic] += number < last
+            before, last = sent, number
             try:
                 callback(message)
             except MusculoskeletalError as error:
@@ -57,7 +63,7 @@ class Reception:
         self.rejected[f'{source}: {reason}'] += 1
         first = self.rejected[f'{source}: {reason}'] == 1
         if first:
-            self._warn(f'rejected {self.last_rejected} (counted in /diagnostics)')
+            self._warn(f'rejected {self.last_rejected}')
         return first
 
     def take_received(self) -> dict[str, int]:

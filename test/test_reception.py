@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
-from musculoskeletal_ae.nodes.reception import Reception
+from musculoskeletal_ae.reception import Reception
 
 SECOND = 1_000_000_000
 
@@ -44,6 +44,24 @@ def test_of_two_publishers_neither_hides_the_other():
     inbox.get('ahead', 100 * SECOND, 50)
     inbox.get('behind', 100 * SECOND - SECOND // 2, 1)
     assert inbox.used == ['ahead', 'behind']
+
+
+@pytest.mark.parametrize(
+    ('time', 'number', 'late'),
+    [
+        (100 * SECOND, 7, True),  # twice
+        (100 * SECOND - 1, 6, True),  # reordered
+        (100 * SECOND + 1, 8, False),
+        (100 * SECOND - 1, 8, False),  # the publisher's clock stepped back
+        (99 * SECOND, 6, False),  # another publisher's clock
+        (0, 0, False),  # not known
+    ],
+)
+def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number, late):
+    inbox = Inbox()
+    inbox.get('first', 100 * SECOND, 7)
+    inbox.get('next', time, number)
+    assert inbox.used == (['first'] if late else ['first', 'next'])
 
 
 @pytest.mark.parametrize(
