@@ -65,8 +65,10 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
     share, text = attempt(*steps)
     if share >= REQUIRED_SHARE:
         return [*told, f'together: {text}']
-    told = told or ['nothing that was tried helps alone']
-    return [*told, f'not enough even together: {text}; other routes may help, see --suggest']
+    if share > max(alone)[0]:
+        told.append(f'not enough even together: {text}')
+    told = told or [f'none of these helps: {", ".join(TRIED)}']
+    return [*told, 'other routes may help: see --suggest']
 
 
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:

@@ -18,7 +18,7 @@ def main(argv: list[str] | None = None) -> int:
         'Exit status 0: sound (with --suggest: what it wrote is), 1: not sound.',
     )
     parser.add_robot('robot', default=None)
-    parser.add_argument('--postures', type=whole(1, 1_000_000), default=200, help='random postures')
+    parser.add_argument('--postures', type=whole(1, 10_000), default=200, help='random postures')
     parser.add_seed('of the postures')
     parser.add_plot('moment arms and stiffness')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
