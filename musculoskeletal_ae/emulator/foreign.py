@@ -147,15 +147,15 @@ class ForeignArm(Arm):
         self.reset()
 
     def _make_guides(self) -> Guides:
-        model, data, sites = self._model, self._data, []
-        for t in self.individual.tendons:
+        model, data, tendons, sites = self._model, self._data, self.individual.tendons, []
+        for t in tendons:
             path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
             of_sites = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
             sites.append(model.wrap_objid[path][of_sites])
         place, give = model.site_pos, self._draw.about('give', model.nsite)
         runs = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.ravel(), data.ten_wrapadr
         site = np.concatenate(sites), model.site_bodyid, data.xmat.reshape(-1, 9)
-        return Guides(*runs, data.ten_wrapnum, *site, place, place.copy(), give)
+        return Guides(tendons, *runs, data.ten_wrapnum, *site, place, place.copy(), give)
 
     def _draw_sensors(self) -> None:
         """Draw what is wrong with joint sensors and messages, and when wires slip."""

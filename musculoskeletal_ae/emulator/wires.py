@@ -114,11 +114,11 @@ Wires = namedtuple(
 #: elongations e_i [m] (M, 6), share of stiction p, bend φ [rad], by how much they grew longer [m],
 #: 1 beyond the ridge, and what the module's sensors read of l [m] and T [N].
 Memory = namedtuple('Memory', 'elongation loop slow rest bend longer over reading cell')
-#: Where wires run, MuJoCo's arrays: points of the paths (P, 3) [m], −1 for a site or the geom that
-#: they wrap (P,), first point and number of points of each path (M,), the paths' sites in their
-#: order; of all sites (S,) the body, its turn (B, 9), the place in it, which is changed, the place
-#: without load (S, 3) [m], and how far they give [m/N].
-Guides = namedtuple('Guides', 'point kind start count site body turn place rest give')
+#: Where wires run, MuJoCo's arrays: tendon of each muscle (M,); points of all paths (P, 3) [m], −1
+#: for a site or the geom that they wrap (P,), first point and number of points of each tendon; the
+#: sites of the muscles in their order; of all sites (S,) the body, its turn (B, 9), the place in it,
+#: which is changed, the place without load (S, 3) [m], and how far they give [m/N].
+Guides = namedtuple('Guides', 'tendon point kind start count site body turn place rest give')
 
 
 def make_wires(
@@ -231,7 +231,8 @@ def guides_step(guides: Guides, tension: Array, bend: Array, duration: float) ->
     line, load, i = np.zeros(3), np.zeros(3), 0
     for m in range(tension.shape[0]):
         bend[m] = 0.0
-        first, last = guides.start[m], guides.start[m] + guides.count[m] - 1
+        first = guides.start[guides.tendon[m]]
+        last = first + guides.count[guides.tendon[m]] - 1
         for p in range(first, last + 1):
             load[:] = 0.0
             both = True
