@@ -18,7 +18,7 @@ zero while much is commanded has no wire, or a slack one. Slack is wound in by a
 longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
 ② restores it: slack wire is too long, and what is left of a cut one too short.
 
-Preset `paper` decides on A alone, against the largest that the healthy arm showed.
+Preset `paper` decides on A alone, against the checkpoint's threshold of A.
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
 SHOWN = 60.0  # [s] before the grasp
 TAIL = 3.0  # [s] after the mending
 OFF_TIME = 40.0  # [s] of motion before muscles are switched off
-#: moments of the appearance [s]: ends of exploration's steps, before and after the grasp
-MOMENTS = {'moving': 9.9, 'at rest': 19.9, 'weight grasped': 29.9, 'weight moved': 39.9}
+#: moments of the appearance [s]: ends of the motion's cycles, without weight and with it
+MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'weight grasped': 29.9, 'weight, 40 s': 39.9}
 OFF = 'switched_off'
 NOTICED = ('detection_s', 'detected_share', 'named_share')  # of muscles switched off
 

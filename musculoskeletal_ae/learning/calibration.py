@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrating the anomaly detector: residuals of ② over messages of the healthy arm.
 
-    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d
+    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d (of A: max A)
 
 Messages, moving and resting, are kept in a reservoir, a uniform draw from all that ever came; each
 new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
@@ -139,9 +139,10 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
         distances(part, error[sound & ~first]).max(initial=0.0),
         distances(statistics, error[sound]).max(),
     )
+    margin = MARGIN * (1.0 + YOUNG / max(known, 1))
     thresholds = {
-        DISTANCE: float(MARGIN * (1.0 + YOUNG / max(known, 1)) * largest),
-        NORM: float(anomaly(error[sound]).max()),
+        DISTANCE: float(margin * largest),
+        NORM: float(margin * anomaly(error[sound]).max()),
     }
     return replace(
         statistics, thresholds=thresholds, postures=_spread_out(state.theta[sound], POSTURES)

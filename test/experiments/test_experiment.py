@@ -29,7 +29,7 @@ KEYS = {
     'loss_change': '',
     'body_change': '',
 }
-METHODS = ('geometric', 'first', 'second', 'proposed', 'proposed_paper')
+METHODS = ('geometric', 'first', 'second', 'proposed', 'second_paper', 'proposed_paper')
 
 
 def result(folder, name):
