@@ -54,6 +54,7 @@ CURVE_STRIDE = 10  # of held-out messages, after every update
 FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit
 PRINTED_MINUTES = 10.0
 PRINTED = (0.324, 0.154)  # [rad] the paper's fit at the start and after ten minutes
+QUICK_STEPS = 600  # of initial training: with fewer the gate refuses a network of preset paper
 NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
 COLOURS = {'paper': plots.PAPER, 'default': plots.AFTER}
 
@@ -120,7 +121,7 @@ def train_initial(study: Study, preset: str) -> None:
         norms = ([each.norm for each in pair_errors(mae, states)] for states in (train, test))
         rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
 
-    trained = initial_mae(robot, preset, progress=note, steps=300 if study.quick else None)
+    trained = initial_mae(robot, preset, progress=note, steps=QUICK_STEPS if study.quick else None)
     checkpoint.save(trained.mae, study.network_file(preset, None))
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
