@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with the second body, and how much: every effect with its size, 0 to switch it off.
 
-    Effects()                            as it was calibrated (`python -m bench second_body`)
+    Effects()                            as it is calibrated (`python -m bench second_body`)
     replace(Effects(), hysteresis=0.0)   one effect off; all else stays as it was drawn
     NONE                                 a body as its description or its file has it
 

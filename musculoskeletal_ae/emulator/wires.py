@@ -116,8 +116,8 @@ Wires = namedtuple(
 Memory = namedtuple('Memory', 'elongation loop slow rest bend longer over reading cell')
 #: Where wires run, MuJoCo's arrays: tendon of each muscle (M,); points of all paths (P, 3) [m], −1
 #: for a site or the geom that they wrap (P,), first point and number of points of each tendon; the
-#: sites of the muscles in their order; of all sites (S,) the body, its turn (B, 9), the place in
-#: it, which is changed, the place without load (S, 3) [m], and how far they give [m/N].
+#: sites of the muscles in order; of all sites (S,) the body, its turn (B, 9), the place in it,
+#: which is changed, the place without load (S, 3) [m], and how far they give [m/N].
 Guides = namedtuple('Guides', 'tendon point kind start count site body turn place rest give')
 
 
