@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import DURATIONS, RAMP_SHARE, TRIES, holdable_postures
+from musculoskeletal_ae.control.exploration import DURATIONS, TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import (
     SEARCH,
     TORQUE_WEIGHT,
@@ -31,7 +31,7 @@ from musculoskeletal_ae.control.methods import (
     msc_compensation,
     paper_terms,
 )
-from musculoskeletal_ae.control.posture import Ramp
+from musculoskeletal_ae.control.posture import RAMP_SHARE, Ramp
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.online_learning import beginner, explore
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME

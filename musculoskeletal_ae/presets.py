@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.groups import Group
+
+if TYPE_CHECKING:  # options are read without numpy
+    from musculoskeletal_ae.robot.groups import Group
 
 REFERENCE = 5 + 10  # D + M of the arm that the numbers of preset `default` are for
 

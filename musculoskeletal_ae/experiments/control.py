@@ -206,13 +206,12 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
 
 OTHERS = {'geometric': NOTHING, **dict.fromkeys(('first', 'second'), 'far below `geometric`')}
 ROWS = (
-    *(Row(f'`{name}`, distance from θ_eval [rad]', paper, f'{name}_paper.error_rad',
-          f'{name}.error_rad')
+    *(Row(f'`{name}`, distance from θ_eval [rad]', paper, '', f'{name}.error_rad')
       for name, paper in OTHERS.items()),
     Row('`proposed`, distance from θ_eval [rad]', 'as `second`',
         'proposed_paper.error_rad', 'proposed.error_rad', '', 0.06),
-    *(Row(f'`{name}`, ‖T‖ [N]', NOTHING, f'{name}_paper.tension_n', f'{name}.tension_n',
-          f'{name}.bound_reached_n', digits=0) for name in OTHERS),
+    *(Row(f'`{name}`, ‖T‖ [N]', NOTHING, '', f'{name}.tension_n', f'{name}.bound_reached_n',
+          digits=0) for name in OTHERS),
     Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`', 'proposed_paper.tension_n',
         'proposed.tension_n', 'proposed.bound_reached_n', digits=0),
     Row('`proposed`, ‖T‖ beside the QP bound at θ_eval [ratio]', NOTHING,

@@ -136,5 +136,5 @@ def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
     assert judged.cause.startswith('A = ') if known else not judged.cause
     detector.reset()
     assert not any(verdict.cause for verdict in verdicts(healthy, IN_A_ROW))
-    detector.threshold = 1e6  # as large as no A is: no physics comes to its aid
+    detector.settings = Detection(1e6)  # as large as no A is: no physics comes to its aid
     assert not any(verdict.cause for verdict in verdicts(slack, round(2 * DEAD_TIME / DT)))

@@ -58,7 +58,7 @@ def test_the_seconds_before_a_stop_are_kept_as_a_bag(moving, tmp_path, monkeypat
     assert files[0].read_text() == 'controller/stop was called\n'
     bag = Bag.open(files[0].parent)
     sent = [m for m in bag.messages() if m.topic.endswith('/muscle_length_command')]
-    assert 30 < len(sent) <= len(arm.sent())
+    assert len(sent) > 30
     heard = {name.rpartition('/')[2] for name in bag.topics}
     assert {'muscle_states', 'estimated_joint_states', 'target_joint_states'} <= heard
 

@@ -86,7 +86,8 @@ def test_a_second_source_of_muscle_states_stops_the_arm_by_name_until_it_is_gone
     space = arm.graph.namespace
     arm.says(f'stopped: muscle_states come from {space}/hardware_emulator and {space}/test')
     assert not arm.graph.call(Trigger, 'controller/reset').success
-    assert arm.estimator.rejected['muscle_states: several publishers'] > 0
+    refused = arm.estimator.rejected
+    arm.graph.wait(lambda: refused['muscle_states: several publishers'], 'a refusal')
     arm.graph.node.destroy_publisher(stranger)
     arm.graph.wait(lambda: arm.graph.call(Trigger, 'controller/reset').success, 'the reset')
     arm.goes_to(HERE)

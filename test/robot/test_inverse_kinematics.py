@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.emulator.arm import seen_by_camera
+from musculoskeletal_ae.emulator.modules import seen_by_camera
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, SPREADS, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
