@@ -135,7 +135,7 @@ class Replay(Node):
                 if now > self._next_report:
                     self._next_report = now + 1.0
                     seconds = np.array([self._done(), (self._stop - self._start) / 1e9])
-                    self._told.publish(array_message(seconds, 'position'))
+                    self._told.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
             else:
                 time.sleep(wait)
