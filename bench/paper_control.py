@@ -32,7 +32,7 @@ from musculoskeletal_ae.control.methods import (
     paper_terms,
 )
 from musculoskeletal_ae.control.posture import RAMP_SHARE, Ramp
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments.online_learning import beginner, explore
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.experiments.study import Study
@@ -104,7 +104,7 @@ READINGS = {
 Command = Callable[[Array], Array]
 
 
-def follow(arm: EmulatedArm, last: Array, goal: Array, duration: float) -> Array:
+def follow(arm: Arm, last: Array, goal: Array, duration: float) -> Array:
     """Ramp to a command [m] (M,), as the controller does, and rest; return the command."""
     ramp, command = Ramp(last, goal, RAMP_SHARE * duration, RATE), last
     for _ in range(round(max(duration, ramp.duration) / SAMPLE_TIME)):

@@ -86,7 +86,7 @@ def measured(
     exploring = record(arm(), default, EXPLORATION_STREAM + seed, 600.0 * share)
     held_out = record(arm(), default, HELD_OUT_STREAM, 300.0 * share)
     learner = Learner(robot, paper, 'paper', seed)
-    follow(learner, exploring, held_out)
+    follow(learner, zip(*exploring, strict=True), held_out)
     swept = np.zeros((len(SWEEP), robot.joint_count))
     swept[:, shoulder(robot)] = SWEEP
     off = true_lengths(arm(), swept) - robot.routes.relative_lengths(swept)
