@@ -67,7 +67,7 @@ def parameters_given(arguments: list[str]) -> list[str]:
 
 
 class LeanExecutor(SingleThreadedExecutor):
-    """Spins one node whose callbacks wait for nothing, at a third of the price.
+    """Spins one node whose callbacks wait for nothing, without what that costs in rclpy.
 
     rclpy builds its wait set anew, in Python, for every message, with every event of every topic in
     it, and wakes itself twice after each callback: more than half of what a node costs. Here it is
@@ -164,26 +164,12 @@ class LeanExecutor(SingleThreadedExecutor):
                 handler.result()
 
     def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Any) -> Any:
-        def take(entity: Any) -> Any:
-            try:
-                work = take_from_wait_list(entity)
-            except Exception as error:  # noqa: BLE001 - else the executor never asks it again
-                return self._escaped(entity, error)
-            if work is None:
-                return None
-
-            async def shielded() -> None:
-                try:
-                    await work()
-                except Exception as error:  # noqa: BLE001
-                    self._escaped(entity, error)
-
-            return shielded
-
         # The handler would wake this executor, which is awake.
         self._guard, guard = ASLEEP, self._guard
         try:
-            return super()._make_handler(entity, node, take)
+            return super()._make_handler(
+                entity, node, lambda entity: self._run(entity, take_from_wait_list)
+            )
         finally:
             self._guard = guard
 
