@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -91,9 +92,7 @@ def test_a_joint_s_sensor_errs_alone(arm, robot):
 
 def hold(arm, robot, lines, seconds=1.5, tension=80.0):
     arm.faults.set(lines)
-    theta = 0.5 * (robot.lower + robot.upper)
-    tensions = np.full(robot.muscle_count, tension)
-    command = robot.muscle_lengths(theta, tensions) - (tension - 30.0) / robot.stiffness
+    command = to_mid_range(robot, tension)
     for _ in range(round(seconds / 0.01)):
         arm.command_length(command)
         arm.step(0.01)

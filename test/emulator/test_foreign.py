@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
 
+from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator import foreign
 from musculoskeletal_ae.emulator.effects import NONE, Effects
 from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -52,9 +53,7 @@ def imported(tmp_path_factory):
 def drive(arm, seconds=0.3, tension=80.0):
     """Drive an arm to mid-range and return what happened on the way, (N, 2D + 3M)."""
     robot, rows = arm.robot, []
-    theta = 0.5 * (robot.lower + robot.upper)
-    tensions = np.full(robot.muscle_count, tension)
-    command = robot.muscle_lengths(theta, tensions) - (tension - 30.0) / robot.stiffness
+    command = to_mid_range(robot, tension)
     for _ in range(round(seconds / 0.02)):
         arm.command_length(command)
         arm.step(0.02)
