@@ -76,7 +76,7 @@ class Reading(NamedTuple):
         jacobian = mae.muscle_jacobian_difference(theta, tension, self.step)
         exerted = jacobian.T @ least.matrix / TENSION_SCALE
         balance = Term(self.unit * TORQUE_WEIGHT, exerted, -torque)
-        start = np.broadcast_to(robot.tension.bias, tension.shape) if self.from_bias else tension
+        start = robot.tension.bias if self.from_bias else tension
         z = mae.encode(Mask.THETA_TENSION, theta, start)
         state = mae.decode(descend(mae, z, (least, posture, balance), SEARCH))
         length = mae.lengths(theta, state.tension) if self.own_length else state.length
@@ -116,7 +116,7 @@ def follow(arm: Arm, last: Array, goal: Array, duration: float) -> Array:
 
 def stages(robot: Robot, mae: Mae, name: str, theta: Array) -> list[tuple[Command, float]]:
     """Return the commands of a method or reading one after another, and for how long each [s]."""
-    bias = np.broadcast_to(robot.tension.bias, (robot.muscle_count,))
+    bias = robot.tension.bias
     reading, (long, short, _) = READINGS.get(name, Reading()), DURATIONS
 
     def first(_: Array) -> Array:
@@ -149,8 +149,7 @@ def learned(study: Study, seed: int) -> Mae:
 def individual(study: Study, seed: int) -> dict[str, tuple[float, float]]:
     """Return mean error [rad] and ‖T‖ [N] of every method and reading; 'bound' has ‖T‖ alone."""
     robot, mae, arm = study.robot, learned(study, seed), study.arm(seed)
-    rng, bias = np.random.default_rng([seed, 0xC0]), np.full(study.robot.muscle_count, 0.0)
-    bias += robot.tension.bias
+    rng, bias = np.random.default_rng([seed, 0xC0]), robot.tension.bias
     postures = robot.random_postures(TRIES, rng)
     count, starts = (1, 1) if study.quick else (TARGETS, STARTS)
     held = holdable_postures(robot, postures, count, arm.individual.muscle_jacobian)
@@ -188,21 +187,20 @@ def main(argv: list[str] | None = None) -> int:
     """Print the table."""
     parser = Parser('paper_control', 'Readings of the paper’s `proposed`.')
     parser.add_robot()
-    parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
-    parser.add_argument('--minutes', type=float, default=10.0, help='of exploration')
+    parser.add_seeds((0, 1, 2, 3, 4))
+    parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('one target and start')
     args = parser.parse_args(argv)
 
     def measure() -> None:
         robot, rows = Robot.load(args.robot), []
-        seeds = tuple(map(int, args.seeds.split(',')))
         with TemporaryDirectory() as folder:
-            study = Study(robot, 'paper', seeds, args.minutes, args.quick, Path(folder))
+            study = Study(robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder))
             checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
-            for seed in seeds:
+            for seed in args.seeds:
                 rows.append(individual(study, seed))
                 print(f'individual {seed}\n{table(rows[-1:])}\n', flush=True)
-        print(f'individuals {args.seeds}\n{table(rows)}')
+        print(f'individuals {", ".join(map(str, args.seeds))}\n{table(rows)}')
 
     return exit_status(measure)
 

@@ -11,12 +11,10 @@ looks, and at most 0.5 % while nobody does.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -24,6 +22,7 @@ import rclpy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
+from bench.wire import cpu
 from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.view import ARM_TOPICS
 from musculoskeletal_ae.robot.robot import Robot
@@ -31,13 +30,6 @@ from musculoskeletal_ae.robot.robot import Robot
 MOST, MOST_IDLE = 0.10, 0.005  # of a core
 PORT, NAMESPACE = 8097, '/bench_view'
 RATE = 100.0  # [Hz]
-TICKS = os.sysconf('SC_CLK_TCK')
-
-
-def cpu(pid: int) -> float:
-    """Return the CPU time [s] that a process has used, all threads."""
-    fields = Path(f'/proc/{pid}/stat').read_text(encoding='utf-8').rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def share(pid: int, seconds: float) -> float:
