@@ -34,7 +34,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.presets import DEFAULT, PAPER, Preset
+from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
 #: between how the network was made and what it learned since, in `Mae.training`
@@ -170,7 +170,7 @@ class BodyUpdater(Updater):
         self._statistics_held = True
 
     def _learn(self, job: Job) -> Update:
-        seen, steps = job.seen, DEFAULT.grown(job.steps, self._robot.groups)
+        seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
         fit = fit_body(body, seen, prior_mean=self._prior_mean)
         contradicted = contradicted_muscles(seen, fit)
@@ -180,10 +180,10 @@ class BodyUpdater(Updater):
         if self._statistics_held and not job.statistics_hold:
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
-        count = max(BATCH, steps * BATCH // USES)
+        count = max(BATCH, job.steps * BATCH // USES)
         data = synthetic_samples(body, fit.noise, count, self._rng)
         self._mix_in_real(data, seen, fit)
-        loss_now = self._trainer.train(data, steps)
+        loss_now = self._trainer.train(data, job.steps)
         return Update(
             self._published(self._trainer.network, 'default', self._trainer.steps, job),
             loss_now,

@@ -5,7 +5,9 @@
 
 (paper, section "Network Structure"). SI units go in and out. The units of the network, its
 standardisation and the constant mask inputs are folded into the first and last layers when the
-object is made, so one estimate is six small matrix products and nothing else.
+object is made, so one estimate is six small matrix products and nothing else. They are computed in
+single precision: a large body's weights then fit into a core's cache, and 1e-6 of a network's
+spread is far below its error. Arrays of double precision go in and come out.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Ints, Singles
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
@@ -32,7 +34,7 @@ class BlockDiagonal:
 
     __array_ufunc__ = None  # x @ weight is then left to __rmatmul__
 
-    def __init__(self, blocks: Sequence[Array], into: Ints | None, out: Ints | None) -> None:
+    def __init__(self, blocks: Sequence[Singles], into: Ints | None, out: Ints | None) -> None:
         """Put blocks (in, out) side by side.
 
         x[into] are their inputs, one block's after the other's, and y[out] of theirs the outputs;
@@ -45,11 +47,11 @@ class BlockDiagonal:
         ]
         self._into, self._out, self._outputs = into, out, sizes[-1][1]
 
-    def __rmatmul__(self, x: Array) -> Array:
+    def __rmatmul__(self, x: Singles) -> Singles:
         """Return x @ weight, shape (..., out), for x (..., in)."""
         if self._into is not None:
             x = x[..., self._into]
-        result = np.empty((*x.shape[:-1], self._outputs))
+        result = np.empty((*x.shape[:-1], self._outputs), np.float32)
         for into, block, out in self._blocks:
             np.matmul(x[..., into], block, out=result[..., out])
         return result if self._out is None else result[..., self._out]
@@ -64,26 +66,26 @@ class BlockDiagonal:
 class Activation(NamedTuple):
     """An activation h(x), and (h, h') together; both may overwrite x."""
 
-    value: Callable[[Array], Array]
-    with_slope: Callable[[Array], tuple[Array, Array]]
+    value: Callable[[Singles], Singles]
+    with_slope: Callable[[Singles], tuple[Singles, Singles]]
 
 
-def _tanh_slope(x: Array) -> tuple[Array, Array]:
+def _tanh_slope(x: Singles) -> tuple[Singles, Singles]:
     h = np.tanh(x, out=x)
     slope = h * h
     return h, np.subtract(1.0, slope, out=slope)
 
 
-def _silu(x: Array) -> Array:
+def _silu(x: Singles) -> Singles:
     # u (1 + tanh u) with u = x/2: does not overflow, and needs one temporary array.
     x *= 0.5
-    result: Array = np.tanh(x)
+    result: Singles = np.tanh(x)
     result += 1.0
     result *= x
     return result
 
 
-def _silu_slope(x: Array) -> tuple[Array, Array]:
+def _silu_slope(x: Singles) -> tuple[Singles, Singles]:
     # h = x σ and h' = σ + h − h σ, in three arrays: a batch then stays in the cache.
     sigmoid = 0.5 * x
     np.tanh(sigmoid, out=sigmoid)
@@ -103,23 +105,27 @@ ACTIVATIONS = {
 
 
 class Stack(NamedTuple):
-    """Layers x @ weight + bias, weight (in, out); the activation follows all but the last."""
+    """Layers x @ weight + bias, weight (in, out); the activation follows all but the last.
 
-    layers: tuple[tuple[Array | BlockDiagonal, Array], ...]
+    What goes in and comes out is of double precision, what is between of single.
+    """
+
+    layers: tuple[tuple[Singles | BlockDiagonal, Singles], ...]
     activation: Activation
 
-    def __call__(self, x: Array) -> Array:
-        """Return the output (..., out) for x (..., in)."""
+    def __call__(self, given: Array) -> Array:
+        """Return the output (..., out) for an input (..., in)."""
+        x = given.astype(np.float32)
         for weight, bias in self.layers[:-1]:
             x = x @ weight
             x += bias
             x = self.activation.value(x)
         weight, bias = self.layers[-1]
-        return x @ weight + bias
+        return (x @ weight + bias).astype(np.float64)
 
-    def with_pullback(self, x: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the output and the function that maps a gradient by it to one by x."""
-        slopes = []
+    def with_pullback(self, given: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Return the output and the function that maps a gradient by it to one by the input."""
+        x, slopes = given.astype(np.float32), []
         for weight, bias in self.layers[:-1]:
             x = x @ weight
             x += bias
@@ -127,23 +133,24 @@ class Stack(NamedTuple):
             slopes.append(slope)
         last, last_bias = self.layers[-1]
 
-        def pullback(gradient: Array) -> Array:
-            gradient = gradient @ last.T
+        def pullback(by_output: Array) -> Array:
+            gradient = by_output.astype(np.float32) @ last.T
             for (weight, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient *= slope
                 gradient = gradient @ weight.T
-            return gradient
+            return gradient.astype(np.float64)
 
-        return x @ last + last_bias, pullback
+        return (x @ last + last_bias).astype(np.float64), pullback
 
-    def tangent(self, x: Array, tangent: Array) -> tuple[Array, Array]:
+    def tangent(self, given: Array, directions: Array) -> tuple[Array, Array]:
         """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
+        x, tangent = given.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
             x, tangent = x @ weight + bias, tangent @ weight
             if i < len(self.layers) - 1:
                 x, slope = self.activation.with_slope(x)
                 tangent = tangent * slope[..., None, :]
-        return x, tangent
+        return x.astype(np.float64), tangent.astype(np.float64)
 
 
 def side_by_side(
@@ -152,7 +159,7 @@ def side_by_side(
     """Return stacks as one whose inputs and outputs stand as in `BlockDiagonal`."""
     if len(stacks) == 1:
         return stacks[0]
-    layers = list[tuple[BlockDiagonal, Array]]()
+    layers = list[tuple[BlockDiagonal, Singles]]()
     for i, level in enumerate(zip(*(stack.layers for stack in stacks), strict=True)):
         ends = into if i == 0 else None, out if i == len(stacks[0].layers) - 1 else None
         weights, biases = zip(*level, strict=True)
@@ -336,5 +343,5 @@ def _frozen(array: Array) -> Array:
     return copy
 
 
-def _transposed(weight: Array, bias: Array) -> Layer:
-    return _frozen(weight.T), _frozen(bias)
+def _transposed(weight: Array, bias: Array) -> tuple[Singles, Singles]:
+    return np.array(weight.T, np.float32, order='C'), bias.astype(np.float32)
