@@ -20,6 +20,7 @@ doc/your_robot.md leads from a robot of your own to one that learns.
   --hardware                 your own driver instead of the emulator: waits for its muscle_states,
                              says what is wrong with them, and starts once nothing is
   --no-controller            nothing may move the arm
+  --combined                 estimator and controller in one process
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
                              --hardware off: a real arm moves when it is told to)
@@ -59,6 +60,7 @@ reality=kin
 namespace=
 learner=true
 controller=true
+combined=false
 hardware=false
 bag=
 recording=
@@ -88,6 +90,7 @@ while [ $# -gt 0 ]; do
     --no-learner) learner=false ;;
     --hardware) hardware=true ;;
     --no-controller) controller=false ;;
+    --combined) combined=true ;;
     --preset) preset=$2 && shift ;;
     --seed) seed=$2 && shift ;;
     --reality) reality=$2 && shift ;;
@@ -96,7 +99,7 @@ while [ $# -gt 0 ]; do
     -h | --help) usage && exit ;;
     *)
       refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
- --no-controller, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --namespace, --duration, --record, --view, --port,\
+ --no-controller, --combined, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --namespace, --duration, --record, --view, --port,\
  --read-only, --help"
       ;;
   esac
@@ -123,6 +126,9 @@ if [ -n "$bag" ]; then
   [ -e "$bag" ] || refuse "--bag '$bag' is neither a bag directory nor an .mcap file"
   bag=$(cd "$(dirname "$bag")" && pwd -P)/$(basename "$bag")
   [ $hardware = false ] || refuse '--bag and --hardware exclude each other: which of them is it?'
+fi
+if [ $combined = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
+  refuse '--combined is estimator and controller in one process: not with --no-controller or --bag'
 fi
 [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
 if [ -n "$recording" ]; then
@@ -316,7 +322,7 @@ if [ $hardware = true ]; then
 fi
 common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
-start estimator estimator "${common[@]}"
+[ $combined = true ] || start estimator estimator "${common[@]}"
 start sim sim "${common[@]}"
 # What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware is
 # the same arm tomorrow, and the learner goes on from where it was.
@@ -330,7 +336,9 @@ elif [ $controller = true ]; then
   moving=(-p "explore:=$explore")
   # A pause of a busy desktop is no fault of an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
-  start controller controller "${common[@]}" "${moving[@]}"
+  name=controller
+  [ $combined = false ] || name=combined
+  start $name $name "${common[@]}" "${moving[@]}"
 fi
 
 if [ -n "$view" ]; then

@@ -13,7 +13,9 @@ from setuptools import find_packages, setup
 from setuptools.command.install_scripts import install_scripts
 
 NAME = 'musculoskeletal_ae'
-NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
+NODES = [
+    'bringup_status', 'combined', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim',
+]  # fmt: skip
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
 

@@ -6,8 +6,9 @@
 Emulator, estimator, sim, controller and, where it says so, learner, as `bringup.sh` starts them,
 each in a process of its own, with the arm exploring. A message and the command that answers it are
 told by their numbers at the source: latency is from the publishing of muscle_states to that of the
-first muscle_length_command after it. Beside it, what a user would write: one plain rclpy node in
-which torch eager estimates and a tension is turned into a length, no safety, no control.
+first muscle_length_command after it. Beside it estimator and controller in one process, and what a
+user would write: one plain rclpy node in which torch eager estimates and a tension is turned into a
+length, no safety, no control.
 
     late      no command within two periods
     missed    messages that the emulator should have sent, and that did not come
@@ -33,6 +34,13 @@ from musculoskeletal_ae.options import Parser, number, whole
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
+#: executables of each row
+KINDS = {
+    'nodes': NODES,
+    'combined': ('hardware_emulator', 'sim', 'combined'),
+    'with learner': (*NODES, 'learner'),
+    'plain node, torch': ('hardware_emulator', 'plain'),
+}
 WARM_UP = 8.0  # [s] until the first message counts
 TICK = os.sysconf('SC_CLK_TCK')
 PLAIN = """
@@ -75,7 +83,7 @@ def cpu(pid: int) -> float:
 class System:
     """Nodes in processes of their own."""
 
-    def __init__(self, robot: str, network: Path, rate: float, learn: bool, plain: bool) -> None:
+    def __init__(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
         """Start them."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -83,22 +91,23 @@ class System:
         from std_msgs.msg import Float64MultiArray
 
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
-        given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in (*NODES, 'learner')}
-        for name in ('estimator', 'sim', 'controller', 'learner'):
-            given[name].append(f'checkpoint:={network}')
-        # A pause of a busy machine is no fault of an emulated arm.
-        given['controller'] += ['explore:=true', 'max_age:=1.0']
-        given['learner'].append(f'state_directory:={network.parent / str(time.time_ns())}')
-        names = ('hardware_emulator',) if plain else (*NODES, *['learner'] * learn)
+        given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
+        for name in given:
+            if name != 'hardware_emulator':
+                given[name].append(f'checkpoint:={network}')
+            if name in ('controller', 'combined'):
+                # A pause of a busy machine is no fault of an emulated arm.
+                given[name] += ['explore:=true', 'max_age:=1.0']
+            if name == 'learner':
+                given[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         quiet: dict[str, Any] = {'stdout': subprocess.DEVNULL}
         for name in names:
             values = [word for value in given[name] for word in ('-p', value)]
             command = [str(folder / name), '--ros-args', *values]
+            if name == 'plain':
+                command = [sys.executable, '-c', PLAIN, str(network)]
             self.nodes[name] = subprocess.Popen(command, **quiet)
-        if plain:
-            command = [sys.executable, '-c', PLAIN, str(network)]
-            self.nodes['plain'] = subprocess.Popen(command, **quiet)
         rclpy.init()
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
         self._executor = SingleThreadedExecutor()
@@ -175,10 +184,8 @@ def main(argv: list[str] | None = None) -> int:
             network = Path(name) / f'{Path(robot).name}.safetensors'
             checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
             for rate in map(float, args.rates.split(',')):
-                for what in ('nodes', 'with learner', 'plain node, torch') * args.repeat:
-                    system = System(
-                        robot, network, rate, what == 'with learner', what.startswith('plain')
-                    )
+                for what, names in [*KINDS.items()] * args.repeat:
+                    system = System(robot, network, rate, names)
                     try:
                         line = measure(system, rate, args.seconds)
                     finally:

@@ -29,7 +29,8 @@ def main() -> int | None:
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # setup.py says why
             signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-        if name in load('musculoskeletal_ae.nodes.parameters').PARAMETERS:
+        known = load('musculoskeletal_ae.nodes.parameters')
+        if name in {**known.PARAMETERS, **known.COMBINED}:
             return load('musculoskeletal_ae.nodes.running').run(name)
         is_tool = Path(__file__).with_name('tools').joinpath(f'{name}.py').exists()
         folder = 'tools' if is_tool else 'nodes'

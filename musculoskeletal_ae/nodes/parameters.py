@@ -143,6 +143,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     },
 }
 
+#: executables that are several nodes in one process
+COMBINED = {'combined': ('estimator', 'controller')}
+
 #: old names of parameters, read for one version: by 0.3 they are gone
 RENAMED = {'marker_rate': 'marker_pose_rate'}
 
@@ -153,18 +156,19 @@ OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 def check_names(given: Iterable[str], node: str = '') -> None:
     """Refuse a parameter that nothing would read.
 
-    That is one that no node has or, where it is given to one `node`, that only another has: a file
-    is for all nodes.
+    That is one that no node has or, where it is given to one `node` or executable, that only
+    another one has: a file is for all nodes.
     """
+    own = COMBINED.get(node, (node,) if node else ())
     every = [*RENAMED, *OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
     for name in given:
         users = [user for user, table in PARAMETERS.items() if name in table]
         told = ''
         if name.split('.')[0] not in every:
-            legal = [*PARAMETERS[node]] if node else every
+            legal = [key for one in own for key in PARAMETERS[one]] or every
             near = get_close_matches(name, legal, 1) or ['none, see --help']
             told = f'no node has a parameter {name!r}; nearest: {near[0]}'
-        elif node and users and node not in users and len(users) == 1:
+        elif own and len(users) == 1 and users[0] not in own:
             told = f'{node} has no parameter {name!r}; {users[0]} has'
         if told:
             raise MusculoskeletalError(printable(told))
@@ -175,10 +179,12 @@ Give them as  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; thos
 set while the node runs. Names of topics:  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
 
 
-def help_text(node: str) -> str:
-    """Return the part of a node's `--help` that tells of its parameters."""
-    lines = ['Parameters:', '']
-    for name, parameter in PARAMETERS[node].items():
+def help_text(executable: str) -> str:
+    """Return the part of `--help` that tells of the parameters of an executable's nodes."""
+    lines, table = ['Parameters:', ''], dict[str, Parameter]()
+    for node in COMBINED.get(executable, (executable,)):
+        table |= PARAMETERS[node]
+    for name, parameter in table.items():
         mark = '*' if parameter.settable else ' '
         lines.append(f' {mark} {name} (default: {json.dumps(parameter.default)})')
         lines.append(f'       {_told(parameter)}')

@@ -36,7 +36,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.parameters import OF_RCLPY, check_names, help_text
+from musculoskeletal_ae.nodes.parameters import COMBINED, OF_RCLPY, check_names, help_text
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.start import load
 
@@ -67,7 +67,7 @@ def parameters_given(arguments: list[str]) -> list[str]:
 
 
 class LeanExecutor(SingleThreadedExecutor):
-    """Spins one node whose callbacks wait for nothing, without what that costs in rclpy.
+    """Spins nodes whose callbacks wait for nothing, without what that costs in rclpy.
 
     rclpy builds its wait set anew, in Python, for every message, with every event of every topic in
     it, and wakes itself twice after each callback: more than half of what a node costs. Here it is
@@ -131,14 +131,14 @@ class LeanExecutor(SingleThreadedExecutor):
             self._escaped(entity, error)
 
     def _build(self) -> None:
-        """Hold on to what the node has now, so that nothing of it goes while it is waited for."""
-        (node,) = self.get_nodes()
+        """Hold on to what nodes have now, so that nothing of it goes while it is waited for."""
+        nodes = self.get_nodes()
         kinds: list[list[Any]] = [
-            [*node.subscriptions],
+            [entity for node in nodes for entity in node.subscriptions],
             [self._guard, self._sigint_gc],
-            [*node.timers],
-            [*node.clients],
-            [*node.services],
+            [entity for node in nodes for entity in node.timers],
+            [entity for node in nodes for entity in node.clients],
+            [entity for node in nodes for entity in node.services],
         ]
         self._held.close()
         for entity in chain(*kinds):
@@ -178,24 +178,27 @@ class LeanExecutor(SingleThreadedExecutor):
         if isinstance(error, ExternalShutdownException) or not self.context.ok():
             raise error
         named = getattr(entity, 'topic_name', None) or getattr(entity, 'srv_name', None)
-        node: Any = self.get_nodes()[0]
-        node.survive(named or type(entity).__name__, error)
+        nodes: list[Any] = self.get_nodes()
+        owners = (n for n in nodes if entity in (*n.subscriptions, *n.timers, *n.services))
+        next(owners, nodes[0]).survive(named or type(entity).__name__, error)
 
 
 def run(name: str) -> None:
-    """Run one node on a single-threaded executor until it is asked to stop.
+    """Run a node, or several in one process, on one thread until it is asked to stop.
 
     What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
     """
+    own, nodes = COMBINED.get(name, (name,)), list[Node]()
     if {'--help', '-h'} & set(sys.argv[1:]):
         # Not by importing the node, which takes a second.
-        source = Path(__file__).with_name(f'{name}.py').read_text(encoding='utf-8')
-        print(ast.get_docstring(ast.parse(source)), help_text(name), sep='\n\n')
+        for each in own:
+            source = Path(__file__).with_name(f'{each}.py').read_text(encoding='utf-8')
+            print(ast.get_docstring(ast.parse(source)), end='\n\n')
+        print(help_text(name))
         return
     # What ends the interpreter itself says where, on stderr, which bringup.sh keeps.
     with suppress(AttributeError, ValueError, RuntimeError, OSError):
         faulthandler.enable()
-    node: Node | None = None
     try:
         given = sys.argv[1:]
         mine = given[: given.index('--ros-args')] if '--ros-args' in given else given
@@ -204,11 +207,12 @@ def run(name: str) -> None:
             print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
             sys.exit(2)
         check_names(parameters_given(given), name)
-        module = load(f'musculoskeletal_ae.nodes.{name}')
+        modules = [load(f'musculoskeletal_ae.nodes.{each}') for each in own]
         rclpy.init()
-        node = getattr(module, name.title().replace('_', ''))()
         with LeanExecutor() as executor:
-            executor.add_node(node)
+            for module, each in zip(modules, own, strict=True):
+                nodes.append(getattr(module, each.title().replace('_', ''))())
+                executor.add_node(nodes[-1])
             executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -217,13 +221,13 @@ def run(name: str) -> None:
     except PARAMETER_ERRORS as error:
         sys.exit(f'error: {printable(reason(error))}')
     except rclpy_implementation.RCLError as error:
-        if node is None:
+        if not nodes:
             sys.exit(f'error: {printable(reason(error))}')
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
             raise
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
 

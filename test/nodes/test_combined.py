@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimator and controller in one process: the same nodes, and one end."""
+
+from __future__ import annotations
+
+import signal
+
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+
+def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, trained_file):
+    graph.listen(DiagnosticArray, '/diagnostics', 100)
+    for kind, topic in (
+        (Float64MultiArray, 'muscle_length_command'),
+        (JointState, 'estimated_joint_states'),
+    ):
+        graph.listen(kind, topic)
+    graph.start('hardware_emulator', robot='arm26')
+    process = graph.start(
+        'combined', robot='arm26', checkpoint=trained_file, explore=True, max_age=2.0
+    )
+    graph.next('estimated_joint_states', 20)
+    graph.next('muscle_length_command', 20)
+    for node in ('estimator', 'controller'):
+        graph.wait(lambda node=node: graph.report(node).message != 'not heard of', node)
+    graph.wait(lambda: graph.report('controller').message == 'exploring', 'exploration')
+    done, why = graph.set_parameter('estimator', 'anomaly_threshold', -1.0)
+    assert not done and 'anomaly_threshold' in why
+    graph.processes.remove(process)
+    assert process.end(signal.SIGINT)[0] == 0
+
+
+def test_a_parameter_that_only_another_node_has_is_refused(graph):
+    process = graph.start('combined', payload=1.0)
+    graph.processes.clear()
+    process.process.wait()
+    status, output = process.end()
+    assert status == 1 and 'combined has no parameter' in output
