@@ -29,12 +29,13 @@ MATRIX_RATIO = 12.5  # γ of the matrices over Adam's step size for the biases
 
 def orthogonal(matrix: Tensor) -> Tensor:
     """Return about U Vᵀ of a matrix U Σ Vᵀ; zero stays zero."""
-    wide = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
-    x = wide / (wide.norm() + 1e-7)
+    tall = matrix.shape[0] > matrix.shape[1]
+    x = matrix / (matrix.norm() + 1e-7)
     for a, b, c in POLYNOMIALS:
-        square = x @ x.T
-        x = a * x + (b * square + c * square @ square) @ x
-    return x.T if matrix.shape[0] > matrix.shape[1] else x
+        square = x.T @ x if tall else x @ x.T
+        rest = torch.addmm(square, square, square, beta=b, alpha=c)
+        x = torch.addmm(x, *((x, rest) if tall else (rest, x)), beta=a)
+    return x
 
 
 class Optimiser:
@@ -47,7 +48,7 @@ class Optimiser:
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
         others = [p for p in parameters if not muon or p.ndim != 2]
-        self._adam = torch.optim.Adam(others, lr=step_size)
+        self._adam = torch.optim.Adam(others, lr=step_size, fused=True)
 
     def step(self, scale: float = 1.0) -> None:
         """Use the gradients, with the step sizes multiplied by `scale`, and clear them."""
