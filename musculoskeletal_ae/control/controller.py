@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control as a whole: targets in, safe commands out, and why the arm must not move.
 
-    target ─→ posture (lengths) or torque (tensions) ─→ safety ─→ command
+    target     ─→ posture (lengths) or torque (tensions) ─┐
+    trajectory ─→ motion (lengths) ───────────────────────┴─→ safety ─→ command
 
 A stop latches on missing or implausible sensor data, an anomaly, an unfit checkpoint, overload,
 overheating, a fault of control's own, or on request (doc/interface.md, stop and resume). `reset`
-clears it once no cause is left; then the last target is resumed by a ramp from where the arm is.
-Exploration is not resumed. Data that is late, but back before the stop pays out, is no reason to
-latch: after RESUME of it the arm goes on by itself, exploring or not.
+clears it once no cause is left; then the last target, which may be a trajectory's end, is resumed
+by a ramp from where the arm is. Exploration is not resumed. Data that is late, but back before
+the stop pays out, is no reason to latch: after RESUME of it the arm goes on by itself, exploring or
+not.
 
 `now` is a steady clock [s], on which ages run; `time` is that of the messages, by which commands
 change. Where the messages' clock is slow, as of a slow simulator, ages may be larger by as much, up
@@ -26,9 +28,11 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.methods import TorqueControl
+from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
@@ -44,6 +48,7 @@ PACE_SPAN = 1.0  # [s] over which the messages' clock is compared
 OVERHEATED = 20.0  # [°C] above temperature_limit
 OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
 NOTABLE = 0.05  # [N·m] of missing torque
+ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
 
 
 class Pace:
@@ -67,6 +72,8 @@ class Controller:
         self._robot, self.settings = robot, settings or Settings()
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
+        self.motion = MotionControl(robot, self.settings)
+        self._follows = False  # a trajectory, or holds where it ended
         self.safety = SafetyFilter(robot, self.settings)
         #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
@@ -105,6 +112,7 @@ class Controller:
         stiffness = settings.desired_stiffness(joints)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
+        self.motion.settings = settings
         if settings.method != before.method and not self.posture.exploring:
             self._starts = True
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
@@ -114,6 +122,7 @@ class Controller:
         """Take a checked network."""
         self._mae = mae
         self.posture.use(mae)
+        self.motion.use(mae)
 
     def muscles(self, muscles: Muscles, now: float) -> None:
         """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
@@ -159,8 +168,56 @@ class Controller:
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         inside = np.clip(theta, robot.lower, robot.upper)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
-        self._starts |= self.posture.exploring
+        self._starts |= self.posture.exploring or self._follows
+        self._follows = False
         self.posture.set_target(inside, effort)
+
+    def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
+        """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
+
+        A MessageError says why not: nothing changes then.
+        """
+        robot = self._robot
+        if points is not None:
+            beyond = (points.position < robot.lower[points.joints] - ROUNDING) | (
+                points.position > robot.upper[points.joints] + ROUNDING
+            )
+            if beyond.any():
+                k, j = np.argwhere(beyond)[0]
+                place = points.joints[j]
+                limits = f'{robot.lower[place]:.3f} to {robot.upper[place]:.3f}'
+                told = f'{robot.joints[place]} {points.position[k, j]:.3f}, legal: {limits} rad'
+                raise MessageError('beyond the joint limits', told)
+        start = self._ready(max(delay, 0.0))
+        if points is None:
+            self._follow(Trajectory.stopping(start, robot))
+        else:
+            planned = Trajectory.through(start, points, max(-delay, 0.0))
+            planned.check(robot)
+            self._follow(planned, max(delay, 0.0))
+
+    def _ready(self, delay: float = 0.0) -> Setpoint:
+        """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
+        if self._estimate is None or self._mae is None:
+            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
+        if cause := self.safety.cause or self.present_cause(self.stepped_at):
+            raise MessageError('stopped', cause)
+        if not self.safety.zeroed:
+            raise MessageError('length zeros are unknown', 'find them by estimator/zero')
+        if self._follows and not self._starts:
+            return self.motion.ahead(delay)
+        robot = self._robot
+        return Setpoint.resting(np.clip(self._estimate, robot.lower, robot.upper))
+
+    def _follow(self, planned: Trajectory, delay: float = 0.0) -> None:
+        if not self._follows or self._starts:
+            self.explore(False)
+            self.motion.start()
+            if delay > 0.0:
+                self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
+        self._follows, self._starts, self.clamped = True, False, ()
+        self.motion.follow(planned, delay)
+        self.posture.theta, self.posture.effort = planned.end, 0.0 * planned.end
 
     # -- what is asked --------------------------------------------------------------------------
 
@@ -256,6 +313,13 @@ class Controller:
             warnings.append(f'method {chosen.method} exerts no effort')
         if self._in_tension:
             missing = self.torque.missing_torque
+        if self._follows:
+            missing, going = self.motion.missing_torque, self.motion.trajectory
+            if going is not None and going.slowed > 1.0:
+                slowed = f'slowed to {100.0 / going.slowed:.0f} % for the winches'
+                values['trajectory'] = slowed
+                if self.motion.moving:
+                    warnings.append(f'trajectory {slowed}')
         if np.abs(missing).max(initial=0.0) > NOTABLE:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
@@ -271,6 +335,8 @@ class Controller:
             warnings.append(f'hot: {", ".join(hot)}')
         still = 'no target' if posture.theta is None else 'holding'
         doing = 'exploring' if posture.exploring else still
+        if self._follows and self.motion.moving:
+            doing = 'following a trajectory'
         if cause := self.safety.cause:
             if self.safety.passing:
                 return Report('warn', f'holding: {cause}', values)
@@ -295,6 +361,7 @@ class Controller:
         dt, awake = self._elapsed(now, now if time is None else time)
         late, cause = self._late(now), self.present_cause(now)
         # Before the first command there is nothing to stop.
+        self._follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:
             if cause == late:
                 self.safety.stop(cause, passing=True)
@@ -353,14 +420,20 @@ class Controller:
                 last = safety.unchanging(self._robot, LENGTH, muscles)
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
+        planned = np.minimum(self.limit, self._robot.tension.limit)
         if self._starts:
-            self._starts = False
+            self._starts = self._follows = False
             # Go on from the last command, or from how the muscles pull at this moment.
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
                 command = safety.unchanging(self._robot, kind, muscles)
             (self.torque if in_tension else posture).start_from(command.value)
-        planned = np.minimum(self.limit, self._robot.tension.limit)
+        if self._follows:
+            sent = self.safety.command
+            if sent is None or sent.kind != LENGTH:
+                sent = safety.unchanging(self._robot, LENGTH, muscles)
+            follow = self.motion.step
+            return Command(LENGTH, follow(muscles, estimate, sent.value, planned, dt))
         if not in_tension:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Following trajectories, without an arm: sensor data is made up, time is counted by the test."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from control_bench import DT, OTHER, REST, ROBOT, Bench, values
+
+from musculoskeletal_ae.control.motion import SETTLING, Winches, slowness
+from musculoskeletal_ae.control.safety import LENGTH
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.exceptions import MessageError
+
+STILL = np.zeros((1, 2))
+
+
+def points(goal, duration=1.0):
+    return Points(np.array([0, 1]), np.array([duration]), np.array([goal]), STILL, STILL)
+
+
+def moved(bench, count):
+    """Let the arm be where it is desired to be."""
+    sent = []
+    for _ in range(count):
+        sent += bench.step()
+        if bench.core.motion.trajectory is not None:
+            bench.theta = bench.core.motion.desired.theta
+    return sent
+
+
+@pytest.fixture
+def bench():
+    made = Bench(rate_limit=0.3)
+    made.step(5)
+    return made
+
+
+def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
+    bench.core.trajectory(points(OTHER))
+    sent = moved(bench, 50)
+    assert bench.report().message == 'following a trajectory'
+    sent += moved(bench, 400)
+    assert {command.kind for command in sent} == {LENGTH}
+    assert bench.report().message == 'holding'
+    held = bench.core.motion._tension
+    torque = ROBOT.kinematics.holding_torque(OTHER)
+    np.testing.assert_allclose(-ROBOT.routes.muscle_jacobian(OTHER).T @ held, torque, atol=0.3)
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
+
+
+def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(bench, monkeypatch):
+    bench.core.trajectory(points(OTHER))
+    moved(bench, round((1.0 + SETTLING) / DT) + 60)
+    solved = []
+
+    def refused(*_):
+        raise AssertionError('the network was asked')
+
+    monkeypatch.setattr(bench.mae, 'lengths', refused, raising=False)
+    monkeypatch.setattr(bench.mae, 'muscle_jacobian', refused, raising=False)
+    from musculoskeletal_ae.control import posture
+
+    real = posture.least_tension
+    monkeypatch.setattr(posture, 'least_tension', lambda *a: solved.append(1) or real(*a))
+    bench.step(100)
+    assert not bench.core.safety.cause
+    assert 5 <= len(solved) <= 12
+
+
+def test_what_winches_cannot_follow_is_slowed_as_a_whole_and_said(bench):
+    bench.configure(rate_limit=0.05)
+    bench.core.trajectory(points(OTHER, 0.5))
+    trajectory = bench.core.motion.trajectory
+    assert trajectory.slowed > 1.2
+    assert slowness(ROBOT, bench.mae, trajectory, bench.core.settings) == pytest.approx(1.0)
+    sent = values(moved(bench, 20))
+    assert 'slowed to' in bench.report().message
+    sent = np.vstack([sent, values(moved(bench, 600))])
+    assert np.abs(np.diff(sent, axis=0)).max() <= 0.05 * DT + 1e-9
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+
+
+def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
+    bench.core.trajectory(points(OTHER, 2.0))
+    moved(bench, 100)
+    bench.core.trajectory(points(REST, 2.0), delay=0.5)
+    first = bench.core.motion.trajectory
+    moved(bench, 45)
+    assert bench.core.motion.trajectory is first
+    before = bench.core.motion.desired
+    moved(bench, 10)
+    after = bench.core.motion.desired
+    assert bench.core.motion.trajectory is not first
+    assert np.abs(after.theta - before.theta).max() < 0.2
+    np.testing.assert_array_equal(bench.core.motion.trajectory.end, REST)
+    bench.core.trajectory(None)
+    moved(bench, 40)
+    assert not bench.core.motion.desired.velocity.any()
+    assert np.abs(bench.core.motion.desired.theta - REST).max() > 0.1
+
+
+def test_refusals_change_nothing(bench):
+    with pytest.raises(MessageError, match='beyond the joint limits'):
+        bench.core.trajectory(points(ROBOT.upper + 0.1))
+    with pytest.raises(MessageError, match='all points have passed'):
+        bench.core.trajectory(points(OTHER), delay=-5.0)
+    bench.core.stop('asked')
+    with pytest.raises(MessageError, match='stopped'):
+        bench.core.trajectory(points(OTHER))
+    assert bench.core.motion.trajectory is None
+    assert bench.step(3)[-1] is None
+
+
+def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
+    bench.core.trajectory(points(OTHER))
+    moved(bench, 50)
+    bench.core.stop('asked')
+    bench.step(100)
+    assert not bench.core.reset(bench.now)
+    bench.step(5)
+    assert not bench.core.motion.moving or not bench.core._follows
+    np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
+
+
+def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
+    bench.core.trajectory(points(OTHER))
+    sent = moved(bench, 50)
+    bench.target(REST)
+    sent += bench.step(300)
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
+    assert bench.report().message == 'holding'
+
+
+def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands():
+    rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
+    length = np.zeros(ROBOT.muscle_count)
+    for _ in range(300):
+        speed = rng.uniform(-0.2, 0.2, ROBOT.muscle_count)
+        tension = rng.uniform(60.0, 120.0, ROBOT.muscle_count)
+        length = length + speed * DT
+        command = length - (tension - ROBOT.tension.bias) / ROBOT.stiffness + lag * speed
+        noise = rng.normal(0.0, 1e-4, ROBOT.muscle_count)
+        winches.step(length + noise, tension, command, DT)
+    assert winches.lag == pytest.approx(lag, rel=0.15)
+
+
+def test_slowing_a_slow_trajectory_changes_nothing():
+    trajectory = Trajectory.to(Setpoint.resting(REST), OTHER, 20.0)
+    assert slowness(ROBOT, Bench().mae, trajectory, Settings()) == 1.0
