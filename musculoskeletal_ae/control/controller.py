@@ -23,10 +23,12 @@ from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
+import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
+from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import TorqueControl
 from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
@@ -74,6 +76,8 @@ class Controller:
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
         self._follows = False  # a trajectory, or holds where it ended
+        self._hand = Hand(robot)
+        self.short = ''  # what the last pose of the hand was out of reach by
         self.safety = SafetyFilter(robot, self.settings)
         #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
@@ -196,6 +200,27 @@ class Controller:
             planned.check(robot)
             self._follow(planned, max(delay, 0.0))
 
+    def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
+        """Bring the end effector to a pose in the root link's frame, or to its position only.
+
+        A MessageError says why not: nothing changes then.
+        """
+        start, chosen, mae = self._ready(), self.settings, self._mae
+        assert mae is not None  # else it was not ready
+        nearest = chosen.unreachable == 'nearest'
+        theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
+        self._follow(self._hand.towards(start, pose, theta, chosen.hand_speed, now))
+        self.short = short
+
+    def twist(self, twist: Array) -> None:
+        """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
+
+        A MessageError says why not: nothing changes then.
+        """
+        start, mae = self._ready(), self._mae
+        assert mae is not None
+        self._follow(self._hand.moved(mae, start, twist))
+
     def _ready(self, delay: float = 0.0) -> Setpoint:
         """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
         if self._estimate is None or self._mae is None:
@@ -215,7 +240,7 @@ class Controller:
             self.motion.start()
             if delay > 0.0:
                 self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
-        self._follows, self._starts, self.clamped = True, False, ()
+        self._follows, self._starts, self.clamped, self.short = True, False, (), ''
         self.motion.follow(planned, delay)
         self.posture.theta, self.posture.effort = planned.end, 0.0 * planned.end
 
@@ -314,12 +339,11 @@ class Controller:
         if self._in_tension:
             missing = self.torque.missing_torque
         if self._follows:
-            missing, going = self.motion.missing_torque, self.motion.trajectory
-            if going is not None and going.slowed > 1.0:
-                slowed = f'slowed to {100.0 / going.slowed:.0f} % for the winches'
-                values['trajectory'] = slowed
-                if self.motion.moving:
-                    warnings.append(f'trajectory {slowed}')
+            missing = self.motion.missing_torque
+            if self.short:
+                warnings.append(f'hand pose out of reach by {self.short}: nearest approached')
+            if self.motion.moving and self.slowed:
+                warnings.append(f'trajectory {self.slowed}')
         if np.abs(missing).max(initial=0.0) > NOTABLE:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
@@ -348,6 +372,19 @@ class Controller:
         return Report('ok', doing, values)
 
     # -- time -----------------------------------------------------------------------------------
+
+    @property
+    def follows(self) -> bool:
+        """Whether a trajectory is followed, or the end of one held."""
+        return self._follows
+
+    @property
+    def slowed(self) -> str:
+        """By how much the last trajectory was slowed, or ''."""
+        last = self.motion.next[0] if self.motion.next else self.motion.trajectory
+        if last is None or last.slowed == 1.0:
+            return ''
+        return f'slowed to {100.0 / last.slowed:.0f} % of its speed for the winches'
 
     @property
     def _in_tension(self) -> bool:

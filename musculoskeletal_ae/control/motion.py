@@ -37,7 +37,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 PROPORTIONAL, INTEGRAL = 1.0, 4.0  # k_p; k_i [1/s]
 FRICTION = 0.05  # μ where none was learned: the mean of what hands build
-SPACING = 0.02  # [s] between the moments of a plan
+SPACING = 0.04  # [s] between the moments of a plan
 SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the feedback
 PLANS = 4  # times a plan is slowed and tried again
 SLOWNESS = 20.0  # at most
@@ -132,9 +132,10 @@ class MotionControl:
             self._begin(trajectory, 0.0)
 
     def _begin(self, trajectory: Trajectory, time: float) -> None:
-        self.trajectory, self.time, self.next, self._resting = trajectory, time, None, None
-        self._feedback.relief[:] = 0.0
-        self._blend = None
+        self.trajectory, self.time, self.next = trajectory, time, None
+        if self._resting is not None:  # on the way, one goes over to the next by itself
+            self._feedback.relief = np.zeros(self._robot.muscle_count)
+            self._resting = self._blend = None
 
     @property
     def moving(self) -> bool:

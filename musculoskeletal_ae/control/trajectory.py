@@ -11,13 +11,13 @@ from the state that is desired at the start. Points whose time has passed are le
 that a message does not name keep the position that they have at the start, and after the last point
 its position is held. An empty message brings the arm to rest.
 
-A trajectory is slowed as a whole, θ(t/s): velocities fall by s and accelerations by s², and the
-path through the joint space stays what it was.
+A trajectory is slowed as a whole: all its points come s times later, with velocities that are s and
+accelerations that are s² times smaller. From rest that is the same path through the joint space.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -63,20 +63,29 @@ class Points(NamedTuple):
     velocity: Array | None
     acceleration: Array | None
 
+    def later(self, slower: float) -> Points:
+        """Return the same, passed so many times later and slower."""
+        velocity, acceleration = self.velocity, self.acceleration
+        return self._replace(
+            time=self.time * slower,
+            velocity=None if velocity is None else velocity / slower,
+            acceleration=None if acceleration is None else acceleration / slower**2,
+        )
+
 
 @dataclass(frozen=True)
 class Trajectory:
     """Curves through points, from `start` on."""
 
+    start: Setpoint
+    points: Points  # that are left
     time: Array  # of the points, the first at 0 [s], (K,)
     coefficients: Array  # of each piece, (K−1, 6, D)
     end: Array  # what is held after the last point [rad], (D,)
     slowed: float = 1.0  # how many times longer it takes
 
     @classmethod
-    def through(
-        cls, start: Setpoint, points: Points, passed: float = 0.0
-    ) -> Trajectory:
+    def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
         """Lead through points, `passed` [s] after the time that they count from.
 
         A MessageError says that no point is left.
@@ -84,21 +93,28 @@ class Trajectory:
         kept = points.time > passed + 1e-9
         if not kept.any():
             raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
-        time = np.concatenate([[0.0], points.time[kept] - passed])
+        joints, time, *values = points
+        values = [None if value is None else value[kept] for value in values]
+        return cls._joined(start, Points(joints, time[kept] - passed, *values))
+
+    @classmethod
+    def _joined(cls, start: Setpoint, points: Points, slowed: float = 1.0) -> Trajectory:
+        time = np.concatenate([[0.0], points.time])
         degrees = [points.velocity, points.acceleration]
         every = np.zeros((3, len(time), len(start.theta)))
         every[0] = start.theta
         every[:, 0] = start
-        every[0, 1:, points.joints] = points.position[kept].T
+        every[0, 1:, points.joints] = points.position.T
         for order, given in enumerate(degrees, 1):
             if given is not None:
-                every[order, 1:, points.joints] = given[kept].T
+                every[order, 1:, points.joints] = given.T
         shape = LINEAR if degrees[0] is None else CUBIC if degrees[1] is None else QUINTIC
         span = np.diff(time)[:, None]
         first, last = every[:, :-1], every[:, 1:]
         scales = np.stack([np.ones_like(span), span, span**2])
         ends = np.concatenate([scales * first, scales * last])
-        return cls(time, np.einsum('cp,pkd->kcd', shape, ends), every[0, -1])
+        pieces = np.einsum('cp,pkd->kcd', shape, ends)
+        return cls(start, points, time, pieces, every[0, -1], slowed)
 
     @classmethod
     def to(cls, start: Setpoint, theta: Array, duration: float) -> Trajectory:
@@ -124,11 +140,11 @@ class Trajectory:
     @property
     def duration(self) -> float:
         """How long it takes [s]."""
-        return float(self.time[-1]) * self.slowed
+        return float(self.time[-1])
 
     def sample(self, time: Array | float) -> Setpoint:
         """Return what is desired at times [s] (N,), or at one; before and after it rests."""
-        inner = np.clip(np.asarray(time) / self.slowed, 0.0, self.time[-1])
+        inner = np.clip(np.asarray(time), 0.0, self.time[-1])
         piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]
         tau = ((inner - self.time[piece]) / span)[..., None]
@@ -137,10 +153,10 @@ class Trajectory:
         theta = np.einsum('k...d,...k->...d', c, powers)
         velocity = np.einsum('k...d,...k->...d', c[1:], k[1:] * powers[..., :-1])
         acceleration = np.einsum('k...d,...k->...d', c[2:], k[2:] * k[1:-1] * powers[..., :-2])
-        rate = (1.0 / (span * self.slowed))[..., None]
+        rate = (1.0 / span)[..., None]
         moving = ((np.asarray(time) >= 0.0) & (np.asarray(time) < self.duration))[..., None]
         return Setpoint(theta, moving * velocity * rate, moving * acceleration * rate**2)
 
     def scaled(self, slower: float) -> Trajectory:
-        """Return the same path, taking so many times longer."""
-        return replace(self, slowed=self.slowed * slower)
+        """Return one whose points come so many times later."""
+        return self._joined(self.start, self.points.later(slower), self.slowed * slower)
