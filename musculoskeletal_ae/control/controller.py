@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 import pinocchio as pin
@@ -38,6 +39,7 @@ from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
@@ -172,6 +174,14 @@ class Controller:
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         inside = np.clip(theta, robot.lower, robot.upper)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
+        if self._quick and not self.safety.cause:
+            with suppress(MessageError):  # not ready: then by a ramp, once it is
+                planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
+                clamped = self.clamped
+                self._follow(planned)
+                self.motion.exert(effort)
+                self.posture.effort, self.clamped = effort, clamped
+                return
         self._starts |= self.posture.exploring or self._follows
         self._follows = False
         self.posture.set_target(inside, effort)
@@ -242,7 +252,8 @@ class Controller:
                 self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
         self.motion.follow(planned, delay)
-        self.posture.theta, self.posture.effort = planned.end, 0.0 * planned.end
+        self.motion.effort = np.zeros(self._robot.joint_count)
+        self.posture.theta, self.posture.effort = planned.end, self.motion.effort
 
     # -- what is asked --------------------------------------------------------------------------
 
@@ -372,6 +383,12 @@ class Controller:
         return Report('ok', doing, values)
 
     # -- time -----------------------------------------------------------------------------------
+
+    @property
+    def _quick(self) -> bool:
+        chosen = self.settings
+        solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
+        return solved and chosen.target_duration > 0.0
 
     @property
     def follows(self) -> bool:

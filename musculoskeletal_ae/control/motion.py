@@ -137,6 +137,11 @@ class MotionControl:
             self._feedback.relief = np.zeros(self._robot.muscle_count)
             self._resting = self._blend = None
 
+    def exert(self, effort: Array) -> None:
+        """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
+        if effort.any():
+            self.effort, self._resting, self._blend = effort, None, None
+
     @property
     def moving(self) -> bool:
         """Whether a trajectory goes on or is to come."""

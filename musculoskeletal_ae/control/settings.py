@@ -30,6 +30,14 @@ class Settings:
     second_duration: float = settable(
         2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
     )
+    target_duration: float = settable(
+        1.2,
+        'movement to a target under `proposed`, longer where winches need it (0: a ramp of '
+        'lengths, first_duration)',
+        's',
+        0.0,
+        60.0,
+    )
     constant_tension: float = settable(
         0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )

@@ -93,9 +93,10 @@ class Trajectory:
         kept = points.time > passed + 1e-9
         if not kept.any():
             raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
-        joints, time, *values = points
-        values = [None if value is None else value[kept] for value in values]
-        return cls._joined(start, Points(joints, time[kept] - passed, *values))
+        velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
+        time, position = points.time[kept] - passed, points.position[kept]
+        left = Points(points.joints, time, position, velocity, acceleration)
+        return cls._joined(start, left)
 
     @classmethod
     def _joined(cls, start: Setpoint, points: Points, slowed: float = 1.0) -> Trajectory:

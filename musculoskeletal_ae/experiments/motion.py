@@ -7,7 +7,7 @@ Here. Minimum-jerk motions between random postures that the true body can hold, 
 each 0.6 s apart, after learning: the joint trajectory is followed by inverse dynamics. Tracking:
 the mean over the motion of ‖θ_desired − θ_true‖ over all joints; settled: the same 0.5 s after its
 end. Beside it the other ways to get there in that time: a target under `proposed`, `first` and
-`second`, whose ramp is as long as the motion, and the desired posture, message by message, under
+`second`, by ramps of lengths that are as long as the motion, and the desired posture, message by message, under
 `tension`. Where winches cannot follow, a trajectory is slowed, and its own desired posture counts;
 "slowed" is by how much. The controller may use the speed that the emulated winches have.
 "Tension" is the mean of ‖T‖ beside that of the least T ≥ T_bias that moves the true body along the
@@ -30,12 +30,12 @@ from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.hand import POSITION, Hand
 from musculoskeletal_ae.control.posture import RAMP_SHARE
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, times
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
@@ -57,6 +57,8 @@ METHODS = {
 RADIUS, SPEED = 0.05, 0.1  # [m], [m/s]
 EVERY = 2  # messages between two poses
 NEAR = 0.002  # [m]
+#: where the hand is to be at a time [s]
+Place = Callable[[float], pin.SE3]
 LAP = 2.0 * np.pi * RADIUS / SPEED
 
 
@@ -80,14 +82,14 @@ def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> C
     # `first` takes all of the time but for the ramp of the other part, if it has one.
     ramp = duration / RAMP_SHARE
     first_part = 0.5 * ramp if method == 'second' else ramp
-    settings = Settings(rate_limit=SPEED_LIMIT, first_duration=first_part)
+    settings = Settings(rate_limit=SPEED_LIMIT)
     loop = ClosedLoop(arm, mae, settings)
     loop.step()
     loop.go(start, STARTING)
     if method != 'trajectory':
         other = Settings(
-            method=method, rate_limit=SPEED_LIMIT, first_duration=first_part,
-            second_duration=0.5 * ramp,
+            method=method, rate_limit=SPEED_LIMIT, target_duration=0.0,
+            first_duration=first_part, second_duration=0.5 * ramp,
         )  # fmt: skip
         loop.core.configure(other)
         loop.go(start, STARTING)
@@ -106,8 +108,7 @@ def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: f
         core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
     theta, tension = [], []
     count = round(planned.duration / SAMPLE_TIME)
-    time = SAMPLE_TIME * np.arange(1, count + round(REST / SAMPLE_TIME) + 1)
-    desired = planned.sample(time)
+    desired = planned.sample(SAMPLE_TIME + times(count + round(REST / SAMPLE_TIME)))
     for at in desired.theta.tolist():
         if method == 'tension':
             core.target({name: (angle, 0.0) for name, angle in zip(names, at)})
@@ -136,9 +137,11 @@ def bounds(arm: Arm, motion: Setpoint) -> Array:
     return np.reshape(result, (-1, 2)).T
 
 
-def circles(robot: Robot, mae: Mae, rng: np.random.Generator, count: int) -> list[Any]:
+def circles(
+    robot: Robot, mae: Mae, rng: np.random.Generator, count: int
+) -> list[tuple[Array, Place]]:
     """Return random circles that can be followed: a posture, and where the hand is at times [s]."""
-    hand, found = Hand(robot), list[Any]()
+    hand, found = Hand(robot), list[tuple[Array, Place]]()
     for theta, _ in holdable_postures(robot, robot.random_postures(TRIES, rng), 40):
         centre = robot.kinematics.end_effector_pose(theta).translation
         frame = np.linalg.qr(robot.kinematics.end_effector_jacobian(theta)[:3])[0]
@@ -160,7 +163,9 @@ def circles(robot: Robot, mae: Mae, rng: np.random.Generator, count: int) -> lis
     return found
 
 
-def circle(loop: ClosedLoop, start: Array, place: Callable[[float], pin.SE3]) -> tuple[Array, Array]:
+def circle(
+    loop: ClosedLoop, start: Array, place: Callable[[float], pin.SE3]
+) -> tuple[Array, Array]:
     """Go round once; return where the hand was to be and where it was [m], each (N, 3)."""
     loop.go(start, STARTING)
     loop.core.pose(place(0.0), False, -1.0)
@@ -236,12 +241,13 @@ def motion(_: Study, rows: Rows) -> Plot:
     for panel, duration in zip(panels, DURATIONS, strict=True):
         for method, colour in METHODS.items():
             error = row.traces[f'{method} {duration:.0f}s']
-            time = SAMPLE_TIME * np.arange(len(error))
             told = f'{method}: {error.mean():.3f} rad'
-            plots.line(panel, time, error, color=colour, label=told, lw=1.2)
+            plots.line(panel, times(len(error)), error, color=colour, label=told, lw=1.2)
         title = f'individual {seed}, motions of {duration:g} s'
         plots.tidy(panel, 'time [s]', '‖θ_desired − θ‖ [rad]', title, legend='right')
-    caption = 'Distance from the minimum-jerk motion over time, several motions one after the other.'
+    caption = (
+        'Distance from the minimum-jerk motion over time, several motions one after the other.'
+    )
     return figure, caption
 
 

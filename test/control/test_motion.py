@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 
+from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.motion import SETTLING, Winches, slowness
 from musculoskeletal_ae.control.safety import LENGTH
 from musculoskeletal_ae.control.settings import Settings
@@ -133,6 +135,22 @@ def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
     assert bench.report().message == 'holding'
 
 
+def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench):
+    bench.configure(target_duration=1.0)
+    bench.target(OTHER)
+    moved(bench, 400)
+    plain = bench.core.motion._tension
+    assert bench.core.follows
+    bench.target(OTHER, (1.0, 0.0))
+    moved(bench, 400)
+    np.testing.assert_array_equal(bench.core.motion.desired.theta, OTHER)
+    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.motion._tension)
+    np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
+    bench.target(ROBOT.upper + 1.0)
+    bench.step()
+    assert 'clamped' in bench.report().message
+
+
 def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands():
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
@@ -149,3 +167,72 @@ def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands():
 def test_slowing_a_slow_trajectory_changes_nothing():
     trajectory = Trajectory.to(Setpoint.resting(REST), OTHER, 20.0)
     assert slowness(ROBOT, Bench().mae, trajectory, Settings()) == 1.0
+
+
+def hand(bench, theta, whole=False):
+    bench.core.pose(ROBOT.kinematics.end_effector_pose(theta), whole, bench.now)
+
+
+def test_a_pose_of_the_hand_is_reached_and_one_out_of_reach_refused_or_approached(bench):
+    hand(bench, OTHER)
+    moved(bench, 300)
+    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta)
+    wanted = ROBOT.kinematics.end_effector_pose(OTHER)
+    np.testing.assert_allclose(at.translation, wanted.translation, atol=5e-3)
+    far = pin.SE3(wanted.rotation, 3.0 * wanted.translation)
+    before = bench.core.motion.trajectory
+    with pytest.raises(MessageError, match='out of reach'):
+        bench.core.pose(far, False, bench.now)
+    assert bench.core.motion.trajectory is before
+    bench.configure(unreachable='nearest')
+    bench.core.pose(far, False, bench.now)
+    bench.step()
+    assert 'nearest approached' in bench.report().message
+
+
+def test_what_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
+    weak = bench.mae.muscle_jacobian
+    # Beyond half of the way the muscles have no leverage.
+    half = 0.5 * (REST + OTHER)
+    monkeypatch.setattr(
+        bench.mae, 'muscle_jacobian',
+        lambda theta, tension: weak(theta, tension) * (np.abs(theta - REST) < np.abs(half - REST)).all(),
+        raising=False,
+    )  # fmt: skip
+    with pytest.raises(MessageError, match='the muscles lack'):
+        hand(bench, OTHER)
+    theta, short = Hand(ROBOT).posture(
+        bench.mae, ROBOT.kinematics.end_effector_pose(OTHER), False, REST, True
+    )
+    assert 'the muscles lack' in short
+    share = (theta - REST) / (OTHER - REST)
+    np.testing.assert_allclose(share, 0.5, atol=0.1)
+
+
+def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
+    start, speed = REST, np.array([0.2, 0.3])
+    hand(bench, start)
+    moved(bench, 200)
+    for n in range(60):
+        hand(bench, start + 0.01 * n * speed)
+        moved(bench, 1)
+    wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
+    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
+    assert np.linalg.norm(at - wanted) < 0.006
+    moved(bench, 150)  # no other comes
+    assert not bench.core.motion.moving
+
+
+def test_a_twist_moves_the_hand_until_its_time_is_out(bench):
+    begun = ROBOT.kinematics.end_effector_pose(REST).translation
+    along = ROBOT.kinematics.end_effector_jacobian(REST)[:3] @ np.array([0.3, 0.3])
+    twist = np.concatenate([0.1 * along / np.linalg.norm(along), np.zeros(3)])
+    for _ in range(20):
+        bench.core.twist(twist)
+        moved(bench, 5)
+    rate = ROBOT.kinematics.end_effector_jacobian(bench.core.motion.desired.theta)[:3]
+    np.testing.assert_allclose(rate @ bench.core.motion.desired.velocity, twist[:3], atol=0.02)
+    moved(bench, 80)
+    assert not bench.core.motion.moving
+    gone = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation - begun
+    assert gone @ twist[:3] / 0.1 > 0.08
