@@ -251,7 +251,10 @@ class Controller:
             if delay > 0.0:
                 self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
-        self.motion.follow(planned, delay)
+        try:
+            self.motion.follow(planned, delay)
+        except Exception as error:  # noqa: BLE001 (as in `step`)
+            self.stop(f'fault of control: {type(error).__name__}: {error}')
         self.motion.effort = np.zeros(self._robot.joint_count)
         self.posture.theta, self.posture.effort = planned.end, self.motion.effort
 
@@ -351,6 +354,7 @@ class Controller:
             missing = self.torque.missing_torque
         if self._follows:
             missing = self.motion.missing_torque
+            values['lag of the winches'] = f'{1000.0 * self.motion.winches.lag:.0f} ms'
             if self.short:
                 warnings.append(f'hand pose out of reach by {self.short}: nearest approached')
             if self.motion.moving and self.slowed:

@@ -119,9 +119,8 @@ class Hand:
         normal = part @ part.T + DAMPING**2 * np.eye(len(part))
         velocity: Array = part.T @ np.linalg.solve(normal, twist[rows])
         time = np.cumsum([STARTING, TWIST_TIMEOUT, STOPPING])
-        ways = np.array([0.5 * STARTING, 0.5 * STARTING + TWIST_TIMEOUT])
-        ways = np.append(ways, ways[-1] + 0.5 * STOPPING)
-        theta = start.theta + ways[:, None] * velocity
+        ways = 0.5 * STARTING + np.array([0.0, TWIST_TIMEOUT, TWIST_TIMEOUT + 0.5 * STOPPING])
+        theta = start.theta + 0.5 * STARTING * start.velocity + ways[:, None] * velocity
         inside = np.clip(theta, robot.lower, robot.upper)
         # A joint that would meet its limit stops there, the others go on.
         free = (inside == theta).all(axis=0)

@@ -169,7 +169,8 @@ class MotionControl:
             if self.next[1] <= 0.0:
                 trajectory = self.next[0]
                 self._begin(trajectory, -self.next[1])
-        self.desired = trajectory.sample(self.time)
+        if self._resting is None:
+            self.desired = trajectory.sample(self.time)
         self.error = self.desired.theta - theta
         feedback = self._feedback
         if self.time < trajectory.duration + SETTLING:

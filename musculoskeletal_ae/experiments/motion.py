@@ -7,13 +7,14 @@ Here. Minimum-jerk motions between random postures that the true body can hold, 
 each 0.6 s apart, after learning: the joint trajectory is followed by inverse dynamics. Tracking:
 the mean over the motion of ‖θ_desired − θ_true‖ over all joints; settled: the same 0.5 s after its
 end. Beside it the other ways to get there in that time: a target under `proposed`, `first` and
-`second`, by ramps of lengths that are as long as the motion, and the desired posture, message by message, under
-`tension`. Where winches cannot follow, a trajectory is slowed, and its own desired posture counts;
-"slowed" is by how much. The controller may use the speed that the emulated winches have.
-"Tension" is the mean of ‖T‖ beside that of the least T ≥ T_bias that moves the true body along the
-path (inverse dynamics). A wire that is pulled out drags its winch along, which no command can help;
-"winches" is the same beside the least T with that drag. The circles, of 10 cm, are random ones that
-can be reached; the hand's position is sent by target_pose, 50 times a second, at 0.1 m/s.
+`second`, by ramps of lengths that are as long as the motion, and the desired posture, message by
+message, under `tension`. Where winches cannot follow, a trajectory is slowed, and its own desired
+posture counts; "slowed" is by how much. The controller may use the speed that the emulated winches
+have. "Tension" is the mean of ‖T‖ beside that of the least T ≥ T_bias that moves the true body
+along the path (inverse dynamics). A wire that is pulled out drags its winch along, which no command
+can help; "winches" is the same beside the least T with that drag. To settle: the time from a target
+under `proposed` until the arm stays within 0.05 rad of it. The circles, of 10 cm, are random ones
+that can be reached; the hand's position is sent by target_pose, 50 times a second, at 0.1 m/s.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ EVERY = 2  # messages between two poses
 NEAR = 0.002  # [m]
 #: where the hand is to be at a time [s]
 Place = Callable[[float], pin.SE3]
+WATCHED, WITHIN = 4.0, 0.05  # [s], [rad]
 LAP = 2.0 * np.pi * RADIUS / SPEED
 
 
@@ -121,6 +123,16 @@ def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: f
     return Followed(
         desired.theta, np.array(theta), np.array(tension)[:count], bound, planned.slowed
     )
+
+
+def settling(loop: ClosedLoop, goal: Array) -> float:
+    """Return how long it takes from a target [rad] (D,) until the arm stays near it [s]."""
+    names, last = loop.arm.robot.joints, 0
+    loop.core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
+    for n in range(round(WATCHED / SAMPLE_TIME)):
+        loop.step()
+        last = n + 1 if np.linalg.norm(loop.arm.theta - goal) > WITHIN else last
+    return SAMPLE_TIME * last
 
 
 def bounds(arm: Arm, motion: Setpoint) -> Array:
@@ -211,6 +223,7 @@ def measure(study: Study, seed: int) -> Measured:
         'tension_ratio_winches': 0.5 * (ours['winches_ratio_1s'] + ours['winches_ratio_2s']),
     }
     loop = loop_at(study.arm(seed), mae, postures[0], 'trajectory', 1.0)
+    numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
     laps = [circle(loop, *each) for each in circles(robot, mae, rng, 1 if study.quick else CIRCLES)]
     if laps:
         off = [np.linalg.norm(true - wanted, axis=1).mean() for wanted, true in laps]
@@ -274,6 +287,7 @@ ROWS = (
     Row('motions of 1 s, tracking [rad]', NOTHING, '', 'track_1s_rad', '', 0.10),
     Row('motions of 2 s, tracking [rad]', NOTHING, '', 'track_2s_rad', '', 0.06),
     Row('0.5 s after a motion [rad]', NOTHING, '', 'settled_rad', '', 0.05),
+    Row('from a target to within 0.05 rad of it [s]', NOTHING, '', 'settle_s', '', 2.0, 2),
     Row('‖T‖ of motions beside the inverse dynamics’ least [ratio]', NOTHING, '', 'tension_ratio',
         '', 1.15, 2),
     Row('‖T‖ of motions beside the least with the winches’ drag [ratio]', NOTHING, '',

@@ -96,7 +96,7 @@ def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
     after = bench.core.motion.desired
     assert bench.core.motion.trajectory is not first
     assert np.abs(after.theta - before.theta).max() < 0.2
-    np.testing.assert_array_equal(bench.core.motion.trajectory.end, REST)
+    np.testing.assert_allclose(bench.core.motion.trajectory.end, REST)
     bench.core.trajectory(None)
     moved(bench, 40)
     assert not bench.core.motion.desired.velocity.any()
@@ -143,7 +143,7 @@ def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench
     assert bench.core.follows
     bench.target(OTHER, (1.0, 0.0))
     moved(bench, 400)
-    np.testing.assert_array_equal(bench.core.motion.desired.theta, OTHER)
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
     more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.motion._tension)
     np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
     bench.target(ROBOT.upper + 1.0)
@@ -191,14 +191,12 @@ def test_a_pose_of_the_hand_is_reached_and_one_out_of_reach_refused_or_approache
 
 
 def test_what_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
-    weak = bench.mae.muscle_jacobian
-    # Beyond half of the way the muscles have no leverage.
-    half = 0.5 * (REST + OTHER)
-    monkeypatch.setattr(
-        bench.mae, 'muscle_jacobian',
-        lambda theta, tension: weak(theta, tension) * (np.abs(theta - REST) < np.abs(half - REST)).all(),
-        raising=False,
-    )  # fmt: skip
+    strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
+
+    def weak(theta, tension):  # beyond half of the way
+        return strong(theta, tension) * (np.abs(theta - REST) < half).all()
+
+    monkeypatch.setattr(bench.mae, 'muscle_jacobian', weak, raising=False)
     with pytest.raises(MessageError, match='the muscles lack'):
         hand(bench, OTHER)
     theta, short = Hand(ROBOT).posture(

@@ -39,7 +39,7 @@ def test_a_trajectory_is_followed_and_its_state_said_and_a_wrong_one_moves_nothi
         arm.says('holding')
         arm.goes_to(goal, within=0.3)
     state = graph.next('controller_state')
-    assert state.joint_names == robot.joints
+    assert tuple(state.joint_names) == robot.joints
     desired, feedback, error = (np.array(point.positions) for point in state.points)
     np.testing.assert_allclose(desired, THERE)
     np.testing.assert_allclose(desired - feedback, error, atol=1e-12)
@@ -69,7 +69,9 @@ def test_a_hand_pose_is_reached_and_one_in_another_frame_refused(arm):
     publisher.publish(message)
 
     def away():
-        return np.linalg.norm(robot.kinematics.end_effector_pose(arm.posture()).translation - wanted)
+        return np.linalg.norm(
+            robot.kinematics.end_effector_pose(arm.posture()).translation - wanted
+        )
 
     graph.wait(lambda: away() < 0.06, 'the hand at its place')
     place.x = 9.0
