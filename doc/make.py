@@ -29,6 +29,8 @@ MODULES = {
     'estimation/estimator.py': ['Estimator', 'Estimate'],
     'control/controller.py': ['Controller'],
     'control/settings.py': ['Settings'],
+    'control/trajectory.py': ['Trajectory', 'Points', 'Setpoint'],
+    'control/motion.py': ['MotionControl'],
     'learning/learner.py': ['Learner'],
     'simulation/simulation.py': ['Simulation'],
     'emulator/reality.py': ['make_arm'],

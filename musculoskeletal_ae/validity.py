@@ -16,12 +16,15 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 
 # Far more than any arm has; what is longer is refused before it is looked at.
 MOST_ENTRIES = 10_000
 # What a hand can take [N], [N·m]: a third of what the emulated arms do, any axis and posture.
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
+MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the hand
+LAST_VELOCITY = 1e-6  # [rad/s] at which a trajectory ends
 MOST_EFFORT = 1000.0  # [N·m] asked of one joint
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
@@ -120,12 +123,78 @@ def read_wrench(message: Any, root_link: str) -> Array:
     return wrench
 
 
-def read_pose(message: Any, frame: str) -> pin.SE3:
-    """Return the pose of a PoseStamped that is given in `frame`."""
+def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
+    """Return the points of a JointTrajectory, or None if it has none: come to rest.
+
+    Velocities and accelerations are given at all points or at none.
+    """
+    names, points = list(message.joint_names), list(message.points)
+    if len(names) * max(len(points), 1) > MOST_ENTRIES:
+        told = f'{len(points)} points of {len(names)} joints, at most {MOST_ENTRIES} values'
+        raise MessageError('oversized', told)
+    if not points:
+        return None
+    if not names:
+        raise MessageError('empty', 'points, but no joint_names')
+    if unknown := [name for name in names if name not in joints]:
+        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
+    if len(set(names)) < len(names):
+        raise MessageError('duplicate joint', repr(max(names, key=names.count)))
+    columns: dict[str, Array | None] = {}
+    for what in ('positions', 'velocities', 'accelerations', 'effort'):
+        rows = [getattr(point, what) for point in points]
+        lengths = {len(row) for row in rows}
+        legal = {len(names)} if what == 'positions' else {0, len(names)}
+        if len(lengths) > 1 or not lengths <= legal:
+            told = f'{what} of {sorted(lengths)} values at the points, for {len(names)} joints'
+            raise MessageError('wrong length', told)
+        columns[what] = None if 0 in lengths else np.array([list(row) for row in rows], dtype=float)
+    position, velocity, acceleration, effort = columns.values()
+    assert position is not None
+    if effort is not None:
+        raise MessageError('effort', 'a trajectory has positions, velocities, accelerations only')
+    if velocity is None and acceleration is not None:
+        raise MessageError('wrong length', 'accelerations without velocities')
+    spans = [point.time_from_start for point in points]
+    time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
+    if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
+        raise MessageError('times do not increase', str(time[:20].tolist()))
+    parts = [part for part in (position, velocity, acceleration) if part is not None]
+    if not all(np.isfinite(part).all() for part in parts):
+        raise MessageError('not finite', 'a position, velocity or acceleration')
+    if velocity is not None and np.abs(velocity[-1]).max() > LAST_VELOCITY:
+        raise MessageError('moves at its end', f'last velocities {velocity[-1].tolist()}')
+    places = np.array([list(joints).index(name) for name in names])
+    return Points(places, time, position, velocity, acceleration)
+
+
+def read_twist(message: Any, frame: str) -> Array:
+    """Return the linear [m/s] and angular velocity [rad/s] (6,) of a TwistStamped in `frame`."""
+    if message.header.frame_id != frame:
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
+    linear, angular = message.twist.linear, message.twist.angular
+    twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+    if not np.isfinite(twist).all():
+        raise MessageError('not finite', 'a linear or angular velocity')
+    if (np.abs(twist) > MOST_TWIST).any():
+        raise MessageError('oversized', f'{twist}, at most {MOST_TWIST}')
+    return twist
+
+
+def without_orientation(message: Any) -> bool:
+    """Whether a PoseStamped asks for a position only: its quaternion is all zeros."""
+    turn = message.pose.orientation
+    return not any((turn.x, turn.y, turn.z, turn.w))
+
+
+def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
+    """Return the pose of a PoseStamped that is given in `frame`, or its position alone."""
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     position, turn = message.pose.position, message.pose.orientation
     values = np.array([turn.x, turn.y, turn.z, turn.w, position.x, position.y, position.z])
+    if position_only:
+        values[:4] = 0.0, 0.0, 0.0, 1.0
     if not np.isfinite(values).all():
         raise MessageError('not finite', 'a position or orientation')
     if abs(np.linalg.norm(values[:4]) - 1.0) > UNIT_TOLERANCE:

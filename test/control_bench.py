@@ -24,7 +24,8 @@ class Bench:
     """A controller that is fed healthy sensor data unless told otherwise."""
 
     def __init__(self, mae=None, **chosen):
-        self.core = Controller(ROBOT, Settings(**chosen))
+        # Ramps of lengths need no arm that comes along.
+        self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)
         self.now, self.theta, self.tension, self.temperature = 100.0, REST, None, COLD

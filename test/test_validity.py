@@ -7,19 +7,24 @@ import math
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.validity import (
     read_array,
     read_joints,
+    read_pose,
     read_posture,
+    read_trajectory,
+    read_twist,
     read_wrench,
+    without_orientation,
 )
 
 JOINTS = ('a', 'b')
@@ -173,3 +178,75 @@ def test_messages_are_told_by_their_fields_whatever_library_made_them():
         read_array(recorded, 2, 2)
     recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
     assert read_posture(recorded, JOINTS).tolist() == [1.0, 2.0]
+
+
+def trajectory(names=('b', 'a'), times=(1.0, 2.5), rows=((1.0, 2.0), (3.0, 4.0)), **others):
+    points = [JointTrajectoryPoint(positions=row) for row in rows]
+    for point, time in zip(points, times):
+        point.time_from_start.sec = int(time // 1)
+        point.time_from_start.nanosec = round(1e9 * (time % 1))
+    for field, values in others.items():
+        for point, row in zip(points, values):
+            setattr(point, field, row)
+    return JointTrajectory(joint_names=names, points=points)
+
+
+def test_a_trajectory_is_matched_by_name_and_an_empty_one_is_none():
+    still = ((0.5, 0.0), (0.0, 0.0))
+    points = read_trajectory(trajectory(velocities=still, accelerations=still), JOINTS)
+    assert points.joints.tolist() == [1, 0]
+    assert points.time.tolist() == [1.0, 2.5]
+    assert points.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert points.velocity.tolist() == [[0.5, 0.0], [0.0, 0.0]]
+    assert read_trajectory(trajectory(['a'], rows=[[1.0]]), JOINTS).velocity is None
+    assert read_trajectory(JointTrajectory(), JOINTS) is None
+
+
+@pytest.mark.parametrize(
+    ('message', 'reason'),
+    [
+        (trajectory(('a', 'c')), 'unknown joint'),
+        (trajectory(('a', 'a')), 'duplicate joint'),
+        (trajectory((), rows=((), ())), 'empty'),
+        (trajectory(rows=((1.0, 2.0), (3.0,))), 'wrong length'),
+        (trajectory(rows=((), ())), 'wrong length'),
+        (trajectory(velocities=((0.0, 0.0), ())), 'wrong length'),
+        (trajectory(accelerations=((0.0, 0.0), (0.0, 0.0))), 'wrong length'),
+        (trajectory(effort=((0.0, 0.0), (0.0, 0.0))), 'effort'),
+        (trajectory(times=(1.0, 1.0)), 'times do not increase'),
+        (trajectory(times=(2.0, 1.0)), 'times do not increase'),
+        (trajectory(times=(-1.0, 1.0)), 'times do not increase'),
+        (trajectory(rows=((1.0, math.nan), (3.0, 4.0))), 'not finite'),
+        (trajectory(velocities=((math.inf, 0.0), (0.0, 0.0))), 'not finite'),
+        (trajectory(velocities=((0.0, 0.0), (0.0, 0.1))), 'moves at its end'),
+        (trajectory(times=range(6000), rows=((0.0, 0.0),) * 6000), 'oversized'),
+    ],
+)
+def test_what_is_no_trajectory_is_refused(message, reason):
+    with pytest.raises(MessageError, match=reason):
+        read_trajectory(message, JOINTS)
+
+
+def test_a_pose_may_say_its_position_only_and_frames_must_be_right():
+    message = PoseStamped()
+    message.header.frame_id, message.pose.orientation.w = 'base', 0.0
+    assert without_orientation(message)
+    message.pose.position.x = 0.3
+    assert read_pose(message, 'base', position_only=True).translation.tolist() == [0.3, 0.0, 0.0]
+    with pytest.raises(MessageError, match='quaternion'):
+        read_pose(message, 'base')
+    with pytest.raises(MessageError, match='wrong frame'):
+        read_pose(message, 'hand', position_only=True)
+
+
+def test_a_twist_is_in_the_root_link_finite_and_not_absurd():
+    message = TwistStamped()
+    message.twist.linear.y = 0.2
+    with pytest.raises(MessageError, match='wrong frame'):
+        read_twist(message, 'base')
+    message.header.frame_id = 'base'
+    assert read_twist(message, 'base').tolist() == [0.0, 0.2, 0.0, 0.0, 0.0, 0.0]
+    for value, reason in ((math.nan, 'not finite'), (1e3, 'oversized')):
+        message.twist.angular.z = value
+        with pytest.raises(MessageError, match=reason):
+            read_twist(message, 'base')

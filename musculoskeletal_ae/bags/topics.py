@@ -21,6 +21,8 @@ class Topic(NamedTuple):
 _ARRAY = 'std_msgs/msg/Float64MultiArray'
 _JOINTS = 'sensor_msgs/msg/JointState'
 _WRENCH = 'geometry_msgs/msg/WrenchStamped'
+_POSE = 'geometry_msgs/msg/PoseStamped'
+_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 _MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
@@ -32,13 +34,17 @@ TOPICS = {
     'muscle_length_command': Topic(_ARRAY, sent=True),
     'muscle_tension_command': Topic(_ARRAY, sent=True),
     'target_joint_states': Topic(_JOINTS, sent=True),
+    'joint_trajectory': Topic(_TRAJECTORY, sent=True),
+    'target_pose': Topic(_POSE, sent=True),
+    'target_twist': Topic('geometry_msgs/msg/TwistStamped', sent=True),
+    'controller_state': Topic(_TRAJECTORY),
     'estimated_joint_states': Topic(_JOINTS),
     'estimated_muscle_states': Topic(_ARRAY),
     'muscle_length_zeros': Topic(_ARRAY, latched=True),
     'anomaly': Topic('std_msgs/msg/Float64'),
     'anomaly_detected': Topic('std_msgs/msg/Bool', latched=True),
     'mae_checkpoint': Topic('std_msgs/msg/UInt8MultiArray', latched=True),
-    'marker_pose': Topic('geometry_msgs/msg/PoseStamped', sent=True),
+    'marker_pose': Topic(_POSE, sent=True),
     'vision_joint_states': Topic(_JOINTS),
     'sim/joint_states': Topic(_JOINTS),
     'sim/muscle_states': Topic(_ARRAY),

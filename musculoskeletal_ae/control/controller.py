@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control as a whole: targets in, safe commands out, and why the arm must not move.
 
-    target ─→ posture (lengths) or torque (tensions) ─→ safety ─→ command
+    target     ─→ posture (lengths) or torque (tensions) ─┐
+    trajectory ─→ motion (lengths) ───────────────────────┴─→ safety ─→ command
 
 A stop latches on missing or implausible sensor data, an anomaly, an unfit checkpoint, overload,
 overheating, a fault of control's own, or on request (doc/interface.md, stop and resume). `reset`
-clears it once no cause is left; then the last target is resumed by a ramp from where the arm is.
-Exploration is not resumed. Data that is late, but back before the stop pays out, is no reason to
-latch: after RESUME of it the arm goes on by itself, exploring or not.
+clears it once no cause is left; then the last target, which may be a trajectory's end, is resumed
+by a ramp from where the arm is. Exploration is not resumed. Data that is late, but back before
+the stop pays out, is no reason to latch: after RESUME of it the arm goes on by itself, exploring or
+not.
 
 `now` is a steady clock [s], on which ages run; `time` is that of the messages, by which commands
 change. Where the messages' clock is slow, as of a slow simulator, ages may be larger by as much, up
@@ -19,19 +21,25 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
+import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
+from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import TorqueControl
+from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
@@ -44,6 +52,7 @@ PACE_SPAN = 1.0  # [s] over which the messages' clock is compared
 OVERHEATED = 20.0  # [°C] above temperature_limit
 OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
 NOTABLE = 0.05  # [N·m] of missing torque
+ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
 
 
 class Pace:
@@ -67,6 +76,10 @@ class Controller:
         self._robot, self.settings = robot, settings or Settings()
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
+        self.motion = MotionControl(robot, self.settings)
+        self._follows = False  # a trajectory, or holds where it ended
+        self._hand = Hand(robot)
+        self.short = ''  # what the last pose of the hand was out of reach by
         self.safety = SafetyFilter(robot, self.settings)
         #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
@@ -105,6 +118,7 @@ class Controller:
         stiffness = settings.desired_stiffness(joints)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
+        self.motion.settings = settings
         if settings.method != before.method and not self.posture.exploring:
             self._starts = True
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
@@ -114,6 +128,7 @@ class Controller:
         """Take a checked network."""
         self._mae = mae
         self.posture.use(mae)
+        self.motion.use(mae)
 
     def muscles(self, muscles: Muscles, now: float) -> None:
         """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
@@ -159,8 +174,89 @@ class Controller:
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         inside = np.clip(theta, robot.lower, robot.upper)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
-        self._starts |= self.posture.exploring
+        if self._quick and not self.safety.cause:
+            with suppress(MessageError):  # not ready: then by a ramp, once it is
+                planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
+                clamped = self.clamped
+                self._follow(planned)
+                self.motion.exert(effort)
+                self.posture.effort, self.clamped = effort, clamped
+                return
+        self._starts |= self.posture.exploring or self._follows
+        self._follows = False
         self.posture.set_target(inside, effort)
+
+    def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
+        """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
+
+        A MessageError says why not: nothing changes then.
+        """
+        robot = self._robot
+        if points is not None:
+            beyond = (points.position < robot.lower[points.joints] - ROUNDING) | (
+                points.position > robot.upper[points.joints] + ROUNDING
+            )
+            if beyond.any():
+                k, j = np.argwhere(beyond)[0]
+                place = points.joints[j]
+                limits = f'{robot.lower[place]:.3f} to {robot.upper[place]:.3f}'
+                told = f'{robot.joints[place]} {points.position[k, j]:.3f}, legal: {limits} rad'
+                raise MessageError('beyond the joint limits', told)
+        start = self._ready(max(delay, 0.0))
+        if points is None:
+            self._follow(Trajectory.stopping(start, robot))
+        else:
+            planned = Trajectory.through(start, points, max(-delay, 0.0))
+            planned.check(robot)
+            self._follow(planned, max(delay, 0.0))
+
+    def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
+        """Bring the end effector to a pose in the root link's frame, or to its position only.
+
+        A MessageError says why not: nothing changes then.
+        """
+        start, chosen, mae = self._ready(), self.settings, self._mae
+        assert mae is not None  # else it was not ready
+        nearest = chosen.unreachable == 'nearest'
+        theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
+        self._follow(self._hand.towards(start, pose, theta, chosen.hand_speed, now))
+        self.short = short
+
+    def twist(self, twist: Array) -> None:
+        """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
+
+        A MessageError says why not: nothing changes then.
+        """
+        start, mae = self._ready(), self._mae
+        assert mae is not None
+        self._follow(self._hand.moved(mae, start, twist))
+
+    def _ready(self, delay: float = 0.0) -> Setpoint:
+        """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
+        if self._estimate is None or self._mae is None:
+            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
+        if cause := self.safety.cause or self.present_cause(self.stepped_at):
+            raise MessageError('stopped', cause)
+        if not self.safety.zeroed:
+            raise MessageError('length zeros are unknown', 'find them by estimator/zero')
+        if self._follows and not self._starts:
+            return self.motion.ahead(delay)
+        robot = self._robot
+        return Setpoint.resting(np.clip(self._estimate, robot.lower, robot.upper))
+
+    def _follow(self, planned: Trajectory, delay: float = 0.0) -> None:
+        if not self._follows or self._starts:
+            self.explore(False)
+            self.motion.start()
+            if delay > 0.0:
+                self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
+        self._follows, self._starts, self.clamped, self.short = True, False, (), ''
+        try:
+            self.motion.follow(planned, delay)
+        except Exception as error:  # noqa: BLE001 (as in `step`)
+            self.stop(f'fault of control: {type(error).__name__}: {error}')
+        self.motion.effort = np.zeros(self._robot.joint_count)
+        self.posture.theta, self.posture.effort = planned.end, self.motion.effort
 
     # -- what is asked --------------------------------------------------------------------------
 
@@ -256,6 +352,13 @@ class Controller:
             warnings.append(f'method {chosen.method} exerts no effort')
         if self._in_tension:
             missing = self.torque.missing_torque
+        if self._follows:
+            missing = self.motion.missing_torque
+            values['lag of the winches'] = f'{1000.0 * self.motion.winches.lag:.0f} ms'
+            if self.short:
+                warnings.append(f'hand pose out of reach by {self.short}: nearest approached')
+            if self.motion.moving and self.slowed:
+                warnings.append(f'trajectory {self.slowed}')
         if np.abs(missing).max(initial=0.0) > NOTABLE:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
@@ -271,6 +374,8 @@ class Controller:
             warnings.append(f'hot: {", ".join(hot)}')
         still = 'no target' if posture.theta is None else 'holding'
         doing = 'exploring' if posture.exploring else still
+        if self._follows and self.motion.moving:
+            doing = 'following a trajectory'
         if cause := self.safety.cause:
             if self.safety.passing:
                 return Report('warn', f'holding: {cause}', values)
@@ -284,6 +389,25 @@ class Controller:
     # -- time -----------------------------------------------------------------------------------
 
     @property
+    def _quick(self) -> bool:
+        chosen = self.settings
+        solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
+        return solved and chosen.target_duration > 0.0
+
+    @property
+    def follows(self) -> bool:
+        """Whether a trajectory is followed, or the end of one held."""
+        return self._follows
+
+    @property
+    def slowed(self) -> str:
+        """By how much the last trajectory was slowed, or ''."""
+        last = self.motion.next[0] if self.motion.next else self.motion.trajectory
+        if last is None or last.slowed == 1.0:
+            return ''
+        return f'slowed to {100.0 / last.slowed:.0f} % of its speed for the winches'
+
+    @property
     def _in_tension(self) -> bool:
         return self.settings.method == 'tension' and not self.posture.exploring
 
@@ -295,6 +419,7 @@ class Controller:
         dt, awake = self._elapsed(now, now if time is None else time)
         late, cause = self._late(now), self.present_cause(now)
         # Before the first command there is nothing to stop.
+        self._follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:
             if cause == late:
                 self.safety.stop(cause, passing=True)
@@ -353,14 +478,20 @@ class Controller:
                 last = safety.unchanging(self._robot, LENGTH, muscles)
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
+        planned = np.minimum(self.limit, self._robot.tension.limit)
         if self._starts:
-            self._starts = False
+            self._starts = self._follows = False
             # Go on from the last command, or from how the muscles pull at this moment.
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
                 command = safety.unchanging(self._robot, kind, muscles)
             (self.torque if in_tension else posture).start_from(command.value)
-        planned = np.minimum(self.limit, self._robot.tension.limit)
+        if self._follows:
+            sent = self.safety.command
+            if sent is None or sent.kind != LENGTH:
+                sent = safety.unchanging(self._robot, LENGTH, muscles)
+            follow = self.motion.step
+            return Command(LENGTH, follow(muscles, estimate, sent.value, planned, dt))
         if not in_tension:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)

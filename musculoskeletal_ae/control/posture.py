@@ -38,6 +38,7 @@ RELIEF = 0.004
 #: of estimated error that is left alone [rad]: about the estimate's own, after which an arm with
 #: friction would creep for ever
 DEADBAND = 0.03
+BETWEEN = 0.1  # [s] between two programmes of what tension is needless
 SETTLING = 0.5  # [s] after a movement until the arm is taken for resting
 
 
@@ -68,7 +69,7 @@ class RestFeedback:
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T,   T_bias ≤ T* ≤ T_limit
-        l_target = ①(θ_target + c, T_planned) + l_comp(T_planned) + r
+        l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
     Friction and errors of the body image leave the arm beside its target; the estimate sees most of
     that (LINEAGE, hysteresis feedback). They also leave muscles that pull against each other: a
@@ -88,7 +89,7 @@ class RestFeedback:
 
     def moving(self) -> None:
         """Freeze the corrections until the arm has settled again."""
-        self._rested = 0.0
+        self._rested = self._unsolved = 0.0
 
     def step(
         self, error: Array, jacobian: Array, tension: Array, limit: Array, gain: float, dt: float
@@ -103,17 +104,17 @@ class RestFeedback:
             return False
         beyond = np.where(np.abs(error) < DEADBAND, 0.0, error)
         self.correction = np.clip(self.correction + gain * dt * beyond, -CORRECTION, CORRECTION)
-        bias = self._robot.tension.bias
-        pulled = np.clip(tension, bias, limit)
-        least = least_tension(jacobian, -jacobian.T @ pulled, bias, limit).tension
-        relieved = self.relief + gain * dt * (pulled - least) / self._robot.stiffness
-        self.relief = np.clip(relieved, -RELIEF, RELIEF)
+        self._unsolved += dt
+        if self._unsolved >= BETWEEN:
+            bias, share = self._robot.tension.bias, gain * self._unsolved / self._robot.stiffness
+            pulled, self._unsolved = np.clip(tension, bias, limit), 0.0
+            least = least_tension(jacobian, -jacobian.T @ pulled, bias, limit).tension
+            self.relief = np.clip(self.relief + share * (pulled - least), -RELIEF, RELIEF)
         return True
 
-    def shift(self, mae: Mae, theta: Array, tension: Array) -> Array:
-        """Return what the corrections add to the lengths at (θ_target, T) [m], shape (M,)."""
-        shifted = mae.lengths(theta + self.correction, tension)
-        return shifted - mae.lengths(theta, tension) + self.relief
+    def shift(self, jacobian: Array) -> Array:
+        """Return what the corrections add to the lengths [m] (M,), by G (M, D) at the target."""
+        return jacobian @ self.correction + self.relief
 
 
 class Goal(NamedTuple):
@@ -153,7 +154,7 @@ class PostureControl:
         self._limit: Array = np.full(robot.muscle_count, robot.tension.limit)
         self._command: Array = np.zeros(robot.muscle_count)
         self._ramp: Ramp | None = None
-        self._jacobian: Array | None = None  # G at the solution, once it is needed
+        self._jacobian: Array | None = None  # G at the solution, where it is needed
 
     @property
     def exploring(self) -> bool:
@@ -236,11 +237,12 @@ class PostureControl:
         self._method, duration, constant = self._goals.pop(0)
         self._tension = tension if constant is None else constant
         self._limit = limit
-        self.solution = self._jacobian = None
+        self.solution = None
         self.solution = self._solve(self._mae, self.theta)
         goal = self.solution.length
         if self._corrects:
-            goal = goal + self.feedback.shift(self._mae, self.theta, self.solution.tension)
+            self._jacobian = self._mae.muscle_jacobian(self.theta, self.solution.tension)
+            goal = goal + self.feedback.shift(self._jacobian)
         self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self.settings.rate_limit)
         self._remaining = max(duration, self._ramp.duration)
         self.feedback.moving()
@@ -262,11 +264,9 @@ class PostureControl:
 
     def _correct(self, tension: Array, theta: Array, dt: float) -> None:
         """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""
-        mae, target, solution = self._mae, self.theta, self.solution
+        target, solution, jacobian = self.theta, self.solution, self._jacobian
         # They gave the goal that is held.
-        assert mae is not None and target is not None and solution is not None
-        if self._jacobian is None:
-            self._jacobian = mae.muscle_jacobian(target, solution.tension)
+        assert target is not None and solution is not None and jacobian is not None
         error, gain = target - theta, self.settings.feedback_gain
-        if self.feedback.step(error, self._jacobian, tension, self._limit, gain, dt):
-            self._command = solution.length + self.feedback.shift(mae, target, solution.tension)
+        if self.feedback.step(error, jacobian, tension, self._limit, gain, dt):
+            self._command = solution.length + self.feedback.shift(jacobian)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, settable
 
+UNREACHABLE = ('refuse', 'nearest')
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
 
 
@@ -29,6 +30,14 @@ class Settings:
     second_duration: float = settable(
         2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
     )
+    target_duration: float = settable(
+        1.2,
+        'movement to a target under `proposed`, longer where winches need it (0: a ramp of '
+        'lengths, first_duration)',
+        's',
+        0.0,
+        60.0,
+    )
     constant_tension: float = settable(
         0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
@@ -43,6 +52,12 @@ class Settings:
     )
     feedback_gain: float = settable(
         0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
+    )
+    hand_speed: float = settable(
+        0.25, 'fastest of the hand on its way to a single target_pose', 'm/s', 0.01, 2.0
+    )
+    unreachable: str = settable(
+        'refuse', 'what is done with a target_pose out of reach', legal=UNREACHABLE
     )
     max_age: float = settable(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `controller`: target posture → muscle commands, with a latched safe stop.
 
-target_joint_states, estimated_joint_states, muscle_states, anomaly_detected →
-muscle_length_command, or muscle_tension_command with method `tension`.
+target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
+muscle_states, anomaly_detected → muscle_length_command, or muscle_tension_command with method
+`tension`; controller_state.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller as Core
@@ -28,7 +32,13 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.validity import read_joints
+from musculoskeletal_ae.validity import (
+    read_joints,
+    read_pose,
+    read_trajectory,
+    read_twist,
+    without_orientation,
+)
 
 
 class Controller(Shell):
@@ -54,6 +64,10 @@ class Controller(Shell):
         self.follow_muscle_states(self._muscles, partial(setattr, self.core, 'intruder'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
+        self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
+        self.listen(PoseStamped, 'target_pose', self._pose, RELIABLE)
+        self.listen(TwistStamped, 'target_twist', self._twist, RELIABLE)
+        self.states = self.create_publisher(JointTrajectory, 'controller_state', RELIABLE)
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
@@ -109,6 +123,45 @@ class Controller(Shell):
         if clamped := ', '.join(self.core.clamped):
             warn(f'target clamped to the joint limits: {clamped}')
 
+    def _trajectory(self, message: JointTrajectory) -> None:
+        points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
+        now = self.get_clock().now().nanoseconds * 1e-9
+        begin = stamp.sec + 1e-9 * stamp.nanosec  # 0: now
+        self.core.trajectory(points, begin - now if begin > 0.0 else 0.0)
+        self._tell_slowed()
+
+    def _pose(self, message: PoseStamped) -> None:
+        only = without_orientation(message)
+        pose = read_pose(message, self.root_frame, only)
+        before = self.core.short
+        self.core.pose(pose, not only, time.monotonic())
+        if self.core.short not in ('', before):
+            self.get_logger().warning(f'out of reach by {self.core.short}: nearest approached')
+        self._tell_slowed()
+
+    def _twist(self, message: TwistStamped) -> None:
+        self.core.twist(read_twist(message, self.root_frame))
+
+    def _tell_slowed(self) -> None:
+        if slowed := self.core.slowed:
+            self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
+
+    def _publish_state(self) -> None:
+        """Say what is desired, what is estimated, and the error, as three points."""
+        motion = self.core.motion
+        desired, names = motion.desired, ('positions', 'velocities', 'accelerations')
+        parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}
+        estimated = desired.theta - motion.error
+        points = [
+            JointTrajectoryPoint(**parts),
+            JointTrajectoryPoint(positions=estimated.tolist()),
+            JointTrajectoryPoint(positions=motion.error.tolist()),
+        ]
+        points[0].time_from_start = Duration(seconds=motion.time).to_msg()
+        message = JointTrajectory(joint_names=self.robot.joints, points=points)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.states.publish(message)
+
     def _explore(self, request: SetBool.Request) -> str:
         if reason := self.core.explore(request.data):
             raise MusculoskeletalError(reason)
@@ -136,6 +189,8 @@ class Controller(Shell):
             message = array_message(value, 'muscle')
             self.publishers_of[command.kind].publish(message)
             self.recording.heard(f'muscle_{command.kind}_command', message)
+        if self.core.follows:
+            self._publish_state()
         safety, before = self.core.safety, self.latched
         self.latched = bool(safety.cause) and not safety.passing
         if self.latched and not before:

@@ -28,6 +28,7 @@ KEYS = {
     'simulation': 'before_rad after_rad before_n after_n frictionless_rad',
     'loss_change': '',
     'body_change': '',
+    'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m',
 }
 METHODS = ('geometric', 'first', 'second', 'proposed', 'second_paper', 'proposed_paper')
 

@@ -49,6 +49,9 @@ def test_commands_checkpoints_and_targets_have_one_source():
         ('muscle_tension_command', 'controller'),
         ('mae_checkpoint', 'learner'),
         ('target_joint_states', 'operator'),
+        ('joint_trajectory', 'operator'),
+        ('target_pose', 'operator'),
+        ('target_twist', 'operator'),
     ):
         allowed = [n for n in (*NODES, 'operator') if topic in rights(n, 'topics', 'publish')]
         assert allowed == [source]

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion at speed: muscle lengths along a trajectory, by inverse dynamics and learned lengths.
+
+At each message, for the θ, θ̇, θ̈ that are desired then (`trajectory`),
+
+    τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
+    T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,   T at the far ends of the wires
+    l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c| ≤ CORRECTION
+    l_target = l + l_comp(T e^{μ s}) + λ dl/dt
+
+Friction: the tension at the motor is T e^{μ s}, with s the direction in which the wire slides along
+the path, and μ as the learner found it (`mae.touch`), else FRICTION. Winches: the motor of a
+module that follows muscle stiffness control (MSC) turns at dl/dt = (T − T_MSC)/(K_stiff λ). So its
+command has to lead by λ dl/dt, and a wire that is pulled out at dl/dt resists with T_bias + K_stiff
+λ dl/dt even if MSC demands no more than T_bias; that is T_low. λ is measured while the arm moves.
+
+A trajectory that winches cannot follow is slowed as a whole before it starts (`slowness`). After
+its end G and T stay as they are, and the feedback at rest (`posture.RestFeedback`) goes on from c.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.methods import msc_compensation
+from musculoskeletal_ae.control.posture import CORRECTION, Ramp, RestFeedback
+from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
+from musculoskeletal_ae.learning.rest import REVERSAL
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+
+PROPORTIONAL, INTEGRAL = 1.0, 4.0  # k_p; k_i [1/s]
+FRICTION = 0.05  # μ where none was learned: the mean of what hands build
+SPACING = 0.04  # [s] between the moments of a plan
+SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the feedback
+PLANS = 4  # times a plan is slowed and tried again
+SLOWNESS = 20.0  # at most
+BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
+SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
+TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
+WINDING = 0.03  # [m/s] from which a winch tells its lag
+LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
+LARGEST_LAG = 0.1  # [s]
+
+
+class Winches:
+    """λ [s] of the modules: how far they lag behind what MSC demands.
+
+        l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
+
+    by least squares over all muscles that wind fast enough to tell.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._products, self._squares = 0.0, LAGS
+        self._length: Array | None = None
+
+    @property
+    def lag(self) -> float:
+        """λ as far as it is known [s]."""
+        return min(max(self._products / self._squares, 0.0), LARGEST_LAG)
+
+    def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
+        """Take l [m], T [N] (M,), `dt` [s] after the ones before, and what was commanded then."""
+        before, self._length = self._length, length
+        if before is None or dt <= 0.0:
+            return
+        speed = (length - before) / dt
+        lacking = length - command + msc_compensation(self._robot, tension)
+        telling = (np.abs(speed) > WINDING) & (length > command)
+        self._products -= float(lacking[telling] @ speed[telling])
+        self._squares += float(speed[telling] @ speed[telling])
+
+    def forget(self) -> None:
+        """Begin anew after a pause; λ stays."""
+        self._length = None
+
+
+class MotionControl:
+    """Follows trajectories, and holds where the last one ended."""
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._robot, self.settings = robot, settings
+        self.trajectory: Trajectory | None = None
+        self.next: tuple[Trajectory, float] | None = None  # and in how many seconds it starts
+        self.effort: Array = np.zeros(robot.joint_count)  # beyond weight and motion [N·m]
+        self.desired = Setpoint.resting(np.zeros(robot.joint_count))
+        self.error: Array = np.zeros(robot.joint_count)  # desired − estimated θ [rad]
+        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self.winches, self._feedback = Winches(robot), RestFeedback(robot)
+        self._mae: Mae | None = None
+        self._friction: Array = np.full(robot.muscle_count, FRICTION)
+        self._blend: Ramp | None = None
+        self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
+        self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
+        self.start()
+
+    # -- what is asked --------------------------------------------------------------------------
+
+    def use(self, mae: Mae) -> None:
+        """Take a new network; the command goes over to it without a jump."""
+        self._mae = mae
+        touch = getattr(mae, 'touch', None)
+        known = np.full(self._robot.muscle_count, FRICTION) if touch is None else touch.friction
+        self._friction = known
+        self._resting = self._blend = None
+
+    def start(self) -> None:
+        """Go on from what something else commanded."""
+        self._resting = self._blend = None
+        # T at the far ends and at the motors [N], and s of each wire
+        self._tension: Array = self._robot.tension.bias.copy()
+        self._pull: Array = self._tension
+        self._sliding: Array = np.zeros(self._robot.muscle_count)
+        self._feedback.reset()
+        self.winches.forget()
+
+    def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
+        """Follow a trajectory from `delay` [s] on, in the place of all that was to come after."""
+        assert self._mae is not None
+        trajectory = trajectory.scaled(slowness(self._robot, self._mae, trajectory, self.settings))
+        if delay > 0.0:
+            self.next = trajectory, delay
+        else:
+            self._begin(trajectory, 0.0)
+
+    def _begin(self, trajectory: Trajectory, time: float) -> None:
+        self.trajectory, self.time, self.next = trajectory, time, None
+        if self._resting is not None:  # on the way, one goes over to the next by itself
+            self._feedback.relief = np.zeros(self._robot.muscle_count)
+            self._resting = self._blend = None
+
+    def exert(self, effort: Array) -> None:
+        """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
+        if effort.any():
+            self.effort, self._resting, self._blend = effort, None, None
+
+    @property
+    def moving(self) -> bool:
+        """Whether a trajectory goes on or is to come."""
+        going = self.trajectory is not None and self.time < self.trajectory.duration
+        return going or self.next is not None
+
+    def ahead(self, delay: float) -> Setpoint:
+        """Return what will be desired in `delay` [s], as far as is known now."""
+        assert self.trajectory is not None
+        return self.trajectory.sample(self.time + delay)
+
+    # -- time -----------------------------------------------------------------------------------
+
+    def step(self, muscles: Muscles, theta: Array, sent: Array, limit: Array, dt: float) -> Array:
+        """Return the command [m] (M,), dt [s] after the last, of which `sent` left [m] (M,).
+
+        θ [rad] is estimated; `limit` [N] (M,) is the highest tension planned for each muscle.
+        """
+        mae, trajectory = self._mae, self.trajectory
+        assert mae is not None and trajectory is not None
+        self.winches.step(muscles.length, muscles.tension, sent, dt)
+        self.time += dt
+        if self.next is not None:
+            self.next = self.next[0], self.next[1] - dt
+            if self.next[1] <= 0.0:
+                trajectory = self.next[0]
+                self._begin(trajectory, -self.next[1])
+        if self._resting is None:
+            self.desired = trajectory.sample(self.time)
+        self.error = self.desired.theta - theta
+        feedback = self._feedback
+        if self.time < trajectory.duration + SETTLING:
+            step = INTEGRAL * dt * self.error
+            feedback.correction = np.clip(feedback.correction + step, -CORRECTION, CORRECTION)
+            feedback.moving()
+            self._shift = feedback.correction + PROPORTIONAL * self.error
+            command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
+        else:
+            command = self._held(mae, muscles.tension, limit, dt)
+        if self._blend is None:
+            rate = self.settings.rate_limit
+            self._blend = Ramp(sent - command, np.zeros_like(command), BLENDING, rate)
+        return command + self._blend.step(dt)
+
+    def _planned(self, mae: Mae, at: Setpoint, limit: Array, dt: float) -> Array:
+        """Return l_target [m] (M,) for a moment."""
+        robot, lag = self._robot, self.winches.lag
+        jacobian = mae.muscle_jacobian(at.theta, self._tension)
+        speed = jacobian @ at.velocity
+        # Friction turns round within `REVERSAL` of sliding (Dahl).
+        turned = np.exp(-np.abs(speed) * dt / REVERSAL)
+        direction = -np.tanh(speed / TURNING)
+        self._sliding = direction + (self._sliding - direction) * turned
+        torque = robot.kinematics.inverse_dynamics(*at) + self.effort
+        low = robot.tension.bias + robot.stiffness * lag * np.maximum(speed, 0.0)
+        loss = np.exp(self._friction * self._sliding)
+        self._tension, self.missing_torque = least_tension(
+            jacobian, torque, np.minimum(low, limit) / loss, limit / loss
+        )
+        self._pull = self._tension * loss
+        length = mae.lengths(at.theta + self._shift, self._tension)
+        return length + msc_compensation(robot, self._pull) + lag * speed
+
+    def _held(self, mae: Mae, tension: Array, limit: Array, dt: float) -> Array:
+        """Return l_target [m] (M,) at rest, for which nothing is solved that does not change."""
+        feedback = self._feedback
+        if self._resting is None:
+            feedback.correction = self._shift
+            theta = self.desired.theta
+            length = mae.lengths(theta, self._tension) + msc_compensation(self._robot, self._pull)
+            self._resting = length, mae.muscle_jacobian(theta, self._tension)
+        length, jacobian = self._resting
+        gain = self.settings.feedback_gain
+        feedback.step(self.error, jacobian, tension, limit, gain, dt)
+        self._shift = feedback.correction
+        return length + feedback.shift(jacobian)
+
+
+def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
+    """Return how many times longer a trajectory has to take, so that the winches can follow.
+
+    Looked at are moments `SPACING` [s] apart, fewer of a long one; friction, which turns round in
+    a moment, is left out.
+    """
+    slower, bias, limit = 1.0, robot.tension.bias, robot.tension.limit
+    for _ in range(PLANS):
+        tried = trajectory.scaled(slower)
+        count = min(max(math.ceil(tried.duration / SPACING), 4), SAMPLES)
+        time = np.linspace(0.0, tried.duration, count + 1)
+        at = tried.sample(0.999999 * time)
+        pulls = np.broadcast_to(bias, (len(time), len(bias)))
+        jacobian = mae.muscle_jacobian(at.theta, pulls)
+        motion = map(robot.kinematics.inverse_dynamics, *at)
+        pulls = np.array([least_tension(g, t, bias, limit)[0] for g, t in zip(jacobian, motion)])
+        command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
+        fastest = np.abs(np.diff(command, axis=0)).max() * count / tried.duration
+        needed = fastest / (SHARE * settings.rate_limit)
+        if needed <= 1.0:
+            break
+        slower = min(slower * (1.02 * needed), SLOWNESS)
+    return slower

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion.
+
+Paper. Postures are approached in 5 s; it shows no motion at speed.
+
+Here. Minimum-jerk motions between random postures that the true body can hold, in 1 s and in 2 s,
+each 0.6 s apart, after learning: the joint trajectory is followed by inverse dynamics. Tracking:
+the mean over the motion of ‖θ_desired − θ_true‖ over all joints; settled: the same 0.5 s after its
+end. Beside it the other ways to get there in that time: a target under `proposed`, `first` and
+`second`, by ramps of lengths that are as long as the motion, and the desired posture, message by
+message, under `tension`. Where winches cannot follow, a trajectory is slowed, and its own desired
+posture counts; "slowed" is by how much. The controller may use the speed that the emulated winches
+have. "Tension" is the mean of ‖T‖ beside that of the least T ≥ T_bias that moves the true body
+along the path (inverse dynamics). A wire that is pulled out drags its winch along, which no command
+can help; "winches" is the same beside the least T with that drag. To settle: the time from a target
+under `proposed` until the arm stays within 0.05 rad of it. The circles, of 10 cm, are random ones
+that can be reached; the hand's position is sent by target_pose, 50 times a second, at 0.1 m/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.control.hand import POSITION, Hand
+from musculoskeletal_ae.control.posture import RAMP_SHARE
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
+from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, times
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.table import NOTHING, Row
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+
+DURATIONS = (1.0, 2.0)  # [s]
+MOTIONS, CIRCLES = 6, 3
+STARTING = 3.0  # [s] to the first posture
+REST, SETTLED = 0.6, 0.5  # [s] after a motion, and when it is read
+METHODS = {
+    'trajectory': plots.AFTER,
+    'proposed': '#56B4E9',
+    'tension': plots.PAPER,
+    'first': '#E69F00',
+    'second': '#009E73',
+}
+RADIUS, SPEED = 0.05, 0.1  # [m], [m/s]
+EVERY = 2  # messages between two poses
+NEAR = 0.002  # [m]
+#: where the hand is to be at a time [s]
+Place = Callable[[float], pin.SE3]
+WATCHED, WITHIN = 4.0, 0.05  # [s], [rad]
+LAP = 2.0 * np.pi * RADIUS / SPEED
+
+
+class Followed(NamedTuple):
+    """N messages of one motion."""
+
+    desired: Array  # θ [rad], (N, D)
+    theta: Array  # true [rad], (N, D)
+    tension: Array  # ‖T‖ of the true arm while it moves [N], (N',)
+    bound: Array  # least ‖T‖ of the same, without the winches' drag and with it [N], (2, N')
+    slowed: float
+
+    @property
+    def error(self) -> Array:
+        """‖θ_desired − θ_true‖ [rad], (N,)."""
+        return np.linalg.norm(self.desired - self.theta, axis=1)
+
+
+def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> ClosedLoop:
+    """Return a loop that has brought an arm to a posture [rad] (D,)."""
+    # `first` takes all of the time but for the ramp of the other part, if it has one.
+    ramp = duration / RAMP_SHARE
+    first_part = 0.5 * ramp if method == 'second' else ramp
+    settings = Settings(rate_limit=SPEED_LIMIT)
+    loop = ClosedLoop(arm, mae, settings)
+    loop.step()
+    loop.go(start, STARTING)
+    if method != 'trajectory':
+        other = Settings(
+            method=method, rate_limit=SPEED_LIMIT, target_duration=0.0,
+            first_duration=first_part, second_duration=0.5 * ramp,
+        )  # fmt: skip
+        loop.core.configure(other)
+        loop.go(start, STARTING)
+    return loop
+
+
+def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: float) -> Followed:
+    """Move between two postures [rad] (D,) in a time [s]."""
+    core, arm = loop.core, loop.arm
+    names, planned = arm.robot.joints, Trajectory.to(Setpoint.resting(start), goal, duration)
+    if method == 'trajectory':
+        core.trajectory(planned.points)
+        assert core.motion.trajectory is not None
+        planned = core.motion.trajectory
+    elif method != 'tension':
+        core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
+    theta, tension = [], []
+    count = round(planned.duration / SAMPLE_TIME)
+    desired = planned.sample(SAMPLE_TIME + times(count + round(REST / SAMPLE_TIME)))
+    for at in desired.theta.tolist():
+        if method == 'tension':
+            core.target({name: (angle, 0.0) for name, angle in zip(names, at)})
+        loop.step()
+        theta.append(arm.theta)
+        tension.append(np.linalg.norm(arm.tension))
+    if core.safety.cause:
+        raise MusculoskeletalError(f'control stopped: {core.safety.cause}')
+    bound = bounds(arm, Setpoint(*(part[:count] for part in desired)))
+    return Followed(
+        desired.theta, np.array(theta), np.array(tension)[:count], bound, planned.slowed
+    )
+
+
+def settling(loop: ClosedLoop, goal: Array) -> float:
+    """Return how long it takes from a target [rad] (D,) until the arm stays near it [s]."""
+    names, last = loop.arm.robot.joints, 0
+    loop.core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
+    for n in range(round(WATCHED / SAMPLE_TIME)):
+        loop.step()
+        last = n + 1 if np.linalg.norm(loop.arm.theta - goal) > WITHIN else last
+    return SAMPLE_TIME * last
+
+
+def bounds(arm: Arm, motion: Setpoint) -> Array:
+    """Return the least ‖T‖ [N] (2, N) that moves the true body, without and with winches' drag."""
+    robot, limits = arm.robot, arm.robot.tension
+    jacobian = arm.individual.muscle_jacobian(motion.theta)
+    torque = map(robot.kinematics.inverse_dynamics, *motion)
+    result = []
+    for slope, wanted, speed in zip(jacobian, torque, motion.velocity):
+        drag = np.maximum(slope @ speed, 0.0) / MOTOR_GAIN
+        for low in (limits.bias, np.minimum(limits.bias + drag, limits.limit)):
+            least = least_tension(slope, wanted, low, limits.limit).tension
+            result.append(float(np.linalg.norm(least)))
+    return np.reshape(result, (-1, 2)).T
+
+
+def circles(
+    robot: Robot, mae: Mae, rng: np.random.Generator, count: int
+) -> list[tuple[Array, Place]]:
+    """Return random circles that can be followed: a posture, and where the hand is at times [s]."""
+    hand, found = Hand(robot), list[tuple[Array, Place]]()
+    for theta, _ in holdable_postures(robot, robot.random_postures(TRIES, rng), 40):
+        centre = robot.kinematics.end_effector_pose(theta).translation
+        frame = np.linalg.qr(robot.kinematics.end_effector_jacobian(theta)[:3])[0]
+        axes = frame[:, :2] if robot.joint_count == 2 else np.linalg.qr(rng.normal(size=(3, 3)))[0]
+
+        def place(time: float, centre: Array = centre, axes: Array = axes) -> pin.SE3:
+            turn = SPEED / RADIUS * time
+            along: Array = RADIUS * (np.cos(turn) * axes[:, 0] + np.sin(turn) * axes[:, 1])
+            return pin.SE3(np.eye(3), centre + along)
+
+        at, far = theta, False
+        for time in np.linspace(0.0, LAP, 25):
+            at, distance, _ = inverse_kinematics(robot, place(time), at, POSITION)
+            far = far or distance > NEAR or bool(hand.missing(mae, at))
+        if not far:
+            found.append((theta, place))
+        if len(found) == count:
+            break
+    return found
+
+
+def circle(
+    loop: ClosedLoop, start: Array, place: Callable[[float], pin.SE3]
+) -> tuple[Array, Array]:
+    """Go round once; return where the hand was to be and where it was [m], each (N, 3)."""
+    loop.go(start, STARTING)
+    loop.core.pose(place(0.0), False, -1.0)
+    for _ in range(round(1.5 / SAMPLE_TIME)):
+        loop.step()
+    wanted, true = [], []
+    for n in range(round(LAP / SAMPLE_TIME)):
+        if n % EVERY == 0:
+            loop.core.pose(place(n * SAMPLE_TIME), False, n * SAMPLE_TIME)
+        loop.step()
+        wanted.append(place((n + 1) * SAMPLE_TIME).translation)
+        true.append(loop.arm.hand.translation)
+    return np.array(wanted), np.array(true)
+
+
+def measure(study: Study, seed: int) -> Measured:
+    """Return the numbers and traces of one individual."""
+    mae, rng = study.network(seed), np.random.default_rng([seed, 0x307])
+    robot = study.robot
+    count = 2 if study.quick else MOTIONS
+    arm = study.arm(seed)
+    postures = robot.random_postures(TRIES, rng)
+    held = holdable_postures(robot, postures, count + 1, arm.individual.muscle_jacobian)
+    postures = np.array([theta for theta, _ in held])
+    numbers: dict[str, Any] = {'methods': {}}
+    traces: dict[str, Any] = {}
+    for method in METHODS:
+        row: dict[str, float] = {}
+        for duration in DURATIONS:
+            arm = study.arm(seed)
+            loop = loop_at(arm, mae, postures[0], method, duration)
+            runs = [follow(loop, a, b, method, duration) for a, b in pairwise(postures)]
+            said, name = _said(runs), f'{duration:.0f}s'
+            row |= {f'{key}_{name}': value for key, value in said.items()}
+            traces[f'{method} {name}'] = np.concatenate([run.error for run in runs])
+        numbers['methods'][method] = row
+    ours = numbers['methods']['trajectory']
+    numbers |= {
+        'track_1s_rad': ours['track_rad_1s'],
+        'track_2s_rad': ours['track_rad_2s'],
+        'settled_rad': 0.5 * (ours['settled_rad_1s'] + ours['settled_rad_2s']),
+        'tension_ratio': 0.5 * (ours['tension_ratio_1s'] + ours['tension_ratio_2s']),
+        'tension_ratio_winches': 0.5 * (ours['winches_ratio_1s'] + ours['winches_ratio_2s']),
+    }
+    loop = loop_at(study.arm(seed), mae, postures[0], 'trajectory', 1.0)
+    numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
+    laps = [circle(loop, *each) for each in circles(robot, mae, rng, 1 if study.quick else CIRCLES)]
+    if laps:
+        off = [np.linalg.norm(true - wanted, axis=1).mean() for wanted, true in laps]
+        numbers['hand_circle_m'] = float(np.mean(off))
+    traces['laps'] = laps
+    # wrench_error and false_contacts: contact, see issue.
+    return Measured(numbers, traces)
+
+
+def _said(runs: list[Followed]) -> dict[str, float]:
+    moving = [run.error[: len(run.tension)] for run in runs]
+    at = round(SETTLED / SAMPLE_TIME) - 1
+    tension, bound = (np.concatenate(part, axis=-1) for part in zip(*[run[2:4] for run in runs]))
+    ratio = tension.mean() / bound.mean(axis=1)
+    return {
+        'track_rad': float(np.mean([error.mean() for error in moving])),
+        'settled_rad': float(np.mean([run.error[len(run.tension) + at] for run in runs])),
+        'tension_ratio': float(ratio[0]),
+        'winches_ratio': float(ratio[1]),
+        'slowed': float(np.mean([run.slowed for run in runs])),
+    }
+
+
+def motion(_: Study, rows: Rows) -> Plot:
+    """Draw the tracking error of the first individual over time."""
+    seed, row = first(rows)
+    figure, panels = plots.new_figure(11.0, 6.4, 2)
+    for panel, duration in zip(panels, DURATIONS, strict=True):
+        for method, colour in METHODS.items():
+            error = row.traces[f'{method} {duration:.0f}s']
+            told = f'{method}: {error.mean():.3f} rad'
+            plots.line(panel, times(len(error)), error, color=colour, label=told, lw=1.2)
+        title = f'individual {seed}, motions of {duration:g} s'
+        plots.tidy(panel, 'time [s]', '‖θ_desired − θ‖ [rad]', title, legend='right')
+    caption = (
+        'Distance from the minimum-jerk motion over time, several motions one after the other.'
+    )
+    return figure, caption
+
+
+def motion_hand(_: Study, rows: Rows) -> Plot:
+    """Draw the circles of the hand, wanted and true, each in its plane."""
+    seed, row = first(rows)
+    laps = row.traces['laps']
+    figure, panels = plots.new_figure(4.0 * max(len(laps), 1), 4.2, 1, max(len(laps), 1))
+    for panel, (wanted, true) in zip(panels, laps):
+        centre = wanted.mean(axis=0)
+        axes = np.linalg.svd(wanted - centre)[2][:2]
+        for name, path, style in (
+            ('wanted', wanted, {'color': plots.TRUE, 'ls': '--'}),
+            ('true', true, {'color': plots.AFTER}),
+        ):
+            panel.plot(*(1000.0 * axes @ (path - centre).T), label=name, **style)
+        panel.set_aspect('equal')
+        off = 1000.0 * np.linalg.norm(true - wanted, axis=1).mean()
+        plots.tidy(panel, '[mm]', '[mm]', f'mean {off:.1f} mm', legend='below')
+    return figure, f'Circles of the hand at {SPEED} m/s by target_pose, individual {seed}.'
+
+
+ROWS = (
+    Row('motions of 1 s, tracking [rad]', NOTHING, '', 'track_1s_rad', '', 0.10),
+    Row('motions of 2 s, tracking [rad]', NOTHING, '', 'track_2s_rad', '', 0.06),
+    Row('0.5 s after a motion [rad]', NOTHING, '', 'settled_rad', '', 0.05),
+    Row('from a target to within 0.05 rad of it [s]', NOTHING, '', 'settle_s', '', 2.0, 2),
+    Row('‖T‖ of motions beside the inverse dynamics’ least [ratio]', NOTHING, '', 'tension_ratio',
+        '', 1.15, 2),
+    Row('‖T‖ of motions beside the least with the winches’ drag [ratio]', NOTHING, '',
+        'tension_ratio_winches', '', None, 2),
+    Row('circles of 10 cm by `target_pose` at 0.1 m/s [m]', NOTHING, '', 'hand_circle_m', '', 0.01),
+)  # fmt: skip
+EXPERIMENT = Experiment(__doc__, measure, (motion, motion_hand), 12.0, ROWS)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Following trajectories, without an arm: sensor data is made up, time is counted by the test."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from control_bench import DT, OTHER, REST, ROBOT, Bench, values
+
+from musculoskeletal_ae.control.hand import Hand
+from musculoskeletal_ae.control.motion import SETTLING, Winches, slowness
+from musculoskeletal_ae.control.safety import LENGTH
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.exceptions import MessageError
+
+STILL = np.zeros((1, 2))
+
+
+def points(goal, duration=1.0):
+    return Points(np.array([0, 1]), np.array([duration]), np.array([goal]), STILL, STILL)
+
+
+def moved(bench, count):
+    """Let the arm be where it is desired to be."""
+    sent = []
+    for _ in range(count):
+        sent += bench.step()
+        if bench.core.motion.trajectory is not None:
+            bench.theta = bench.core.motion.desired.theta
+    return sent
+
+
+@pytest.fixture
+def bench():
+    made = Bench(rate_limit=0.3)
+    made.step(5)
+    return made
+
+
+def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
+    bench.core.trajectory(points(OTHER))
+    sent = moved(bench, 50)
+    assert bench.report().message == 'following a trajectory'
+    sent += moved(bench, 400)
+    assert {command.kind for command in sent} == {LENGTH}
+    assert bench.report().message == 'holding'
+    held = bench.core.motion._tension
+    torque = ROBOT.kinematics.holding_torque(OTHER)
+    np.testing.assert_allclose(-ROBOT.routes.muscle_jacobian(OTHER).T @ held, torque, atol=0.3)
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
+
+
+def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(bench, monkeypatch):
+    bench.core.trajectory(points(OTHER))
+    moved(bench, round((1.0 + SETTLING) / DT) + 60)
+    solved = []
+
+    def refused(*_):
+        raise AssertionError('the network was asked')
+
+    monkeypatch.setattr(bench.mae, 'lengths', refused, raising=False)
+    monkeypatch.setattr(bench.mae, 'muscle_jacobian', refused, raising=False)
+    from musculoskeletal_ae.control import posture
+
+    real = posture.least_tension
+    monkeypatch.setattr(posture, 'least_tension', lambda *a: solved.append(1) or real(*a))
+    bench.step(100)
+    assert not bench.core.safety.cause
+    assert 5 <= len(solved) <= 12
+
+
+def test_what_winches_cannot_follow_is_slowed_as_a_whole_and_said(bench):
+    bench.configure(rate_limit=0.05)
+    bench.core.trajectory(points(OTHER, 0.5))
+    trajectory = bench.core.motion.trajectory
+    assert trajectory.slowed > 1.2
+    assert slowness(ROBOT, bench.mae, trajectory, bench.core.settings) == pytest.approx(1.0)
+    sent = values(moved(bench, 20))
+    assert 'slowed to' in bench.report().message
+    sent = np.vstack([sent, values(moved(bench, 600))])
+    assert np.abs(np.diff(sent, axis=0)).max() <= 0.05 * DT + 1e-9
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+
+
+def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
+    bench.core.trajectory(points(OTHER, 2.0))
+    moved(bench, 100)
+    bench.core.trajectory(points(REST, 2.0), delay=0.5)
+    first = bench.core.motion.trajectory
+    moved(bench, 45)
+    assert bench.core.motion.trajectory is first
+    before = bench.core.motion.desired
+    moved(bench, 10)
+    after = bench.core.motion.desired
+    assert bench.core.motion.trajectory is not first
+    assert np.abs(after.theta - before.theta).max() < 0.2
+    np.testing.assert_allclose(bench.core.motion.trajectory.end, REST)
+    bench.core.trajectory(None)
+    moved(bench, 40)
+    assert not bench.core.motion.desired.velocity.any()
+    assert np.abs(bench.core.motion.desired.theta - REST).max() > 0.1
+
+
+def test_refusals_change_nothing(bench):
+    with pytest.raises(MessageError, match='beyond the joint limits'):
+        bench.core.trajectory(points(ROBOT.upper + 0.1))
+    with pytest.raises(MessageError, match='all points have passed'):
+        bench.core.trajectory(points(OTHER), delay=-5.0)
+    bench.core.stop('asked')
+    with pytest.raises(MessageError, match='stopped'):
+        bench.core.trajectory(points(OTHER))
+    assert bench.core.motion.trajectory is None
+    assert bench.step(3)[-1] is None
+
+
+def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
+    bench.core.trajectory(points(OTHER))
+    moved(bench, 50)
+    bench.core.stop('asked')
+    bench.step(100)
+    assert not bench.core.reset(bench.now)
+    bench.step(5)
+    assert not bench.core.motion.moving or not bench.core._follows
+    np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
+
+
+def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
+    bench.core.trajectory(points(OTHER))
+    sent = moved(bench, 50)
+    bench.target(REST)
+    sent += bench.step(300)
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
+    assert bench.report().message == 'holding'
+
+
+def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench):
+    bench.configure(target_duration=1.0)
+    bench.target(OTHER)
+    moved(bench, 400)
+    plain = bench.core.motion._tension
+    assert bench.core.follows
+    bench.target(OTHER, (1.0, 0.0))
+    moved(bench, 400)
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.motion._tension)
+    np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
+    bench.target(ROBOT.upper + 1.0)
+    bench.step()
+    assert 'clamped' in bench.report().message
+
+
+def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands():
+    rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
+    length = np.zeros(ROBOT.muscle_count)
+    for _ in range(300):
+        speed = rng.uniform(-0.2, 0.2, ROBOT.muscle_count)
+        tension = rng.uniform(60.0, 120.0, ROBOT.muscle_count)
+        length = length + speed * DT
+        command = length - (tension - ROBOT.tension.bias) / ROBOT.stiffness + lag * speed
+        noise = rng.normal(0.0, 1e-4, ROBOT.muscle_count)
+        winches.step(length + noise, tension, command, DT)
+    assert winches.lag == pytest.approx(lag, rel=0.15)
+
+
+def test_slowing_a_slow_trajectory_changes_nothing():
+    trajectory = Trajectory.to(Setpoint.resting(REST), OTHER, 20.0)
+    assert slowness(ROBOT, Bench().mae, trajectory, Settings()) == 1.0
+
+
+def hand(bench, theta, whole=False):
+    bench.core.pose(ROBOT.kinematics.end_effector_pose(theta), whole, bench.now)
+
+
+def test_a_pose_of_the_hand_is_reached_and_one_out_of_reach_refused_or_approached(bench):
+    hand(bench, OTHER)
+    moved(bench, 300)
+    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta)
+    wanted = ROBOT.kinematics.end_effector_pose(OTHER)
+    np.testing.assert_allclose(at.translation, wanted.translation, atol=5e-3)
+    far = pin.SE3(wanted.rotation, 3.0 * wanted.translation)
+    before = bench.core.motion.trajectory
+    with pytest.raises(MessageError, match='out of reach'):
+        bench.core.pose(far, False, bench.now)
+    assert bench.core.motion.trajectory is before
+    bench.configure(unreachable='nearest')
+    bench.core.pose(far, False, bench.now)
+    bench.step()
+    assert 'nearest approached' in bench.report().message
+
+
+def test_what_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
+    strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
+
+    def weak(theta, tension):  # beyond half of the way
+        return strong(theta, tension) * (np.abs(theta - REST) < half).all()
+
+    monkeypatch.setattr(bench.mae, 'muscle_jacobian', weak, raising=False)
+    with pytest.raises(MessageError, match='the muscles lack'):
+        hand(bench, OTHER)
+    theta, short = Hand(ROBOT).posture(
+        bench.mae, ROBOT.kinematics.end_effector_pose(OTHER), False, REST, True
+    )
+    assert 'the muscles lack' in short
+    share = (theta - REST) / (OTHER - REST)
+    np.testing.assert_allclose(share, 0.5, atol=0.1)
+
+
+def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
+    start, speed = REST, np.array([0.2, 0.3])
+    hand(bench, start)
+    moved(bench, 200)
+    for n in range(60):
+        hand(bench, start + 0.01 * n * speed)
+        moved(bench, 1)
+    wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
+    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
+    assert np.linalg.norm(at - wanted) < 0.006
+    moved(bench, 150)  # no other comes
+    assert not bench.core.motion.moving
+
+
+def test_a_twist_moves_the_hand_until_its_time_is_out(bench):
+    begun = ROBOT.kinematics.end_effector_pose(REST).translation
+    along = ROBOT.kinematics.end_effector_jacobian(REST)[:3] @ np.array([0.3, 0.3])
+    twist = np.concatenate([0.1 * along / np.linalg.norm(along), np.zeros(3)])
+    for _ in range(20):
+        bench.core.twist(twist)
+        moved(bench, 5)
+    rate = ROBOT.kinematics.end_effector_jacobian(bench.core.motion.desired.theta)[:3]
+    np.testing.assert_allclose(rate @ bench.core.motion.desired.velocity, twist[:3], atol=0.02)
+    moved(bench, 80)
+    assert not bench.core.motion.moving
+    gone = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation - begun
+    assert gone @ twist[:3] / 0.1 > 0.08
