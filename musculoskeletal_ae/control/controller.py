@@ -25,7 +25,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
-from musculoskeletal_ae.control.methods import TorqueControl
+from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
@@ -67,6 +67,7 @@ class Controller:
         self._robot, self.settings = robot, settings or Settings()
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
+        self.floating = FloatControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
         #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
@@ -105,6 +106,9 @@ class Controller:
         stiffness = settings.desired_stiffness(joints)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
+        self.floating.settings = settings
+        if settings.method == 'float':
+            self.explore(False)
         if settings.method != before.method and not self.posture.exploring:
             self._starts = True
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
@@ -151,6 +155,8 @@ class Controller:
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
+        if self.settings.method == 'float':
+            raise MessageError('floating', 'a hand moves the arm; set another method first')
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
         if kept is None and len(joints) < robot.joint_count:
@@ -168,6 +174,8 @@ class Controller:
         """Explore, or end it and hold; return why not, or ''."""
         if wanted and self.safety.cause:
             return f'stopped: {self.safety.cause}'
+        if wanted and self.settings.method == 'float':
+            return 'method float: a hand moves the arm; set another method first'
         if wanted != self.posture.exploring:
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
@@ -255,7 +263,7 @@ class Controller:
         if posture.effort.any() and chosen.method in ('geometric', 'first', 'second'):
             warnings.append(f'method {chosen.method} exerts no effort')
         if self._in_tension:
-            missing = self.torque.missing_torque
+            missing = self._torque.missing_torque
         if np.abs(missing).max(initial=0.0) > NOTABLE:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
@@ -271,6 +279,7 @@ class Controller:
             warnings.append(f'hot: {", ".join(hot)}')
         still = 'no target' if posture.theta is None else 'holding'
         doing = 'exploring' if posture.exploring else still
+        doing = 'floating' if chosen.method == 'float' else doing
         if cause := self.safety.cause:
             if self.safety.passing:
                 return Report('warn', f'holding: {cause}', values)
@@ -285,7 +294,11 @@ class Controller:
 
     @property
     def _in_tension(self) -> bool:
-        return self.settings.method == 'tension' and not self.posture.exploring
+        return self.settings.method in ('tension', 'float') and not self.posture.exploring
+
+    @property
+    def _torque(self) -> TorqueControl:
+        return self.floating if self.settings.method == 'float' else self.torque
 
     def step(self, now: float, time: float | None = None) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded.
@@ -359,11 +372,16 @@ class Controller:
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
                 command = safety.unchanging(self._robot, kind, muscles)
-            (self.torque if in_tension else posture).start_from(command.value)
+            (self._torque if in_tension else posture).start_from(command.value)
         planned = np.minimum(self.limit, self._robot.tension.limit)
         if not in_tension:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
+        if self.settings.method == 'float':
+            # Where it is left is held by the method that comes next.
+            tension = self.floating.step(mae, estimate, estimate, 0.0 * estimate, planned, dt)
+            posture.theta, posture.effort = self.floating.held, 0.0 * estimate
+            return Command(TENSION, tension)
         if posture.theta is None:
             return None
         target, effort = posture.theta, posture.effort

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, settable
 
-METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
+METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 
 
 @dataclass(frozen=True)
