@@ -34,6 +34,7 @@ TOPICS = {
     'target_joint_states': Topic(_JOINTS, sent=True),
     'estimated_joint_states': Topic(_JOINTS),
     'estimated_muscle_states': Topic(_ARRAY),
+    'estimated_external_wrench': Topic(_WRENCH),
     'muscle_length_zeros': Topic(_ARRAY, latched=True),
     'anomaly': Topic('std_msgs/msg/Float64'),
     'anomaly_detected': Topic('std_msgs/msg/Bool', latched=True),

@@ -30,9 +30,11 @@ from musculoskeletal_ae.robot.robot import Robot
 BANDWIDTH = 25.0  # [1/s] of the low pass, twice
 LARGEST_USUAL = 40.0  # F₀ [N]
 SMALL = np.eye(3) / LARGEST_USUAL**2
-AT_STOP = 0.03  # [rad] or [m] from a joint limit
+#: [rad] or [m] from a joint limit: what the estimate may be off by
+AT_STOP = 0.06
 TURNED = 0.02  # [rad] by which joints turn until G is taken anew
-CONTACT, IN_A_ROW = 8.0, 2
+#: d of five healthy arms that explored for ten minutes each reached 8.6
+CONTACT, IN_A_ROW = 10.0, 2
 
 
 class Touch(NamedTuple):
@@ -73,7 +75,7 @@ class ExternalTorque:
     def step(self, theta: Array, tension: Array, length: Array, dt: float) -> Touch:
         """Take estimated θ [rad] (D,), T [N] and l [m] (M,), dt [s] after the ones before."""
         kinematics, joints = self._robot.kinematics, len(theta)
-        if np.abs(theta - self._turned).max() > TURNED:
+        if not np.abs(theta - self._turned).max() <= TURNED:  # not a number, too
             self._jacobian, self._turned = self._mae.muscle_jacobian(theta, tension), theta
         end_tension = tension * np.exp(-self._friction * self._direction.step(length, dt))
         now: Array = np.concatenate((theta, end_tension @ self._jacobian))
