@@ -9,8 +9,8 @@
 is the momentum observer's residual (De Luca 2005), without differences of noise. μ is how much of
 the tension each wire loses on its way, as the learner found it, s which way it slid last: without
 that, friction hides a push of 10 N. σ is what a healthy moving arm leaves (`TouchStatistics`). F₀
-keeps a force small that the joints do not feel, as along a stretched arm. A joint at its stop says
-nothing: the stop bears part of the push.
+keeps a force small that the joints do not feel, as along a stretched arm. At its stop a joint says
+nothing of torques away from it, which are the stop's own; one towards it is at least what is felt.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
 
 BANDWIDTH = 25.0  # [1/s] of the low pass, twice
-LARGEST_USUAL = 40.0  # F₀ [N]
+LARGEST_USUAL = 20.0  # F₀ [N]
 SMALL = np.eye(3) / LARGEST_USUAL**2
 #: [rad] or [m] from a joint limit: what the estimate may be off by
 AT_STOP = 0.06
@@ -40,7 +40,7 @@ CONTACT, IN_A_ROW = 10.0, 2
 class Touch(NamedTuple):
     """What one message says of the outside."""
 
-    torque: Array  # τ_ext [N·m], (D,); 0 of joints at their stops
+    torque: Array  # τ_ext [N·m], (D,); 0 where a stop bears the joint
     force: Array  # F on the end effector's origin, axes of the root link [N], (3,)
     distance: float  # d; NaN without statistics
     contact: bool
@@ -90,7 +90,8 @@ class ExternalTorque:
         smooth, self.velocity = self._value[:joints], rate[:joints]
         torque = kinematics.inverse_dynamics(smooth, self.velocity, acceleration)
         torque += self._value[joints:]
-        free = np.abs(smooth - self._middle) < self._reach
+        out = smooth - self._middle
+        free = (np.abs(out) < self._reach) | (torque * out > 0.0)
         torque *= free
         if not math.isfinite(torque.sum()):
             self.reset()

@@ -95,7 +95,8 @@ def measure(study: Study, seed: int) -> Measured:
         loop.rest(theta)
         for _ in range(2):
             pushes.append(_pushed(loop, _force(robot, rng, LEAST, MOST)))
-    delays = _collisions(loop, rng, count(COLLISIONS))
+    hits, delays = _collisions(loop, rng, count(COLLISIONS))
+    soon = delays <= SOON + 1e-9
     loop.arm.reset()
     seconds = share * HEALTHY / len(study.seeds)
     contacts = _healthy(loop, seconds)
@@ -108,12 +109,14 @@ def measure(study: Study, seed: int) -> Measured:
         'wrench_error_deg': float(angle.mean()),
         'pushes_free_share': float(free.mean()),
         'collision_s': float(np.median(delays)),
-        'collisions_soon_share': float(np.mean(delays <= SOON + 1e-9)),
+        'collisions_soon_share': float(soon.mean()),
         'false_contacts': contacts,
         'healthy_touch_s': seconds,
         'float_drift_rad': float(np.max(drift)),
         'float_moved_m': float(np.mean(moved)),
     }
+    if (firm := hits > 0.5 * (LEAST + MOST)).any():
+        numbers['firm_collisions_soon_share'] = float(soon[firm].mean())
     if free.any():
         numbers['wrench_free_error'] = float(size[free].mean())
         numbers['wrench_free_error_deg'] = float(angle[free].mean())
@@ -162,18 +165,20 @@ def _pushed(loop: FeelingLoop, force: Array) -> Push:
 
 
 def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Array:
-    """Return how long it takes until pushes of the moving arm are noticed [s], ∞ for never."""
-    robot, delays = loop.arm.robot, list[float]()
-    while len(delays) < count:
+    """Return sizes of pushes of the moving arm [N], and how long until they are noticed [s]."""
+    robot, found = loop.arm.robot, list[tuple[float, float]]()
+    while len(found) < count:
         for _ in range(round(rng.uniform(0.5, 1.0) * APART / SAMPLE_TIME)):
             before = loop.feel(exploring=True)
         if before.contact or np.linalg.norm(loop.arm.velocity) < 0.1:
             continue
-        loop.push(_force(robot, rng, LEAST, MOST))
+        force = _force(robot, rng, LEAST, MOST)
+        loop.push(force)
         noticed = [loop.feel(exploring=True).contact for _ in range(round(MOVED / SAMPLE_TIME))]
         loop.push(np.zeros(3))
-        delays.append((noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED)
-    return np.array(delays)
+        delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
+        found.append((float(np.linalg.norm(force)), delay))
+    return np.array(found).T
 
 
 def _healthy(loop: FeelingLoop, seconds: float) -> int:
