@@ -378,9 +378,11 @@ class Controller:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
         if self.settings.method == 'float':
+            nothing = np.zeros_like(estimate)
+            tension = self.floating.step(mae, estimate, estimate, nothing, planned, dt)
             # Where it is left is held by the method that comes next.
-            tension = self.floating.step(mae, estimate, estimate, 0.0 * estimate, planned, dt)
-            posture.theta, posture.effort = self.floating.held, 0.0 * estimate
+            inside = np.clip(estimate, self._robot.lower, self._robot.upper)
+            posture.theta, posture.effort = inside, nothing
             return Command(TENSION, tension)
         if posture.theta is None:
             return None
