@@ -40,6 +40,7 @@ TOPICS = {
     'controller_state': Topic(_TRAJECTORY),
     'estimated_joint_states': Topic(_JOINTS),
     'estimated_muscle_states': Topic(_ARRAY),
+    'estimated_external_wrench': Topic(_WRENCH),
     'muscle_length_zeros': Topic(_ARRAY, latched=True),
     'anomaly': Topic('std_msgs/msg/Float64'),
     'anomaly_detected': Topic('std_msgs/msg/Bool', latched=True),

@@ -30,7 +30,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.methods import TorqueControl
+from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
 from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
@@ -80,6 +80,7 @@ class Controller:
         self._follows = False  # a trajectory, or holds where it ended
         self._hand = Hand(robot)
         self.short = ''  # what the last pose of the hand was out of reach by
+        self.floating = FloatControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
         #: tension limit of each muscle, lowered by heat [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
@@ -119,6 +120,9 @@ class Controller:
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
         self.motion.settings = settings
+        self.floating.settings = settings
+        if settings.method == 'float':
+            self.explore(False)
         if settings.method != before.method and not self.posture.exploring:
             self._starts = True
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
@@ -166,6 +170,7 @@ class Controller:
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
+        self._refuse_floating()
         robot = self._robot
         kept = self.posture.theta if self.posture.theta is not None else self._estimate
         if kept is None and len(joints) < robot.joint_count:
@@ -231,8 +236,13 @@ class Controller:
         assert mae is not None
         self._follow(self._hand.moved(mae, start, twist))
 
+    def _refuse_floating(self) -> None:
+        if self.settings.method == 'float':
+            raise MessageError('floating', 'a hand moves the arm; set another method first')
+
     def _ready(self, delay: float = 0.0) -> Setpoint:
         """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
+        self._refuse_floating()
         if self._estimate is None or self._mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
         if cause := self.safety.cause or self.present_cause(self.stepped_at):
@@ -264,6 +274,8 @@ class Controller:
         """Explore, or end it and hold; return why not, or ''."""
         if wanted and self.safety.cause:
             return f'stopped: {self.safety.cause}'
+        if wanted and self.settings.method == 'float':
+            return 'method float: a hand moves the arm; set another method first'
         if wanted != self.posture.exploring:
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
@@ -351,7 +363,7 @@ class Controller:
         if posture.effort.any() and chosen.method in ('geometric', 'first', 'second'):
             warnings.append(f'method {chosen.method} exerts no effort')
         if self._in_tension:
-            missing = self.torque.missing_torque
+            missing = self._torque.missing_torque
         if self._follows:
             missing = self.motion.missing_torque
             values['lag of the winches'] = f'{1000.0 * self.motion.winches.lag:.0f} ms'
@@ -374,6 +386,7 @@ class Controller:
             warnings.append(f'hot: {", ".join(hot)}')
         still = 'no target' if posture.theta is None else 'holding'
         doing = 'exploring' if posture.exploring else still
+        doing = 'floating' if chosen.method == 'float' else doing
         if self._follows and self.motion.moving:
             doing = 'following a trajectory'
         if cause := self.safety.cause:
@@ -409,7 +422,11 @@ class Controller:
 
     @property
     def _in_tension(self) -> bool:
-        return self.settings.method == 'tension' and not self.posture.exploring
+        return self.settings.method in ('tension', 'float') and not self.posture.exploring
+
+    @property
+    def _torque(self) -> TorqueControl:
+        return self.floating if self.settings.method == 'float' else self.torque
 
     def step(self, now: float, time: float | None = None) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded.
@@ -485,7 +502,7 @@ class Controller:
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
                 command = safety.unchanging(self._robot, kind, muscles)
-            (self.torque if in_tension else posture).start_from(command.value)
+            (self._torque if in_tension else posture).start_from(command.value)
         if self._follows:
             sent = self.safety.command
             if sent is None or sent.kind != LENGTH:
@@ -495,6 +512,13 @@ class Controller:
         if not in_tension:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
+        if self.settings.method == 'float':
+            nothing = np.zeros_like(estimate)
+            tension = self.floating.step(mae, estimate, estimate, nothing, planned, dt)
+            # Where it is left is held by the method that comes next.
+            inside = np.clip(estimate, self._robot.lower, self._robot.upper)
+            posture.theta, posture.effort = inside, nothing
+            return Command(TENSION, tension)
         if posture.theta is None:
             return None
         target, effort = posture.theta, posture.effort

@@ -58,6 +58,11 @@ STEP = 0.05
 # `tension`
 SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
+# `float`
+BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
+DAMPING = 1.0  # [N·m·s/rad]
+WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
+
 
 class JointStiffness(NamedTuple):
     """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad]."""
@@ -297,8 +302,7 @@ class TorqueControl:
         self._smooth = smooth = before + dt / (dt + SMOOTHING) * (theta - before)
         velocity = (theta - smooth) / SMOOTHING
         torque = robot.kinematics.holding_torque(smooth) + effort
-        torque = torque + chosen.position_gain * (target - smooth)
-        torque = torque - chosen.velocity_gain * velocity
+        torque = torque + self._feedback(smooth, velocity, target)
         jacobian = mae.muscle_jacobian(smooth, self._command)
         tension, self.missing_torque = least_tension(jacobian, torque, robot.tension.bias, limit)
         # All muscles change by the same share: between two tensions that hold the arm, it is held.
@@ -307,3 +311,31 @@ class TorqueControl:
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
         self._command = self._command + change * share
         return self._command.copy()
+
+    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
+        """Return the torque by posture and velocity [N·m], (D,)."""
+        chosen = self.settings
+        return chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
+
+
+class FloatControl(TorqueControl):
+    """The arm's weight is carried, and a hand moves the arm: the method `float`.
+
+        τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
+        θ_held ← clip(θ_held, θ − BAND, θ + BAND)
+
+    The spring to θ_held, which comes along once it is stretched by BAND, is friction as of a joint:
+    what gravity's model leaves does not make the arm creep. Clip is to WALL_AT inside the limits.
+    """
+
+    def start_from(self, tension: Array) -> None:
+        """Hold where the arm is at the next step, from tensions [N] (M,)."""
+        super().start_from(tension)
+        self.held: Array | None = None  # θ_held [rad], (D,)
+
+    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
+        low, high = self._robot.lower, self._robot.upper
+        held = target if self.held is None else np.clip(self.held, theta - BAND, theta + BAND)
+        self.held = np.clip(held, low, high)
+        wall = np.clip(theta, low + WALL_AT, high - WALL_AT) - theta
+        return HOLD * (held - theta) - DAMPING * velocity + WALL * wall

@@ -10,7 +10,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, settable
 
 UNREACHABLE = ('refuse', 'nearest')
-METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness')
+METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 
 
 @dataclass(frozen=True)

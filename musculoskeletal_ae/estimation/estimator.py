@@ -3,6 +3,7 @@
 
     (T, l) ─② of the MAE→ θ, T, l ─→ detector ─→ anomaly, latched until `reset`
     while zeros are sought: no judgement, but `zeroing` finds them and the estimate follows
+    θ, T, l ─→ what pushes the arm from outside (`touch`)
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
 
 What was detected first names the suspect for as long as the latch holds.
@@ -18,6 +19,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
+from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
@@ -44,6 +46,7 @@ class Estimate(NamedTuple):
     state: State  # (θ, T, l) as the network restores them
     anomaly: float  # A, scaled units
     detected: bool  # whether this message completes a detection that was not there before
+    touch: Touch | None = None  # None while the zeros of l are unknown
 
 
 class Estimator:
@@ -54,6 +57,9 @@ class Estimator:
         self._robot = robot
         self.mae: Mae | None = None  # the network in use
         self.detector = AnomalyDetector(robot, preset=preset)
+        self._external = ExternalTorque(robot)
+        self._touch: Touch | None = None
+        self._contacts = 0
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
@@ -66,6 +72,7 @@ class Estimator:
     def use(self, mae: Mae) -> None:
         """Take a network and the healthy statistics it brings."""
         self.detector.use(mae)
+        self._external.use(mae)
         self.mae = mae
 
     def commanded(
@@ -111,6 +118,8 @@ class Estimator:
         if self.mae is None:
             return None
         dt = min(max(time - self._time, 0.0), LONGEST_PERIOD)
+        if time - self._time > SILENCE:
+            self._external.reset()
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
@@ -126,7 +135,11 @@ class Estimator:
         if detected:
             self._suspect = self._robot.muscles[verdict.suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
-        return Estimate(state, verdict.anomaly, detected)
+        before, self._touch = self._touch, None
+        if self.zeros.known:
+            self._touch = touch = self._external.step(state.theta, tension, length, dt)
+            self._contacts += touch.contact and not (before is not None and before.contact)
+        return Estimate(state, verdict.anomaly, detected, self._touch)
 
     def _zero_on(
         self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
@@ -166,6 +179,7 @@ class Estimator:
         """Start the detector's counts anew; what was detected stays."""
         self._time = math.inf
         self.detector.reset()
+        self._external.reset()
 
     def report(self, now: float) -> Report:
         """Say what is estimated, and how the body is."""
@@ -184,6 +198,11 @@ class Estimator:
             if self.detector.calibrated:
                 letter = 'd' if self.detector.whitened else 'A'
                 values[f'{letter} limit'] = f'{self.detector.limit(self._theta):.3g}'
+        if (touch := self._touch) is not None:
+            force = f'{np.linalg.norm(touch.force):.0f} N at the hand'
+            known = force if touch.contact else 'none'
+            values['contact'] = known if self._external.calibrated else 'not calibrated'
+            values['contacts'] = str(self._contacts)
         if self.zeros.offset.any():
             zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
             values['length zeros'] = ', '.join(f'{n} {o:.1f} ± {d:.1f} mm' for n, o, d in zeros)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.touch import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.rest import RestCollector
@@ -70,6 +71,7 @@ class Learner:
         self._pairing = Pairing(period)
         self._healthy = Reservoir(robot.muscle_count, seed, settings)
         self._rests = RestCollector(robot, settings, self._healthy)
+        self._torque = HealthyTorque(robot)
         self.rejected = self._rests.rejected  # what was not learned from, by reason
         self._steps = steps
         self._news = True  # to learn from, since the last update began
@@ -110,6 +112,8 @@ class Learner:
         _, tension, length, dt, theta = paired
         self._gate_time += dt
         self._gate.message(tension, length, self._gate_time)
+        if self._mae is not None and not self._rests.anomaly:
+            self._torque.step(tension, length, dt)
         for rest in self._rests.step(tension, length, dt, theta):
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
@@ -149,6 +153,7 @@ class Learner:
         """Forget what is no sample yet, as after a backward jump of the clock."""
         self._pairing.reset()
         self._rests.reset()
+        self._torque.reset()
 
     # -- samples → checkpoints ------------------------------------------------------------------
 
@@ -199,7 +204,8 @@ class Learner:
         return replace(mae, version=1 + max(mae.version, before))
 
     def _use(self, mae: Mae) -> None:
-        self._mae, self.checkpoint = mae, checkpoint.to_bytes(mae)
+        self._mae = mae = self._torque.use(mae)
+        self.checkpoint = checkpoint.to_bytes(mae)
         self._gate.take(mae, self._gate_time)
         # What is published is on disk before it leaves.
         self._keep()

@@ -18,6 +18,7 @@ import copy
 import re
 import time
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from musculoskeletal_ae.learning.training import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets import PAPER, Preset
@@ -71,8 +73,12 @@ class Updater(ABC):
         )
         mae = to_mae(network, origin.joints, origin.muscles, origin.preset, history)
         before = self._mae if job.statistics_hold else uncalibrated(self._mae)
-        self._mae = recalibrated(mae, before.anomaly, job.healthy, samples)
-        return self._mae
+        mae = recalibrated(mae, before.anomaly, job.healthy, samples)
+        if self.body is not None:
+            friction = np.array([self.body.friction(m) for m in range(self._robot.muscle_count)])
+            mae = replace(mae, touch=TouchStatistics(friction, np.ones(self._robot.joint_count)))
+        self._mae = mae
+        return mae
 
 
 def make_updater(robot: Robot, mae: Mae, preset: Preset, seed: int = 0) -> Updater:

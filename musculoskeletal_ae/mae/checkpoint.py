@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes
 from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.groups import Group
@@ -38,6 +38,7 @@ MAX_HEADER_BYTES = 1024 * 1024
 # A weight or spread beyond these is no trained network, and could overflow where they are folded.
 LARGEST = 1e9
 SMALLEST_STD = 1e-9
+LARGEST_FRICTION = 5.0  # a factor of 150 between the ends of a wire
 SMALLEST_EIGENVALUE = 1e-12  # of the largest one
 #: beyond what a trained network says of a posture at rest: θ [rad], T [N], l [m], G [m/rad]
 ABSURD = (100.0, 1e5, 100.0, 1e5)
@@ -70,6 +71,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
     groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
+    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None = None  # none: no statistics
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -119,6 +121,8 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
         if self.anomaly_postures:
             shapes['anomaly.postures'] = self.anomaly_postures, len(self.joints)
+        if self.touch_time is not None:
+            shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
         return shapes
 
 
@@ -143,6 +147,9 @@ def to_bytes(mae: Mae) -> bytes:
     }
     if len(mae.groups) > 1:
         entries['groups'] = mae.groups
+    if (touch := mae.touch) is not None:
+        tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
+        entries['touch_time'] = touch.time
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
@@ -223,8 +230,13 @@ def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, A
     for name, value in tensors.items():
         if not (np.abs(value) <= LARGEST).all():
             raise CheckpointError(f'tensor {name} holds a value beyond ±{LARGEST:g}, or not finite')
-    if (least := tensors['std'].min()) < SMALLEST_STD:
-        raise CheckpointError(f'tensor std holds {least:g}; at least {SMALLEST_STD:g} is legal')
+    for name in ('std', 'touch.spread'):
+        if name in tensors and (least := tensors[name].min()) < SMALLEST_STD:
+            told = f'tensor {name} holds {least:g}; at least {SMALLEST_STD:g} is legal'
+            raise CheckpointError(told)
+    if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
+        told = f'tensor touch.friction holds ±{most:g}; at most {LARGEST_FRICTION:g} is legal'
+        raise CheckpointError(told)
     if 'anomaly.covariance' in tensors:
         _check_covariance(tensors['anomaly.covariance'])
     return tensors
@@ -260,12 +272,17 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
             meta.anomaly_thresholds,
             tensors.get('anomaly.postures', np.empty((0, 0))),
         )
+    touch = None
+    if meta.touch_time is not None:
+        friction, spread = tensors['touch.friction'], tensors['touch.spread']
+        touch = TouchStatistics(friction, spread, meta.touch_time)
     return Mae(
         encoder=stack('encoder'),
         decoder=stack('decoder'),
         mean=tensors['mean'],
         std=tensors['std'],
         anomaly=anomaly,
+        touch=touch,
         groups=meta.groups,
         **{name: getattr(meta, name) for name in SHARED},
     )

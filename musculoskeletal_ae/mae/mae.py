@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints, Singles
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
 
@@ -184,6 +184,7 @@ class Mae:
     version: int = 0  # counts up with every checkpoint the learner publishes
     training: str = ''  # how it was trained, for people to read
     anomaly: AnomalyStatistics | None = None  # residuals of healthy data
+    touch: TouchStatistics | None = None  # friction and healthy torques, once some are learned
     groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)

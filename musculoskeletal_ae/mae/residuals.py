@@ -21,6 +21,7 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 # Below any sensor's resolution (0.02 N, 0.01 mm); keeps the covariance invertible when a network
 # restores some combination of its inputs perfectly.
 FLOOR = 1e-4
+LEAST_MOTION = 60.0  # [s]
 
 
 def residuals(restored: State, tension: Array, length: Array) -> Array:
@@ -57,3 +58,17 @@ class AnomalyStatistics:
         covariance = centred.T @ centred / max(len(error) - 1, 1)
         covariance = 0.5 * (covariance + covariance.T) + FLOOR**2 * np.eye(error.shape[1])
         return cls(mean, covariance, calibrated, len(error))
+
+
+@dataclass(frozen=True, eq=False)
+class TouchStatistics:
+    """What tells a push from friction (`estimation/touch.py`)."""
+
+    friction: Array  # μ of each wire: T at the motor is that at the elastic unit times e^{±μ}, (M,)
+    spread: Array  # root mean square of τ_ext of the healthy arm in motion [N·m], (D,); positive
+    time: float = 0.0  # of motion that the spread rests on [s]
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether it has seen enough motion to decide on contact."""
+        return self.time >= LEAST_MOTION

@@ -2,7 +2,7 @@
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
 muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected,
-muscle_length_zeros (joint_states help to find those), estimated/markers;
+estimated_external_wrench, muscle_length_zeros (joint_states help to find those), estimated/markers;
 on request muscle_joint_states and /tf;
 marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
@@ -51,6 +51,7 @@ class Estimator(Shell):
         self.joints = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscles = self.create_publisher(Float64MultiArray, 'estimated_muscle_states', RELIABLE)
         self.anomaly = self.create_publisher(Float64, 'anomaly', RELIABLE)
+        self.wrench = self.create_publisher(WrenchStamped, 'estimated_external_wrench', RELIABLE)
         self.detected = self.create_publisher(Bool, 'anomaly_detected', LATCHED)
         self.detected.publish(Bool(data=False))
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
@@ -145,6 +146,11 @@ class Estimator(Shell):
         restored = np.stack([state.length, state.tension])
         self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
         self.anomaly.publish(Float64(data=estimate.anomaly))
+        if (touch := estimate.touch) is not None:
+            wrench = WrenchStamped()
+            wrench.header.stamp, wrench.header.frame_id = clock.to_msg(), self.root_frame
+            wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force.tolist())))
+            self.wrench.publish(wrench)
         if estimate.detected:
             self.get_logger().warning(f'anomaly detected: {self.core.cause}')
             self.detected.publish(Bool(data=True))

@@ -21,9 +21,11 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.bags.playback import Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.teaching import LEAD, SHOWN, shown
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
@@ -178,10 +180,39 @@ class Replay(Node):
         return f'{(self._start - self._bag.start) / 1e9 + self._done():.6f} s'
 
 
+def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
+    """Publish what a hand showed as one trajectory."""
+    names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
+    ((recorded, name),) = names.items()
+    motion = shown(bag, recorded, *window(bag, options.start, options.duration))
+    message = JointTrajectory(joint_names=motion.joints)
+    for seconds, theta, velocity in zip(*motion[1:]):
+        point = JointTrajectoryPoint(positions=theta.tolist(), velocities=velocity.tolist())
+        point.time_from_start = Duration(seconds=float(seconds)).to_msg()
+        message.points.append(point)
+    start_ros(arguments)
+    node = Node('replay')
+    topic = name.removesuffix(SHOWN) + 'joint_trajectory'
+    publisher, end = node.create_publisher(JointTrajectory, topic, RELIABLE), options.wait
+    end += time.monotonic()
+    while not publisher.get_subscription_count() and time.monotonic() < end:
+        time.sleep(SLEPT)
+    time.sleep(SETTLE_TIME if options.wait else 0.0)
+    publisher.publish(message)
+    publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
+    if not publisher.get_subscription_count():
+        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
+    told = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
+    print(f'{topic}: {told}, the first {LEAD:g} s of it to where it begins')
+    return 0
+
+
 def _replay(options: Namespace, arguments: list[str]) -> int:
     bag = Bag.open(options.bag, unfinished=True)
     for reason in bag.unfinished:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
+    if options.as_trajectory:
+        return _teach(bag, options, arguments)
     names = select(bag, options.topics, options.from_namespace, options.keep_names)
     start, stop = window(bag, options.start, options.duration)
     if options.loop and not options.clock:
@@ -223,6 +254,8 @@ def parse(arguments: list[str]) -> Namespace:
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
+    taught = f'send the motion of {SHOWN} as one smooth joint_trajectory, and end'
+    add('--as-trajectory', action='store_true', help=taught)
     add('--paused', action='store_true', help='wait for replay/resume or replay/step')
     wait = 'longest wait for subscribers [s]'
     add('--wait', type=not_negative, default=2.0, metavar='S', help=wait)

@@ -13,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
@@ -20,6 +21,8 @@ from musculoskeletal_ae.exceptions import UnfinishedBagError
 from musculoskeletal_ae.nodes import record as record_tool
 from musculoskeletal_ae.nodes import replay as replay_tool
 from musculoskeletal_ae.validity import read_array
+
+from .arm_bag import JOINTS, joints
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -208,3 +211,30 @@ def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem,
     message = capsys.readouterr().err
     assert problem in message
     assert message.count('\n') == 1
+
+
+def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
+    names, content = ('elbow', 'shoulder'), []
+    for n in range(300):
+        now = samples.START + n * 10_000_000
+        theta = [0.5 * np.sin(0.01 * n), -0.3]
+        data = joints(names, theta)
+        content.append(samples.Sample('/l/estimated_joint_states', JOINTS, now, now, data))
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    received = graph.listen(JointTrajectory, 'joint_trajectory')
+    replay = tool('replay', tmp_path / 'bag', '--as-trajectory', '--wait', '20', *ros(graph))
+    output = replay.output()
+    assert replay.process.returncode == 0, output
+    assert 'joint_trajectory: 31 points' in output
+    message = graph.wait(lambda: received, 'the trajectory')[0]
+    assert tuple(message.joint_names) == names
+    seconds = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
+    assert seconds[0] > 1.0 and (np.diff(seconds) > 0.05).all()
+    shown = np.array([point.positions for point in message.points])
+    wanted = 0.5 * np.sin(np.array(seconds) - seconds[0])
+    np.testing.assert_allclose(shown[2:-2, 0], wanted[2:-2], atol=0.02)
+    np.testing.assert_allclose(shown[:, 1], -0.3)
+    np.testing.assert_array_equal(message.points[-1].velocities, 0.0)
+    short = tool('replay', tmp_path / 'bag', '--as-trajectory', '--duration', '0.2', *ros(graph))
+    assert 'holds no motion' in short.output()
+    assert short.process.returncode == 1

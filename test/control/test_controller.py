@@ -28,7 +28,7 @@ EVENTS = {
     **{
         name: lambda bench, name=name: bench.configure(method=name)
         for name in METHODS
-        if name != 'tension'
+        if name not in ('tension', 'float')
     },
 }
 
@@ -54,7 +54,7 @@ def test_whatever_happens_lengths_are_finite_and_never_faster_than_the_rate_limi
         assert np.abs(np.diff(lengths, axis=0)).max() <= bench.core.settings.rate_limit * DT + 1e-9
 
 
-@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('method', [name for name in METHODS if name != 'float'])
 def test_every_method_arrives_at_its_command_and_stays_there(method):
     bench = Bench(method=method, first_duration=1.0, second_duration=0.5)
     bench.target(REST)
@@ -328,3 +328,33 @@ def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm(
         bench.step(100)
         assert bench.core.safety.cause == ''
         assert bench.core.limit.min() == ROBOT.tension.bias[0]
+
+
+def test_a_floating_arm_follows_the_hand_takes_no_target_and_is_held_where_it_was_left():
+    bench = Bench(first_duration=1.0)
+    bench.target(REST)
+    bench.step(150)
+    bench.core.explore(True)
+    bench.configure(method='float')
+    sent = bench.step(200)
+    assert {command.kind for command in sent} == {TENSION}
+    assert not bench.core.posture.exploring and bench.report().message == 'floating'
+    with pytest.raises(MessageError, match='floating'):
+        bench.target(OTHER)
+    assert 'float' in bench.core.explore(True)
+    for share in np.linspace(0.0, 1.0, 100):
+        bench.theta = REST + share * (OTHER - REST)
+        bench.step()
+    bench.configure(method='proposed')
+    assert {command.kind for command in bench.step(300)} == {LENGTH}
+    np.testing.assert_allclose(bench.core.posture.theta, OTHER, atol=0.06)
+
+
+def test_a_floating_arm_stops_as_any_other_and_floats_again():
+    bench = Bench(method='float')
+    bench.step(50)
+    bench.core.stop('asked')
+    bias = ROBOT.tension.bias
+    np.testing.assert_array_equal(bench.step(400)[-1].value, bias)
+    assert not bench.core.reset(bench.now)
+    assert bench.step(200)[-1].value.max() > bias[0]

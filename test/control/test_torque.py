@@ -9,7 +9,7 @@ from exact_mae import ExactMae
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.methods import TorqueControl
+from musculoskeletal_ae.control.methods import BAND, HOLD, WALL_AT, FloatControl, TorqueControl
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -68,3 +68,33 @@ def test_torque_beyond_the_muscles_is_told():
     assert (tension <= 200.0 + 1e-6).all()
     assert control.missing_torque[1] == pytest.approx(90.0, abs=60.0)
     assert control.missing_torque[1] > 10.0
+
+
+def carried(control, theta):
+    """Return the torque beyond the weight [N·m] that a floating arm exerts at θ."""
+    tension = settled(control, target=theta, theta=theta)
+    pulled = -MAE.muscle_jacobian(theta, tension).T @ tension
+    return pulled - ROBOT.kinematics.holding_torque(theta)
+
+
+def test_a_floating_arm_carries_its_weight_and_no_more():
+    np.testing.assert_allclose(carried(FloatControl(ROBOT, Settings()), THETA), 0.0, atol=0.1)
+
+
+@pytest.mark.parametrize('way', [1.0, -1.0])
+def test_a_floating_arm_comes_along_and_pulls_back_no_harder_than_its_band(way):
+    control = FloatControl(ROBOT, Settings())
+    carried(control, THETA)
+    little = carried(control, THETA + way * 0.5 * BAND)
+    np.testing.assert_allclose(little, -way * 0.5 * BAND * HOLD, atol=0.15)
+    far = carried(control, THETA + way * 0.2)
+    np.testing.assert_allclose(far, -way * BAND * HOLD, atol=0.15)
+    np.testing.assert_allclose(control.held, THETA + way * (0.2 - BAND), atol=1e-3)
+
+
+def test_a_floating_arm_is_pushed_back_from_its_limits():
+    theta = THETA.copy()
+    theta[3] = ROBOT.lower[3]
+    pushed = carried(FloatControl(ROBOT, Settings()), theta)
+    assert pushed[3] > 10.0 * WALL_AT
+    np.testing.assert_allclose(np.delete(pushed, 3), 0.0, atol=0.15)

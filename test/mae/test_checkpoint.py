@@ -16,7 +16,7 @@ from safetensors import safe_open
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae.checkpoint import from_bytes, load, save, to_bytes
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -280,3 +280,20 @@ def test_any_cut_file_is_refused(length):
 def test_any_header_gives_a_checkpoint_error(header):
     with pytest.raises(CheckpointError):
         from_bytes(len(header).to_bytes(8, 'little') + header)
+
+
+def test_what_tells_a_push_from_friction_comes_back_and_unsound_values_are_refused():
+    touch = TouchStatistics(np.array([0.1, 0.05]), np.array([0.3]), 90.0)
+    mae = from_bytes(to_bytes(replace(small(), touch=touch)))
+    assert mae.touch.time == 90.0 and mae.touch.calibrated
+    np.testing.assert_array_equal(mae.touch.friction, touch.friction)
+    np.testing.assert_array_equal(mae.touch.spread, touch.spread)
+    assert small().touch is None and from_bytes(GOOD).touch is None
+    for wrong, said in (
+        (replace(touch, friction=np.array([0.1, 9.0])), 'touch.friction holds ±9'),
+        (replace(touch, spread=np.zeros(1)), 'touch.spread holds 0'),
+        (replace(touch, time=-1.0), 'touch_time'),
+        (replace(touch, spread=np.ones(2)), 'touch.spread has shape'),
+    ):
+        with pytest.raises(CheckpointError, match=said):
+            from_bytes(to_bytes(replace(small(), touch=wrong)))

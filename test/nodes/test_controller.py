@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from controlled_arm import RATE_LIMIT, ControlledArm
+from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
@@ -136,3 +137,28 @@ def test_parameters_set_together_are_taken_all_or_none(arm):
     assert len(arm.sent('tension')) == 0
     arm.says('method')
     assert arm.state().values['method'] == 'proposed'
+
+
+def test_a_hand_moves_a_floating_arm_and_the_estimator_feels_it(arm):
+    graph = arm.graph
+    graph.listen(WrenchStamped, 'estimated_external_wrench', 1000)
+    pushes = graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
+    arm.target(HERE)
+    arm.goes_to(HERE)
+    assert graph.set_parameter('controller', 'method', 'float')[0]
+    arm.says('floating')
+    before = arm.posture()
+    for _ in range(30):
+        left = arm.posture()
+    assert np.abs(left - before).max() < 0.1
+
+    def force(size):
+        wrench = WrenchStamped()
+        wrench.wrench.force.x = size
+        pushes.publish(wrench)
+        return graph.next('estimated_external_wrench')
+
+    size = 20.0 if left[1] > np.mean([arm.robot.lower[1], arm.robot.upper[1]]) else -20.0
+    graph.wait(lambda: force(size).wrench.force.x * size > 25.0, 'the force')
+    assert graph.next('estimated_external_wrench').header.frame_id == arm.robot.root_link
+    graph.wait(lambda: np.abs(arm.posture() - left).max() > 0.15, 'motion')

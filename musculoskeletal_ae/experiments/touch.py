@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Touch: what the estimator says of pushes, and what an arm does that a hand moves.
+
+Paper. Not part of it.
+
+Here. The hand is pushed in random directions, by 10 to 50 N, at rest in random postures that can be
+held and while the arm explores. `wrench_error` is |‖F_est‖ − ‖F‖| / ‖F‖ after a second; a push that
+drives joints against their stops, which then bear a part of it, counts like any other (`…_free…`:
+without those). Then an hour of healthy exploration, spread over the individuals, in which every
+contact is a false one. In method `float` the arm is left alone, and pushed by 15 to 20 N.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
+from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
+from musculoskeletal_ae.experiments.plots import AFTER, MARK, new_figure, tidy
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
+from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
+
+TOUCH_STREAM = 7000
+POSTURES, COLLISIONS, FLOATS = 15, 20, 4
+HEALTHY = 3600.0  # [s] over all individuals
+LEAST, MOST = 10.0, 50.0  # [N]
+LIGHT, FIRM = 15.0, 20.0  # [N] of a hand that moves a floating arm
+MOVE, PUSH, JUDGED, APART = 4.0, 1.5, 0.5, 3.0  # [s]
+FLOATING, MOVED = 30.0, 1.0  # [s]
+SOON = 0.1  # [s] in which a collision is to be noticed
+INSIDE = 0.1  # share of the joint ranges that postures stay inside of the limits
+
+
+class FeelingLoop(ClosedLoop):
+    """A closed loop that is asked what pushes the arm."""
+
+    def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
+        self._external = ExternalTorque(arm.robot)
+        super().__init__(arm, mae, settings, seed)
+
+    def use(self, mae: Mae) -> None:
+        """Estimate, control and feel by another network."""
+        super().use(mae)
+        self._external.use(mae)
+
+    def feel(self, exploring: bool = False) -> Touch:
+        """Let a message's time pass; return what it says of the outside."""
+        _ = self.explore() if exploring else self.step()
+        length, tension = self._read.length, self._read.tension
+        theta = self.mae.estimate(tension, length).theta
+        return self._external.step(theta, tension, length, SAMPLE_TIME)
+
+    def rest(self, theta: Array) -> None:
+        """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""
+        self.push(np.zeros(3))
+        self.core.reset(self._now)
+        self.core.target({n: (t, 0.0) for n, t in zip(self.arm.robot.joints, theta.tolist())})
+        for _ in range(round(MOVE / SAMPLE_TIME)):
+            self.feel()
+
+    def push(self, force: Array) -> None:
+        """Push the hand by a force [N] (3,)."""
+        self.arm.set_wrench(np.concatenate([force, np.zeros(3)]))
+
+
+class Push(NamedTuple):
+    """A push of the resting arm."""
+
+    true: Array  # [N], (3,)
+    felt: Array  # [N], (3,)
+    free: bool  # whether no joint reached its stop
+
+
+def measure(study: Study, seed: int) -> Measured:
+    """Push an individual that has learned, at rest, in motion and afloat."""
+    robot, rng = study.robot, np.random.default_rng([seed, TOUCH_STREAM])
+    settings, share = Settings(first_duration=2.0), 0.1 if study.quick else 1.0
+    loop = FeelingLoop(study.arm(seed), study.network(seed), settings, TOUCH_STREAM + seed)
+
+    def count(whole: float) -> int:
+        return max(2, round(share * whole))
+
+    pushes = list[Push]()
+    for theta in _holdable(robot, rng, count(POSTURES)):
+        loop.rest(theta)
+        for _ in range(2):
+            pushes.append(_pushed(loop, _force(robot, rng, LEAST, MOST)))
+    hits, delays = _collisions(loop, rng, count(COLLISIONS))
+    soon = delays <= SOON + 1e-9
+    loop.arm.reset()
+    seconds = share * HEALTHY / len(study.seeds)
+    contacts = _healthy(loop, seconds)
+    drift, moved = zip(*(_afloat(study, seed, rng) for _ in range(count(FLOATS))))
+    true, felt = np.array([p.true for p in pushes]), np.array([p.felt for p in pushes])
+    free = np.array([p.free for p in pushes])
+    size, angle = _errors(true, felt)
+    numbers: dict[str, Any] = {
+        'wrench_error': float(size.mean()),
+        'wrench_error_deg': float(angle.mean()),
+        'pushes_free_share': float(free.mean()),
+        'collision_s': float(np.median(delays)),
+        'collisions_soon_share': float(soon.mean()),
+        'false_contacts': contacts,
+        'healthy_touch_s': seconds,
+        'float_drift_rad': float(np.max(drift)),
+        'float_moved_m': float(np.mean(moved)),
+    }
+    if (firm := hits > 0.5 * (LEAST + MOST)).any():
+        numbers['firm_collisions_soon_share'] = float(soon[firm].mean())
+    if free.any():
+        numbers['wrench_free_error'] = float(size[free].mean())
+        numbers['wrench_free_error_deg'] = float(angle[free].mean())
+    return Measured(numbers, {'true': true, 'felt': felt, 'free': free})
+
+
+def _errors(true: Array, felt: Array) -> tuple[Array, Array]:
+    """Return relative errors in size and those in direction [deg] of forces (N, 3)."""
+    sizes, felt_sizes = np.linalg.norm(true, axis=1), np.linalg.norm(felt, axis=1)
+    cosine = (true * felt).sum(axis=1) / np.maximum(sizes * felt_sizes, 1e-9)
+    return np.abs(felt_sizes - sizes) / sizes, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _force(robot: Robot, rng: np.random.Generator, least: float, most: float) -> Array:
+    """Draw a force [N] (3,) that the joints can feel somewhere: in the plane of a planar arm."""
+    postures = robot.random_postures(20, rng)
+    jacobians = [robot.kinematics.end_effector_jacobian(theta)[:3] for theta in postures]
+    felt = np.abs(np.concatenate(jacobians, axis=1)).max(axis=1) > 1e-6
+    direction = rng.normal(size=3) * felt
+    force: Array = rng.uniform(least, most) * direction / np.linalg.norm(direction)
+    return force
+
+
+def _holdable(robot: Robot, rng: np.random.Generator, count: int) -> Iterator[Array]:
+    while count:
+        (theta,) = robot.random_postures(1, rng, -INSIDE)
+        try:
+            holding_tension(robot, theta)
+        except InfeasibleError:
+            continue
+        count -= 1
+        yield theta
+
+
+def _pushed(loop: FeelingLoop, force: Array) -> Push:
+    robot, felt, free = loop.arm.robot, list[Array](), True
+    loop.push(force)
+    for _ in range(round(PUSH / SAMPLE_TIME)):
+        felt.append(loop.feel().force)
+        theta = loop.arm.theta
+        free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
+    loop.push(np.zeros(3))
+    for _ in range(round(MOVED / SAMPLE_TIME)):
+        loop.feel()
+    return Push(force, np.mean(felt[-round(JUDGED / SAMPLE_TIME) :], axis=0), free)
+
+
+def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Array:
+    """Return sizes of pushes of the moving arm [N], and how long until they are noticed [s]."""
+    robot, found = loop.arm.robot, list[tuple[float, float]]()
+    while len(found) < count:
+        for _ in range(round(rng.uniform(0.5, 1.0) * APART / SAMPLE_TIME)):
+            before = loop.feel(exploring=True)
+        if before.contact or np.linalg.norm(loop.arm.velocity) < 0.1:
+            continue
+        force = _force(robot, rng, LEAST, MOST)
+        loop.push(force)
+        noticed = [loop.feel(exploring=True).contact for _ in range(round(MOVED / SAMPLE_TIME))]
+        loop.push(np.zeros(3))
+        delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
+        found.append((float(np.linalg.norm(force)), delay))
+    return np.array(found).T
+
+
+def _healthy(loop: FeelingLoop, seconds: float) -> int:
+    """Return how often a contact begins in so much healthy exploration [s], the first 5 s apart."""
+    contacts, before = 0, False
+    for n in range(round((seconds + 5.0) / SAMPLE_TIME)):
+        now = loop.feel(exploring=True).contact and n * SAMPLE_TIME > 5.0
+        contacts, before = contacts + (now and not before), now
+    return contacts
+
+
+def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
+    """Return how far a floating joint drifts [rad], and how far a hand moves the hand [m]."""
+    settings, arm = Settings(first_duration=2.0), study.arm(seed)
+    loop = FeelingLoop(arm, study.network(seed), settings, seed)
+    (theta,) = _holdable(study.robot, rng, 1)
+    loop.rest(theta)
+    loop.core.configure(replace(settings, method='float'))
+    for _ in range(round(MOVED / SAMPLE_TIME)):
+        loop.step()
+    start, drift = arm.theta, 0.0
+    for _ in range(round(FLOATING / SAMPLE_TIME)):
+        loop.step()
+        drift = max(drift, float(np.abs(arm.theta - start).max()))
+    before = arm.hand.translation.copy()
+    loop.push(_force(study.robot, rng, LIGHT, FIRM))
+    for _ in range(round(MOVED / SAMPLE_TIME)):
+        loop.step()
+    if loop.core.safety.cause:
+        raise MusculoskeletalError(f'floating stopped: {loop.core.safety.cause}')
+    return drift, float(np.linalg.norm(arm.hand.translation - before))
+
+
+def forces(_: Study, rows: Rows) -> Plot:
+    """Draw sizes and directions of all pushes."""
+    parts = [row.traces for row in rows.values()]
+    true, felt = (np.concatenate([part[key] for part in parts]) for key in ('true', 'felt'))
+    free = np.concatenate([part['free'] for part in parts])
+    sizes, angle = np.linalg.norm(true, axis=1), _errors(true, felt)[1]
+    figure, (left, right) = new_figure(9.0, 3.6, columns=2)
+    for which, colour, name in ((free, AFTER, 'free'), (~free, MARK, 'a joint at its stop')):
+        style = {'color': colour, 's': 12, 'label': name}
+        left.scatter(sizes[which], np.linalg.norm(felt[which], axis=1), **style)
+        right.scatter(sizes[which], angle[which], **style)
+    left.plot([0.0, MOST], [0.0, MOST], color='#222222', linewidth=0.8)
+    tidy(left, 'push [N]', 'estimated [N]', 'size', 'above')
+    tidy(right, 'push [N]', 'error [deg]', 'direction')
+    return figure, f'{len(sizes)} pushes of the hand at rest, one second after they began.'

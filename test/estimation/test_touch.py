@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What pushes the arm from outside: exact on an exact body image, silent where nothing does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact_mae import ExactMae
+
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.touch import ExternalTorque, HealthyTorque
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import TensionProgramme
+
+ARM = Robot.load('musashi_left_arm')
+THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
+DT = 0.01
+SPREAD = np.full(5, 0.2)
+
+
+def observer(friction=0.0, spread=SPREAD, time=LEAST_MOTION, robot=ARM):
+    mae = ExactMae(robot)
+    mae.touch = TouchStatistics(np.full(robot.muscle_count, friction), spread, time)
+    result = ExternalTorque(robot)
+    result.use(mae)
+    return result
+
+
+def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
+    """Return T [N] and l [m] of the arm that rests at θ under a force of the hand [N]."""
+    kin = robot.kinematics
+    torque = kin.holding_torque(theta) - kin.end_effector_jacobian(theta)[:3].T @ np.array(force)
+    jacobian = ExactMae(robot).muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
+    tension = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
+    return tension, robot.muscle_lengths(theta, tension)
+
+
+def felt(core, theta, tension, length, times=100):
+    for _ in range(times):
+        touch = core.step(theta, tension, length, DT)
+    return touch
+
+
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('size', [-20.0, 20.0])
+def test_a_force_of_the_hand_is_found_and_its_opposite_too(axis, size):
+    force = size * np.eye(3)[axis]
+    core = observer()
+    touch = felt(core, THETA, *pulling(THETA, force))
+    np.testing.assert_allclose(touch.force, force, atol=1.0)
+    assert touch.contact
+
+
+def test_an_arm_that_nothing_touches_feels_nothing():
+    touch = felt(observer(), THETA, *pulling(THETA))
+    np.testing.assert_allclose(touch.torque, 0.0, atol=0.02)
+    np.testing.assert_allclose(touch.force, 0.0, atol=0.2)
+    assert not touch.contact
+
+
+def test_a_planar_arm_feels_nothing_across_its_plane(robot):
+    theta = 0.5 * (robot.lower + robot.upper)
+    core = observer(spread=np.full(2, 0.2), robot=robot)
+    touch = felt(core, theta, *pulling(theta, (5.0, 0.0, -5.0), robot))
+    np.testing.assert_allclose(touch.force, [5.0, 0.0, -5.0], atol=0.5)
+
+
+def test_friction_that_is_known_is_no_force():
+    tension, length = pulling(THETA)
+    wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # s = 1: the motor pulls more
+    errors = []
+    for friction in (0.0, 0.1):
+        core = observer(friction)
+        for row in wound:
+            touch = core.step(THETA, tension * np.exp(0.1), row, DT)
+        touch = felt(core, THETA, tension * np.exp(0.1), length)
+        errors.append(np.abs(touch.torque).max())
+    assert errors[1] < 0.05 < 0.2 < errors[0]
+
+
+def test_inertia_is_no_force():
+    """A swing whose muscles give just the torque of inverse dynamics."""
+    core, largest, free, rate = observer(), 0.0, 0.0, 3.0
+    for n in range(300):
+        t = n * DT
+        swing = np.array([0.0, 0.2, 0.0, 0.3, 0.0])
+        theta = THETA + swing * np.sin(rate * t)
+        velocity, turn = swing * rate * np.cos(rate * t), -swing * rate**2 * np.sin(rate * t)
+        torque = ARM.kinematics.inverse_dynamics(theta, velocity, turn)
+        jacobian = ExactMae(ARM).muscle_jacobian(theta, np.full(10, 60.0))
+        tension = TensionProgramme(jacobian, torque, 5.0, 400.0).nearest(60.0)
+        touch = core.step(theta, tension, ARM.muscle_lengths(theta, tension), DT)
+        if n > 50:
+            largest = max(largest, np.abs(touch.torque).max())
+            free = max(free, np.abs(torque - ARM.kinematics.holding_torque(theta)).max())
+    assert largest < 0.5 * free
+
+
+def test_a_joint_at_its_stop_says_nothing():
+    theta = THETA.copy()
+    theta[1] = ARM.upper[1]
+    tension, length = pulling(THETA)
+    touch = felt(observer(), theta, tension, length)
+    assert touch.torque[1] == 0.0 and np.abs(touch.torque).max() > 0.0
+
+
+def test_without_statistics_there_is_a_force_but_no_contact():
+    core = observer(time=0.0)
+    touch = felt(core, THETA, *pulling(THETA, (20.0, 0.0, 0.0)))
+    assert np.linalg.norm(touch.force) > 10.0 and np.isnan(touch.distance) and not touch.contact
+
+
+@pytest.mark.filterwarnings('ignore:invalid value')
+def test_a_message_that_is_no_number_is_forgotten():
+    core, (tension, length) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
+    touch = core.step(np.full(5, np.nan), tension, length, DT)
+    np.testing.assert_array_equal(touch.force, 0.0)
+    assert not touch.contact
+    np.testing.assert_allclose(felt(core, THETA, tension, length).force, [20.0, 0.0, 0.0], atol=1.0)
+
+
+@pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
+def test_it_is_stable_at_any_rate(dt):
+    core, (tension, length) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
+    for _ in range(200):
+        touch = core.step(THETA, tension, length, dt)
+    np.testing.assert_allclose(touch.force, [0.0, 20.0, 0.0], atol=1.0)
+
+
+class Known(ExactMae):
+    """An exact image that estimates what it is told."""
+
+    def estimate(self, *_):
+        return type('State', (), {'theta': self.theta})
+
+
+def test_statistics_are_of_motion_and_a_touch_hardly_counts():
+    core, mae = HealthyTorque(ARM), Known(ARM)
+    mae.touch = None
+    core.use(mae)
+    rng = np.random.default_rng(0)
+    tension, length = pulling(THETA)
+
+    def move(seconds, push=0.0):
+        for n in range(round(seconds / DT)):
+            mae.theta = THETA + 0.3 * np.sin(2.0 * n * DT)
+            wrong = push + rng.normal(0.0, 20.0, 10)
+            core.step(tension + wrong, length, DT)
+
+    mae.theta = THETA
+    for _ in range(100):
+        core.step(tension, length, DT)
+    assert core._time == 0.0  # it rested
+    move(LEAST_MOTION + 20.0)
+    healthy = np.sqrt(core._square)
+    move(1.0, push=500.0)
+    assert (np.sqrt(core._square) < 1.5 * healthy).all()
+
+
+def test_the_estimator_says_what_touches_the_arm(robot, mae):
+    statistics = TouchStatistics(np.zeros(6), np.full(2, 0.1), LEAST_MOTION)
+    core, theta = Estimator(robot), 0.5 * (robot.lower + robot.upper)
+    core.use(replace(mae, touch=statistics))
+    tension, length = pulling(theta, (10.0, 0.0, 10.0), robot)
+    for n in range(100):
+        estimate = core.step(tension, length, n * DT, n * DT)
+    assert estimate.touch.contact
+    values = core.report(1.0).values
+    assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
+    core.use(mae)
+    core.step(tension, length, 1.0, 1.0)
+    assert core.report(1.0).values['contact'] == 'not calibrated'
