@@ -9,4 +9,5 @@ NAMES = (
     'simulation',
     'loss_change',
     'body_change',
+    'robustness',
 )
