@@ -78,7 +78,7 @@ ABLATED = {
     'joint sensors': ('joint_zero', 'joint_bend', 'backlash'),
     'delays': ('delay', 'jitter', 'dropouts'),
 }
-QUICK = 'joint sensors', 'friction'
+QUICK = ('friction',)
 
 
 def measure(study: Study, seed: int) -> Measured:
