@@ -5,7 +5,7 @@
     replace(Effects(), hysteresis=0.0)   one effect off; all else stays as it was drawn
     NONE                                 a body as its description or its file has it
 
-An individual has between 2/3 and 4/3 of a size, or a normal deviation with that spread (σ). The
+An individual has between 3/4 and all of a size, or a normal deviation with that spread (σ). The
 sources of the sizes are in doc/design.md.
 """
 
@@ -25,39 +25,39 @@ class Effects:
 
     # Mechanics of the body
     attachment: float = 0.0105  # σ of each coordinate of each route point [m]
-    heads: float = 0.4  # share of the postures in which a bone's head bends a wire
-    slip_over: float = 0.005  # jump of a wire that slips over a ridge, in 5 % of its postures [m]
-    give: float = 3.5e-5  # how far a route point moves under its load [m/N]
-    joint_friction: float = 0.02  # of each joint, share of the largest torque of the arm's weight
+    kinks: float = 0.01  # how much longer bones' heads and other muscles make a wire's way [m]
+    slip_over: float = 0.0057  # jump of a wire that slips over a ridge, in 5 % of its postures [m]
+    give: float = 5e-5  # how far a route point moves under its load [m/N]
+    joint_friction: float = 0.02  # share of a joint's largest load by weight and muscles at T_bias
     links: float = 0.0  # in units of σ = 5 mm, 2° of axes, 15 % of masses, 20 mm of their centres
     # Elastic units of rubber
     stiffness: float = 0.4  # at most this share more or less than the data sheet's
     laws: float = 1.0  # share of the muscles with another law than the data sheet's
-    hysteresis: float = 0.15  # width of the loop, share of the elongation
-    creep: float = 0.04  # per decade of time, share of the elongation
+    hysteresis: float = 0.2  # width of the loop, share of the elongation
+    creep: float = 0.05  # per decade of time, share of the elongation
     # Wires
     recovery: float = (
-        0.4  # share of the stretch that comes late: 3/4 in 40 minutes, the rest in 12 h
+        0.45  # share of the stretch that comes late: 3/4 in 40 minutes, the rest in 12 h
     )
-    bedding: float = 0.003  # how much longer a wire gets in its first hours [m]
-    knot: float = 0.003  # slip of one knot, once [m]
-    guide_friction: float = 0.25  # relative loss along the route in a posture at mid-range
-    stiction: float = 0.3  # how much more at the start of a motion
+    bedding: float = 0.005  # how much longer a wire gets in its first hours [m]
+    knot: float = 0.0034  # slip of one knot, once [m]
+    guide_friction: float = 0.4  # relative loss along the route in a posture at mid-range
+    stiction: float = 0.34  # how much more at the start of a motion
     # Sensors
     tension_gain: float = 0.05  # σ
     tension_zero: float = 5.0  # σ [N]
-    tension_bend: float = 0.015  # non-linearity, share of the full scale
-    tension_drift: float = 0.15  # of the zero by heat [N/K]
-    spool_gain: float = 0.035  # radius of the spool
-    spool_layer: float = 0.075  # by how much the second layer of wire is wider
-    eccentricity: float = 0.0005  # of the spool [m]
-    spool_slip: float = 0.001  # of the wire on its spool, once in five hours [m]
+    tension_bend: float = 0.02  # non-linearity, share of the full scale
+    tension_drift: float = 0.2  # of the zero by heat [N/K]
+    spool_gain: float = 0.05  # radius of the spool
+    spool_layer: float = 0.1  # by how much the second layer of wire is wider
+    eccentricity: float = 0.0008  # of the spool [m]
+    spool_slip: float = 0.0011  # of the wire on its spool, once in five hours [m]
     length_drift: float = 0.001  # σ [m/h]
     joint_zero: float = np.radians(2.0)  # σ [rad]
     joint_bend: float = 0.01  # non-linearity, share of the joint's range
-    backlash: float = np.radians(0.65)  # of the joint sensor's gear [rad]
+    backlash: float = np.radians(1.0)  # of the joint sensor's gear [rad]
     # Messages
-    delay: float = 0.0125  # of joint angles, and of lengths and tensions [s]
+    delay: float = 0.02  # of joint angles, and of lengths and tensions [s]
     jitter: float = 0.005  # range of the delay [s]
     dropouts: float = 0.001  # share of the messages of each module that do not come
 
@@ -80,7 +80,7 @@ class Draw:
         return float(getattr(self.sizes, name)) * self.rng(name).normal(size=shape)
 
     def about(self, name: str, count: int, signed: bool = False) -> Array:
-        """Return `count` values from 2/3 to 4/3 of an effect's size; signed: of either sign."""
+        """Return `count` values from 3/4 to all of an effect's size; signed: of either sign."""
         rng = self.rng(name)
-        value: Array = getattr(self.sizes, name) * rng.uniform(2.0 / 3.0, 4.0 / 3.0, count)
+        value: Array = getattr(self.sizes, name) * rng.uniform(0.75, 1.0, count)
         return value * rng.choice([-1.0, 1.0], count) if signed else value

@@ -124,6 +124,8 @@ class ForeignArm(Arm):
         data = self._data = mujoco.MjData(model)
         self.individual = body = ForeignBody(robot, copy.copy(model), draw)
         super().__init__(robot, seed, body.length_bias)
+        if file is None:
+            self._rub()
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
         self._hand = model.body(mjcf.HAND).id
@@ -145,6 +147,16 @@ class ForeignArm(Arm):
         self._control = np.array([model.actuator(name).id for name in robot.muscles])
         self._history = np.zeros((HISTORY, robot.joint_count + 3 * muscles))
         self.reset()
+
+    def _rub(self) -> None:
+        """Let joints rub, each by its own load."""
+        robot, draw, body = self.robot, self._draw, self.individual
+        theta = robot.random_postures(200, draw.rng('load'))
+        pulls = np.abs(body.muscle_jacobian(theta)) * robot.tension.bias[:, None]
+        weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
+        load = weight + pulls.sum(axis=1).max(axis=0)
+        joints = [self._model.joint(name).dofadr[0] for name in robot.joints]
+        self._model.dof_frictionloss[joints] = load * draw.about('joint_friction', len(joints))
 
     def _make_guides(self) -> Guides:
         model, data, tendons, sites = self._model, self._data, self.individual.tendons, []

@@ -7,6 +7,7 @@ tendons; the actuators of a file are left out.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,18 @@ from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.kinematics import JointPoses
+from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.links`
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
-THICKEST_HEAD = 0.045  # [m]
-POSTURES = 300  # in which heads are fitted
+THICKEST = 0.045  # [m] radius of a bone's head or a muscle
+POSTURES = 300  # in which they are fitted
 HAND = 'hand of the emulator'
+
+Place = tuple[int, Array]  # joint, and where in its frame [m]
+Obstacle = tuple[int, Array, Array]  # the same of its middle, and its axis
 
 mujoco.set_mju_user_warning(lambda _: None)  # by default it writes a file where it was started
 
@@ -39,8 +43,6 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
     spec.compiler.boundmass = 1e-6  # of links that weigh nothing
-    weight = np.abs(kin.holding_torque(robot.random_postures(200, draw.rng('weight')))).max()
-    friction = weight * draw.about('joint_friction', robot.joint_count)
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies = [spec.worldbody]
     for i in range(1, model.njoints):
@@ -60,7 +62,6 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
         if name in robot.joints:
             k = robot.joints.index(name)
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
-            joint.frictionloss = friction[k]
         else:
             coupling, data = robot.description.couplings[name], np.zeros(11)
             data[:2] = coupling.offset, coupling.ratio
@@ -77,15 +78,16 @@ def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
     """Add the wires: route points that are off, what is described to wrap round, and heads."""
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
+    bellies = _bellies(robot)
     for muscle, route in zip(robot.muscles, robot.description.routes):
-        tendon, before = spec.add_tendon(name=muscle), list[tuple[int, Array]]()
+        tendon, before = spec.add_tendon(name=muscle), list[Place]()
         for n, item in enumerate(route):
             joint, at = kin.placement(item.link)
             place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
             if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
                 # Described ones are a little off as well.
-                radius = item.radius * (rng.uniform(0.9, 1.1) if draw.sizes.heads > 0.0 else 1.0)
+                radius = item.radius * (rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0)
                 _add_round(bodies[joint], name, place, axis, radius)
                 if item.side is not None:
                     side = f'{name} side'
@@ -94,42 +96,76 @@ def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
                 before = []
                 continue
             here = joint, place + draw.sizes.attachment * off.normal(size=3)
-            share, cylinder = draw.sizes.heads * rng.uniform(0.8, 1.2), rng.uniform() < 0.5
-            for last in before if share > 0.0 else ():
-                carrier, axis, radius = _head(robot, poses, [last, here], share, cylinder)
+            kink, cylinder = draw.sizes.kinks * rng.uniform(0.75, 1.0), rng.uniform() < 0.5
+            for last in before if kink > 0.0 else ():
+                others = [belly for owner, belly in bellies if owner != muscle]
+                ends = last, here
+                carrier, mid, axis, radius = _obstacle(kin, poses, ends, others, kink, cylinder)
                 if radius > 1e-3:
-                    _add_round(bodies[carrier], f'{name} head', np.zeros(3), axis, radius)
-                    tendon.wrap_geom(f'{name} head', '')
+                    shape = mid, axis if cylinder else None, radius
+                    _add_round(bodies[carrier], f'{name} kink', *shape)
+                    tendon.wrap_geom(f'{name} kink', '')
             bodies[joint].add_site(name=name, pos=here[1])
             tendon.wrap_site(name)
             before = [here]
 
 
-def _head(
-    robot: Robot, poses: JointPoses, ends: list[tuple[int, Array]], share: float, cylinder: bool
-) -> tuple[int, Array | None, float]:
-    """Return joint, axis (None: a sphere) and radius [m] of the bone's head that a wire passes.
+def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
+    """Return the middle of each run of each muscle and how it lies, where joints are mid-range."""
+    kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
+    poses = kin.joint_poses(0.5 * (robot.lower + robot.upper)[None])
+    turn, origin = poses.rotation[0], poses.translation[0]
+    for muscle, route in zip(robot.muscles, robot.description.routes):
+        placed = [
+            (joint, at.act(item.xyz)) for item in route for joint, at in [kin.placement(item.link)]
+        ]
+        for (joint, place), (other, end) in pairwise(placed):
+            end = turn[joint].T @ (turn[other] @ end + origin[other] - origin[joint])
+            line = (end - place) / max(float(np.linalg.norm(end - place)), 1e-9)
+            bellies.append((muscle, (joint, 0.5 * (place + end), line)))
+    return bellies
 
-    It stands at the joint between its two ends that the straight line is nearest to, and touches
-    the line in a `share` of the postures. A wire may slip over it to its other side.
+
+def _obstacle(
+    kin: Kinematics,
+    poses: JointPoses,
+    ends: tuple[Place, Place],
+    others: list[Obstacle],
+    kink: float,
+    cylinder: bool,
+) -> tuple[int, Array, Array, float]:
+    """Return what a wire is bent by between two ends, with its radius [m]; 0: by nothing.
+
+    It is the head of a bone at a joint between them, or another muscle's belly: what can make its
+    way longer by `kink` [m] in one of the postures, or by most. A wire may slip over it to its
+    other side.
     """
-    kin, best, head = robot.kinematics, np.inf, (0, None, 0.0)
     between = kin.hangs_on[ends[0][0]] ^ kin.hangs_on[ends[1][0]]
-    for joint in np.flatnonzero(between & ~kin.prismatic):
-        away = []
-        for carrier, place in ends:
-            place = poses.rotation[:, carrier] @ place + poses.translation[:, carrier]
-            axis, offset = poses.axis[:, joint], place - poses.translation[:, joint]
-            along = np.sum(offset * axis, axis=1, keepdims=True) * axis
-            away.append(offset - along if cylinder else offset)
-        line = away[1] - away[0]
-        at = -np.sum(away[0] * line, axis=1) / np.maximum(np.sum(line * line, axis=1), 1e-12)
-        distance = np.linalg.norm(away[0] + np.clip(at, 0.0, 1.0)[:, None] * line, axis=1)
-        if np.median(distance) < best:
-            best, least = np.median(distance), min(np.linalg.norm(a, axis=1).min() for a in away)
-            radius = min(float(np.quantile(distance, min(share, 1.0))), 0.8 * least, THICKEST_HEAD)
-            head = int(joint), kin.local_axis[joint] if cylinder else None, radius
-    return head
+    joints = np.flatnonzero(between & ~kin.prismatic)
+    heads = [(int(joint), np.zeros(3), kin.local_axis[joint]) for joint in joints]
+    best, most = (0, np.zeros(3), np.zeros(3), 0.0), 0.0
+    for carrier, middle, axis in [*heads, *others] if heads else ():
+        turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
+        away = [poses.rotation[:, c] @ at + poses.translation[:, c] - origin for c, at in ends]
+        local = [np.einsum('nji,nj->ni', turn, each) - middle for each in away]
+        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder it winds as on a screw
+        local = [each - cylinder * np.outer(each @ axis, axis) for each in local]
+        apart = [np.linalg.norm(each, axis=1) for each in local]
+        radius = np.linspace(0.0, min(0.8 * min(map(np.min, apart)), THICKEST), 30)[:, None]
+        cosine = np.sum(local[0] * local[1], axis=1) / np.maximum(apart[0] * apart[1], 1e-12)
+        touching = np.arccos(np.clip(cosine, -1.0, 1.0))
+        way = np.zeros_like(radius)
+        for each in apart:
+            touching = touching - np.arccos(radius / np.maximum(each, 1e-12))
+            way = way + np.sqrt(each**2 - radius**2)
+        # Two straight runs that touch it, and the arc between them.
+        bent = np.hypot(way + radius * touching, along)
+        straight = np.hypot(np.linalg.norm(local[1] - local[0], axis=1), along)
+        longer = np.max(np.where(touching > 0.0, bent - straight, 0.0), axis=1)
+        if min(longer[-1], kink) > most + 1e-4:
+            most = min(longer[-1], kink)
+            best = carrier, middle, axis, float(np.interp(kink, longer, radius[:, 0]))
+    return best
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:

@@ -10,4 +10,5 @@ NAMES = (
     'loss_change',
     'body_change',
     'motion',
+    'robustness',
 )

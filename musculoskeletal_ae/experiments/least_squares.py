@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint angles from one message (T, l) by weighted least squares on a body model.
 
-    min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² σ_T²)
+    min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² (σ_T² + (μ_m T_m)²))
 
 With the true routes and elastic constants this is the oracle that no estimator can be expected to
 beat: friction is taken as zero and the sensors' bias is unknown. With the geometric model it is the
@@ -40,6 +40,7 @@ class LeastSquares:
     length_at_zero: Array  # l_abs(0) [m], (M,)
     elastic: SeriesElastic
     tension_noise: float = TENSION_NOISE  # [N]; without it all muscles have one weight
+    friction: Array | float = 0.0  # μ (M,), where it is known how much each wire rubs
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M), started at mid-range."""
@@ -47,7 +48,8 @@ class LeastSquares:
         theta = np.tile(0.5 * (lower + upper), (len(tension), 1))
         absolute = self.length_at_zero + self.lengths(theta, np.zeros_like(tension))
         compliance = self.elastic.compliance(absolute, tension)
-        weight = 1.0 / (LENGTH_NOISE**2 + (compliance * self.tension_noise) ** 2)
+        variance = self.tension_noise**2 + (self.friction * tension) ** 2
+        weight = 1.0 / (LENGTH_NOISE**2 + compliance**2 * variance)
         damping = np.full(len(tension), DAMPING)
         residual = length - self.lengths(theta, tension)
         cost = np.sum(weight * residual**2, axis=1)
@@ -68,9 +70,9 @@ class LeastSquares:
             damping = np.clip(np.where(better, damping * 0.3, damping * 10.0), 1e-6, 1e6)
         return theta
 
-    def error(self, recording: Recording) -> float:
-        """Return the mean error on every tenth message [rad]."""
-        part = recording.part(EVERY)
+    def error(self, recording: Recording, rows: slice = EVERY) -> float:
+        """Return the mean error on some messages, by default every tenth [rad]."""
+        part = recording.part(rows)
         return mean_error(self.estimate(part.tension, part.length), part.theta)
 
 

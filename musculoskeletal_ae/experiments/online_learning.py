@@ -17,6 +17,7 @@ and noise, friction taken as zero.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -154,6 +155,7 @@ def measure(study: Study, seed: int) -> Measured:
     pupil = Learner(study.robot, study.network(None, 'paper'), 'paper', seed)
     follow(pupil, zip(*study.stream(seed, 'exploring'), strict=True), held_out)
     numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
+    study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 
 

@@ -95,6 +95,8 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [row[key] for row in rows if key in row]
         if isinstance(first, Mapping):
             result[key] = _mean(values)
+        elif None in values:
+            result[key] = None
         elif isinstance(first, str):
             result[key] = first if len(set(values)) == 1 else sorted(set(values))
         elif key in TOTALS:
@@ -118,10 +120,11 @@ def rounded(value: Any) -> Any:
 
 
 def table(results: Results) -> list[Cells]:
-    """Return the lines of the results table."""
+    """Return the lines of the results table, of the experiments that were run."""
     return [
-        row.cells(results.get(name, {}))
+        row.cells(results[name])
         for name, experiment in EXPERIMENTS.items()
+        if name in results
         for row in experiment.rows
     ]
 

@@ -61,6 +61,10 @@ class Study:
         """Return the file of a network: initial (None), or learned on an individual."""
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
+    def numbers_file(self, seed: int) -> Path:
+        """Return the file of what `online_learning` measured of an individual."""
+        return self.folder / f'online_learning_{seed}.json'
+
     def network(self, seed: int | None, preset: str = '') -> Mae:
         """Return a network: initial (None), or learned on an individual."""
         return checkpoint.load(self.network_file(preset or self.preset, seed), self.robot)

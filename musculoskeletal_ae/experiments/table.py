@@ -58,8 +58,8 @@ class Row(NamedTuple):
 def _at(result: Mapping[str, Any], key: str) -> float | None:
     value: Any = result
     for part in key.split('.'):
-        value = value.get(part, {})
-    return None if value == {} else float(value)
+        value = (value or {}).get(part, {})
+    return None if value in ({}, None) else float(value)
 
 
 def individuals(seeds: Sequence[int]) -> str:

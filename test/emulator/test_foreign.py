@@ -135,7 +135,7 @@ def test_rubber_creeps_as_much_in_every_decade_of_time(robot):
 
 
 def test_friction_grows_with_the_bends_of_the_wire(robot):
-    arm = ForeignArm(robot, 1, replace(NONE, heads=0.4, guide_friction=0.25))
+    arm = ForeignArm(robot, 1, replace(NONE, kinks=0.0065, guide_friction=0.25))
     bends, losses = [], []
     for theta in (robot.lower, robot.upper):
         arm.reset(theta)
@@ -150,6 +150,32 @@ def test_friction_grows_with_the_bends_of_the_wire(robot):
     assert bent.any()
     steeper = (losses[1] - losses[0]) * (bends[1] - bends[0])
     assert np.all(steeper[bent] > 0.0)
+
+
+def test_heads_and_other_muscles_make_some_ways_longer_by_about_the_size():
+    robot = Robot.load('musashi_left_arm')
+    theta = robot.random_postures(400, np.random.default_rng(2))
+    straight, kinked = (
+        ForeignArm(robot, 3, replace(NONE, kinks=kinks)).individual.absolute_lengths(theta)
+        for kinks in (0.0, 0.01)
+    )
+    longer = kinked - straight
+    assert longer.min() > -1e-9
+    most = longer.max(axis=0)
+    # A route of several runs has several; some cannot be bent so much.
+    assert np.median(most) > 0.004
+    assert np.all(most < 0.035)
+    assert np.mean(longer < 1e-6) > 0.3  # a wire that is free of them is straight
+
+
+def test_each_joint_rubs_by_its_own_load():
+    robot = Robot.load('musashi_left_arm')
+    arm = ForeignArm(robot, 1, replace(NONE, joint_friction=0.02))
+    friction = np.array([arm._model.joint(name).frictionloss[0] for name in robot.joints])
+    theta = robot.random_postures(500, np.random.default_rng(3))
+    weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
+    assert np.all(friction > 0.01 * weight)
+    assert friction[4] < 0.5 * friction[:2].min()  # the yaw of the elbow carries little
 
 
 def test_a_users_model_plays_the_robot(imported):

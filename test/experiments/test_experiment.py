@@ -29,7 +29,12 @@ KEYS = {
     'loss_change': '',
     'body_change': '',
     'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m',
+    'robustness': 'kin foreign ablation_rad',
 }
+REALITY = (
+    'before_rad after_rad paper_after_rad oracle_rad informed_oracle_rad frozen_after_rad '
+    'samples_to_halve'
+)
 METHODS = ('geometric', 'first', 'second', 'proposed', 'second_paper', 'proposed_paper')
 
 
@@ -81,6 +86,19 @@ def test_control_has_every_method_of_the_paper(quick):
     content = result(quick, 'control')
     for method in METHODS:
         assert {'error_rad', 'error_var', 'tension_n'} <= set(content[method])
+
+
+def test_robustness_has_both_bodies_and_says_why_there_is_no_frozen_learner(quick):
+    content = result(quick, 'robustness')
+    for reality in ('kin', 'foreign'):
+        assert set(REALITY.split()) <= set(content[reality])
+        assert content[reality]['frozen_after_rad'] is None
+    assert 'quick' in content['frozen']
+    # Sensors and friction of the first body are all that is wrong with it beside its geometry.
+    kin = content['kin']
+    assert kin['informed_oracle_rad'] < min(kin['oracle_rad'], kin['least_squares_rad'])
+    assert content['kin']['after_rad'] == result(quick, 'online_learning')['after_rad']
+    assert content['foreign']['after_rad'] != content['kin']['after_rad']
 
 
 @pytest.mark.parametrize('name', EXPERIMENTS)

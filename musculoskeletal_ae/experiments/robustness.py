@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robustness.
+
+Paper. The body that was learned is a real one; what is wrong with it is not known.
+
+Here. Both bodies, each explored by the default network and by preset paper as in online learning:
+`kin`, which differs from its model in what the learner fits, and `foreign`, whose mechanics are
+foreign too. "Frozen" is the learner before it was changed for the foreign body, taught by the same
+messages. Oracle: least squares on one message with the true routes and elastic constants. The
+informed oracle also knows the errors of the tension and length sensors, and how much each wire
+rubs; neither knows what a message does not tell: which way a wire slid, loops, creep, drift. The
+ablation leaves out some effects of the foreign body, the rest of the individual staying as it is.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+from shutil import copyfile
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import FOREIGN, KIN
+from musculoskeletal_ae.emulator.wires import GUIDES, load_cell, spooled
+from musculoskeletal_ae.experiments import online_learning, plots
+from musculoskeletal_ae.experiments.least_squares import EVERY, nominal, oracle
+from musculoskeletal_ae.experiments.recording import (
+    HELD_OUT_STREAM,
+    Recording,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.table import NOTHING, Row
+from musculoskeletal_ae.presets import PRESETS
+
+REALITIES = KIN, FOREIGN
+FROZEN = '86c8dfc'  # the commit
+#: reads the recordings below folders; prints what its learner is left with after each
+FROZEN_RUN = """
+import sys
+import numpy as np
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+directory, seed, *folders = sys.argv[1:]
+robot = Robot.load(directory)
+initial = initial_mae(robot, 'default').mae
+for folder in folders:
+    learner = Learner(robot, initial, 'default', int(seed))
+    kept = np.load(f'{folder}/exploring_{seed}.npz')
+    for n, (theta, length, tension) in enumerate(zip(*(kept[f'arr_{i}'] for i in (1, 2, 3)))):
+        learner.step(0.01 * n, theta, tension, length)
+    truth, _, length, tension, _ = np.load(f'{folder}/held_out_{seed}.npz').values()
+    off = learner.mae.estimate(tension, length).theta - truth
+    print('frozen', np.linalg.norm(off, axis=1).mean())
+"""
+#: what the ablation leaves out
+ABLATED = {
+    'route points': ('attachment',),
+    'kinks, slip-over': ('kinks', 'slip_over'),
+    'give': ('give',),
+    'friction': ('guide_friction', 'stiction', 'joint_friction'),
+    'spring laws': ('stiffness', 'laws'),
+    'hysteresis': ('hysteresis',),
+    'creep, late stretch': ('creep', 'recovery', 'bedding', 'knot'),
+    'tension sensors': ('tension_gain', 'tension_zero', 'tension_bend', 'tension_drift'),
+    'spools': ('spool_gain', 'spool_layer', 'eccentricity', 'spool_slip', 'length_drift'),
+    'joint sensors': ('joint_zero', 'joint_bend', 'backlash'),
+    'delays': ('delay', 'jitter', 'dropouts'),
+}
+QUICK = ('friction',)
+
+
+def measure(study: Study, seed: int) -> Measured:
+    """Measure an individual of each body; the ablation is of the first one."""
+    parts = {reality: _learned(study, seed, reality) for reality in REALITIES}
+    numbers: dict[str, Any] = {at: _numbers(part, seed) for at, part in parts.items()}
+    frozen, why = _frozen(study, seed, [part.folder for part in parts.values()])
+    for reality, error in zip(REALITIES, frozen, strict=True):
+        numbers[reality]['frozen_after_rad'] = error
+    numbers |= {'frozen': why} if why else {}
+    if seed == study.seeds[0]:
+        numbers['ablation_rad'] = {
+            name: _without(parts[FOREIGN], seed, effects)
+            for name, effects in ABLATED.items()
+            if name in QUICK or not study.quick
+        }
+    return Measured(numbers, {})
+
+
+def _learned(study: Study, seed: int, reality: str) -> Study:
+    """Return where an individual of a reality was learned, after learning it if need be."""
+    if reality == study.reality:
+        return study
+    part = replace(study, reality=reality, folder=study.folder / reality)
+    part.folder.mkdir(exist_ok=True)
+    for preset in PRESETS:
+        copyfile(study.network_file(preset, None), part.network_file(preset, None))
+    online_learning.measure(part, seed)
+    return part
+
+
+def _numbers(study: Study, seed: int) -> dict[str, Any]:
+    held_out = study.stream(seed, 'held_out')
+    kept = json.loads(study.numbers_file(seed).read_text(encoding='utf-8'))
+    names = 'before_rad', 'after_rad', 'paper_before_rad', 'paper_after_rad', 'oracle_rad'
+    return {name: kept[name] for name in (*names, 'samples_to_halve') if name in kept} | {
+        'least_squares_rad': nominal(study.robot).error(held_out),
+        'informed_oracle_rad': _informed(study.arm(seed), held_out),
+    }
+
+
+def _informed(arm: Any, recording: Recording) -> float:
+    """Return the error of least squares that knows an arm's sensors and friction [rad]."""
+    body, part = arm.individual, recording.part(EVERY)
+    if (wires := getattr(arm, 'wires', None)) is None:
+        pull = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain
+        length, friction = part.length - body.length_bias, body.cable_friction
+    else:
+        # Sensors the other way round, by table.
+        every = range(arm.robot.muscle_count)
+        t, x = np.linspace(0.0, 2.0 * arm.robot.tension.max.max(), 2000), np.linspace(-1, 1, 20001)
+        pull, length = np.empty_like(part.tension), np.empty_like(part.length)
+        for m in every:
+            cells = [load_cell(wires, m, each, 25.0) for each in t]
+            pull[:, m] = np.interp(part.tension[:, m], cells, t)
+            length[:, m] = np.interp(part.length[:, m], [spooled(wires, m, each) for each in x], x)
+        friction = wires.friction * (GUIDES + arm._memory.bend)
+    estimator = replace(oracle(arm.robot, body), friction=friction)
+    return estimator.error(part._replace(tension=pull, length=length), np.s_[:])
+
+
+def _frozen(study: Study, seed: int, folders: list[Path]) -> tuple[list[float | None], str]:
+    """Return what the frozen learner is left with, or why that is not known."""
+    nothing: list[float | None] = [None] * len(folders)
+    if study.quick:
+        return nothing, 'the frozen learner is left out of a quick run'
+    here = Path(__file__).parent
+    try:
+        git = ['git', '-C']
+        root = _output([*git, here, 'rev-parse', '--show-toplevel']).decode().strip()
+        archive = _output([*git, root, 'archive', '--format=tar', FROZEN, 'musculoskeletal_ae'])
+    except (OSError, subprocess.CalledProcessError) as error:
+        return nothing, f'no frozen learner: commit {FROZEN} is not at hand ({error})'
+    with TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        tar.extractall(folder, filter='data')
+        arguments = study.robot.description.directory.resolve(), str(seed), *folders
+        said = _output([sys.executable, '-c', FROZEN_RUN, *arguments], cwd=folder)
+    return [float(line.split()[1]) for line in said.splitlines() if line.startswith(b'frozen')], ''
+
+
+def _output(command: list[Any], cwd: str | None = None) -> bytes:
+    environment = {**os.environ, 'PYTHONPATH': cwd} if cwd else None
+    options: dict[str, Any] = {'capture_output': True, 'cwd': cwd, 'env': environment}
+    return bytes(subprocess.run(command, check=True, **options).stdout)  # noqa: S603
+
+
+def _without(study: Study, seed: int, effects: tuple[str, ...]) -> float:
+    """Return what learning is left with where an individual lacks some effects [rad]."""
+    from musculoskeletal_ae.emulator.effects import Effects
+    from musculoskeletal_ae.emulator.foreign import ForeignArm
+
+    def arm() -> Arm:
+        return ForeignArm(study.robot, seed, replace(Effects(), **dict.fromkeys(effects, 0.0)))
+
+    held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
+    learner, loop = online_learning.beginner(study, arm(), seed, study.preset)
+    stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
+    online_learning.follow(learner, stream, held_out)
+    return estimation_error(learner.mae, held_out)
+
+
+ESTIMATES = {
+    'least_squares_rad': 'least squares, geometric model',
+    'before_rad': 'before learning',
+    'paper_after_rad': 'preset paper',
+    'frozen_after_rad': 'frozen learner',
+    'after_rad': 'learned',
+    'oracle_rad': 'oracle',
+    'informed_oracle_rad': 'informed oracle',
+}
+
+
+def robustness(_: Study, rows: Rows) -> Plot:
+    """Draw the errors of all estimators on both bodies."""
+    figure, (panel,) = plots.new_figure(11.0, 4.6)
+    for n, (reality, colour) in enumerate(zip(REALITIES, plots.WHEN.values(), strict=True)):
+        said = [row.numbers[reality] for row in rows.values()]
+        values = [
+            np.mean([np.nan if each[key] is None else each[key] for each in said])
+            for key in ESTIMATES
+        ]
+        at = np.arange(len(values)) + 0.4 * (n - 0.5)
+        bars = panel.bar(at, values, 0.36, color=colour, label=f'reality: {reality}')
+        labels = ['none' if np.isnan(value) else f'{value:.3f}' for value in values]
+        panel.bar_label(bars, labels, fontsize=8)
+    panel.set_xticks(range(len(ESTIMATES)), ESTIMATES.values(), rotation=15)
+    plots.tidy(panel, '', 'mean error, held-out motion [rad]', legend='above')
+    return figure, 'Errors on the motion never used for learning, means over individuals.'
+
+
+def ablation(_: Study, rows: Rows) -> Plot:
+    """Draw what learning is left with where the foreign body lacks some effects."""
+    seed, (numbers, _traces) = first(rows)
+    figure, (panel,) = plots.new_figure(11.0, 4.6)
+    without = numbers.get('ablation_rad', {})
+    names = sorted(without, key=without.__getitem__)
+    bars = panel.barh(names, [without[name] for name in names], color=plots.AFTER)
+    panel.bar_label(bars, fmt='%.3f', fontsize=9, label_type='center', color='white')
+    whole = numbers[FOREIGN]['after_rad']
+    panel.axvline(whole, color=plots.MARK, ls=':', label=f'with all effects: {whole:.3f} rad')
+    plots.tidy(panel, 'mean error after learning [rad]', 'without', legend='above')
+    return figure, (
+        f'The foreign body with some effects left out, individual {seed}: the shorter the bar, the '
+        'more those effects matter.'
+    )
+
+
+ROWS = tuple(
+    row
+    for reality, name in zip(REALITIES, ('first', 'second'), strict=True)
+    for row in (
+        Row(f'{name} body: estimate before learning [rad]', NOTHING,
+            f'{reality}.paper_before_rad', f'{reality}.before_rad', f'{reality}.oracle_rad'),
+        Row(f'{name} body: estimate after learning [rad]', '0.186',
+            f'{reality}.paper_after_rad', f'{reality}.after_rad', f'{reality}.oracle_rad'),
+        Row(f'{name} body: the frozen learner; bound: informed oracle [rad]', NOTHING,
+            '', f'{reality}.frozen_after_rad', f'{reality}.informed_oracle_rad'),
+        Row(f'{name} body: least squares on the geometric model [rad]', NOTHING,
+            '', f'{reality}.least_squares_rad'),
+        Row(f'{name} body: samples until the error is halved', NOTHING,
+            '', f'{reality}.samples_to_halve', digits=0),
+    )
+)  # fmt: skip
+EXPERIMENT = Experiment(__doc__, measure, (robustness, ablation), 40.0, ROWS)
