@@ -15,6 +15,12 @@ along the path (inverse dynamics). A wire that is pulled out drags its winch alo
 can help; "winches" is the same beside the least T with that drag. To settle: the time from a target
 under `proposed` until the arm stays within 0.05 rad of it. The circles, of 10 cm, are random ones
 that can be reached; the hand's position is sent by target_pose, 50 times a second, at 0.1 m/s.
+
+Touch. The hand is pushed in random directions, by 10 to 50 N, at rest in random postures that can
+be held and while the arm explores. `wrench_error` is |‖F_est‖ − ‖F‖| / ‖F‖ after a second; a push
+that drives joints against their stops, which then bear a part of it, counts like any other. Then an
+hour of healthy exploration, spread over the individuals, in which every contact is a false one. In
+method `float` the arm is left alone, and pushed by 15 to 20 N.
 """
 
 from __future__ import annotations
@@ -35,7 +41,7 @@ from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments import plots, touch
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, times
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.experiments.table import NOTHING, Row
@@ -229,8 +235,8 @@ def measure(study: Study, seed: int) -> Measured:
         off = [np.linalg.norm(true - wanted, axis=1).mean() for wanted, true in laps]
         numbers['hand_circle_m'] = float(np.mean(off))
     traces['laps'] = laps
-    # wrench_error and false_contacts: contact, see issue.
-    return Measured(numbers, traces)
+    felt = touch.measure(study, seed)
+    return Measured(numbers | felt.numbers, traces | felt.traces)
 
 
 def _said(runs: list[Followed]) -> dict[str, float]:
@@ -293,5 +299,12 @@ ROWS = (
     Row('‖T‖ of motions beside the least with the winches’ drag [ratio]', NOTHING, '',
         'tension_ratio_winches', '', None, 2),
     Row('circles of 10 cm by `target_pose` at 0.1 m/s [m]', NOTHING, '', 'hand_circle_m', '', 0.01),
+    Row('force of pushes, 10 to 50 N, error [share]', NOTHING, '', 'wrench_error', '', 0.2),
+    Row('their direction, error [degrees]', NOTHING, '', 'wrench_error_deg', '', 15.0, 1),
+    Row('time until a collision in motion is noticed, median [s]', NOTHING, '', 'collision_s', '',
+        0.1, 2),
+    Row('false contacts in a healthy hour', NOTHING, '', 'false_contacts', '', 0.0, 0),
+    Row('drift of a floating arm in 30 s [rad]', NOTHING, '', 'float_drift_rad', '', 0.05),
 )  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (motion, motion_hand), 12.0, ROWS)
+PLOTS = motion, motion_hand, touch.forces
+EXPERIMENT = Experiment(__doc__, measure, PLOTS, 16.0, ROWS)

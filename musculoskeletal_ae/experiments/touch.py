@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Touch: what the estimator says of pushes, and what an arm does that a hand moves.
-
-Paper. Not part of it.
-
-Here. The hand is pushed in random directions, by 10 to 50 N, at rest in random postures that can be
-held and while the arm explores. `wrench_error` is |‖F_est‖ − ‖F‖| / ‖F‖ after a second; a push that
-drives joints against their stops, which then bear a part of it, counts like any other (`…_free…`:
-without those). Then an hour of healthy exploration, spread over the individuals, in which every
-contact is a false one. In method `float` the arm is left alone, and pushed by 15 to 20 N.
-"""
+"""Touch, a part of the experiment `motion`: pushes that are felt, and an arm that a hand moves."""
 
 from __future__ import annotations
 
@@ -84,7 +75,7 @@ class Push(NamedTuple):
 def measure(study: Study, seed: int) -> Measured:
     """Push an individual that has learned, at rest, in motion and afloat."""
     robot, rng = study.robot, np.random.default_rng([seed, TOUCH_STREAM])
-    settings, share = Settings(first_duration=2.0), 0.1 if study.quick else 1.0
+    settings, share = Settings(first_duration=2.0), 0.02 if study.quick else 1.0
     loop = FeelingLoop(study.arm(seed), study.network(seed), settings, TOUCH_STREAM + seed)
 
     def count(whole: float) -> int:

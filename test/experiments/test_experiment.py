@@ -28,7 +28,8 @@ KEYS = {
     'simulation': 'before_rad after_rad before_n after_n frictionless_rad',
     'loss_change': '',
     'body_change': '',
-    'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m',
+    'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m '
+    'wrench_error false_contacts',
     'robustness': 'kin foreign ablation_rad',
 }
 REALITY = (
