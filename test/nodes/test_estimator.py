@@ -74,7 +74,8 @@ def test_estimates_come_by_name_and_near_the_truth(estimator, arm26, healthy):
     length, tension = np.reshape(restored.data, (2, 6))
     np.testing.assert_allclose(length, healthy.data[:6], atol=0.01)
     np.testing.assert_allclose(tension, 60.0, atol=20.0)
-    assert np.isfinite(estimator.received['anomaly'][-1].data)
+    values_of_a = estimator.received['anomaly']
+    assert np.isfinite(estimator.wait(lambda: values_of_a, 'A')[-1].data)
     detected = estimator.received['anomaly_detected']
     estimator.wait(lambda: detected, 'the latched decision')
     assert detected[0].data is False
