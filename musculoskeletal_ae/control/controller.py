@@ -178,9 +178,8 @@ class Controller:
             with suppress(MessageError):  # not ready: then by a ramp, once it is
                 planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
                 clamped = self.clamped
-                self._follow(planned)
-                self.motion.exert(effort)
-                self.posture.effort, self.clamped = effort, clamped
+                self._follow(planned, effort=effort)
+                self.clamped = clamped
                 return
         self._starts |= self.posture.exploring or self._follows
         self._follows = False
@@ -244,7 +243,7 @@ class Controller:
         robot = self._robot
         return Setpoint.resting(np.clip(self._estimate, robot.lower, robot.upper))
 
-    def _follow(self, planned: Trajectory, delay: float = 0.0) -> None:
+    def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
         if not self._follows or self._starts:
             self.explore(False)
             self.motion.start()
@@ -253,9 +252,9 @@ class Controller:
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
         try:
             self.motion.follow(planned, delay)
+            self.motion.exert(np.zeros(self._robot.joint_count) if effort is None else effort)
         except Exception as error:  # noqa: BLE001 (as in `step`)
             self.stop(f'fault of control: {type(error).__name__}: {error}')
-        self.motion.effort = np.zeros(self._robot.joint_count)
         self.posture.theta, self.posture.effort = planned.end, self.motion.effort
 
     # -- what is asked --------------------------------------------------------------------------

@@ -26,7 +26,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import msc_compensation
-from musculoskeletal_ae.control.posture import CORRECTION, Ramp, RestFeedback
+from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFeedback
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
@@ -99,6 +99,7 @@ class MotionControl:
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._blend: Ramp | None = None
         self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
+        self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
         self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
         self.start()
 
@@ -110,7 +111,7 @@ class MotionControl:
         touch = getattr(mae, 'touch', None)
         known = np.full(self._robot.muscle_count, FRICTION) if touch is None else touch.friction
         self._friction = known
-        self._resting = self._blend = None
+        self._plan_anew()
 
     def start(self) -> None:
         """Go on from what something else commanded."""
@@ -134,13 +135,20 @@ class MotionControl:
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
         if self._resting is not None:  # on the way, one goes over to the next by itself
-            self._feedback.relief = np.zeros(self._robot.muscle_count)
-            self._resting = self._blend = None
+            self._plan_anew()
 
     def exert(self, effort: Array) -> None:
         """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
-        if effort.any():
-            self.effort, self._resting, self._blend = effort, None, None
+        if (effort != self.effort).any():
+            self.effort = effort
+            self._plan_anew()
+
+    def _plan_anew(self) -> None:
+        """Go over from the last command to another without a jump; at rest, settle again."""
+        if self._resting is not None and self.trajectory is not None:
+            self.time = min(self.time, self.trajectory.duration)
+            self._feedback.relief = np.zeros(self._robot.muscle_count)
+        self._resting = self._blend = None
 
     @property
     def moving(self) -> bool:
@@ -169,6 +177,9 @@ class MotionControl:
             if self.next[1] <= 0.0:
                 trajectory = self.next[0]
                 self._begin(trajectory, -self.next[1])
+        if np.abs(limit - self._limit).max() > REPLAN:
+            self._limit = limit
+            self._plan_anew()
         if self._resting is None:
             self.desired = trajectory.sample(self.time)
         self.error = self.desired.theta - theta

@@ -38,10 +38,14 @@ def test_a_trajectory_is_followed_and_its_state_said_and_a_wrong_one_moves_nothi
         arm.says('following a trajectory')
         arm.says('holding')
         arm.goes_to(goal, within=0.3)
-    state = graph.next('controller_state')
+
+    def arrived():
+        state = graph.next('controller_state')
+        return state if np.allclose(state.points[0].positions, THERE) else None
+
+    state = graph.wait(arrived, 'the last desired posture')
     assert tuple(state.joint_names) == robot.joints
     desired, feedback, error = (np.array(point.positions) for point in state.points)
-    np.testing.assert_allclose(desired, THERE)
     np.testing.assert_allclose(desired - feedback, error, atol=1e-12)
     assert state.points[0].time_from_start.sec >= 1
     # 0.1 s is the longest step that control takes after a pause.
