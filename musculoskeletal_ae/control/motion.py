@@ -45,6 +45,7 @@ BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
 TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
+LACKING = 0.05  # [N·m] of torque
 LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
 LARGEST_LAG = 0.1  # [s]
 
@@ -235,7 +236,8 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     """Return how many times longer a trajectory has to take, so that the winches can follow.
 
     Looked at are moments `SPACING` [s] apart, fewer of a long one; friction, which turns round in
-    a moment, is left out.
+    a moment, is left out, and so are moments at which the muscles lack torque: there tensions jump
+    from one compromise to another, however slowly.
     """
     slower, bias, limit = 1.0, robot.tension.bias, robot.tension.limit
     for _ in range(PLANS):
@@ -246,10 +248,13 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
         pulls = np.broadcast_to(bias, (len(time), len(bias)))
         jacobian = mae.muscle_jacobian(at.theta, pulls)
         motion = map(robot.kinematics.inverse_dynamics, *at)
-        pulls = np.array([least_tension(g, t, bias, limit)[0] for g, t in zip(jacobian, motion)])
+        plans = [least_tension(g, t, bias, limit) for g, t in zip(jacobian, motion)]
+        pulls, missing = (np.array(part) for part in zip(*plans))
         command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
-        fastest = np.abs(np.diff(command, axis=0)).max() * count / tried.duration
-        needed = fastest / (SHARE * settings.rate_limit)
+        change = np.abs(np.diff(command, axis=0)).max(axis=1)
+        lacking = np.abs(missing).max(axis=1) > LACKING
+        change[lacking[1:] | lacking[:-1]] = 0.0
+        needed = change.max() * count / tried.duration / (SHARE * settings.rate_limit)
         if needed <= 1.0:
             break
         slower = min(slower * (1.02 * needed), SLOWNESS)
