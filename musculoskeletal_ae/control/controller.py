@@ -120,7 +120,7 @@ class Controller:
         self.posture.settings = self.torque.settings = self.safety.settings = settings
         self.motion.settings = settings
         if settings.method != before.method and not self.posture.exploring:
-            self._starts = True
+            self._starts, self._follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
             self.posture.start()
 
@@ -154,7 +154,8 @@ class Controller:
         """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
         self.safety.shift(less)
         self._plausibility = Plausibility(self._robot)
-        self._starts |= known != self.safety.zeroed or bool(less.any())
+        if known != self.safety.zeroed or less.any():
+            self._starts, self._follows = True, False
         self.safety.zeroed = known
         self.gentle.start()
 
@@ -266,7 +267,7 @@ class Controller:
         if wanted != self.posture.exploring:
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
-            self._starts = True
+            self._starts, self._follows = True, False
         return ''
 
     def stop(self, cause: str) -> None:
@@ -478,8 +479,11 @@ class Controller:
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
         planned = np.minimum(self.limit, self._robot.tension.limit)
+        if self._starts and self._follows:  # after a pause: on from where it was
+            self._starts = False
+            self.motion.start()
         if self._starts:
-            self._starts = self._follows = False
+            self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
