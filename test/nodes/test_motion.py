@@ -52,11 +52,13 @@ def test_a_trajectory_is_followed_and_its_state_said_and_a_wrong_one_moves_nothi
     # 0.1 s is the longest step that control takes after a pause.
     assert np.abs(np.diff(arm.sent(), axis=0)).max() <= RATE_LIMIT * 0.1 + 1e-9
     # One joint alone, then a message without points: the arm holds.
-    publisher.publish(trajectory(arm, [0.0], 20, [robot.joints[1]]))
+    publisher.publish(trajectory(arm, HERE[1:], 20, [robot.joints[1]]))
     arm.says('following a trajectory')
     publisher.publish(JointTrajectory())
     arm.says('holding')
-    assert abs(arm.controller.core.motion.desired.theta[1]) > 0.2
+    stopped = arm.controller.core.motion.desired.theta
+    assert stopped[0] == pytest.approx(THERE[0])
+    assert stopped[1] - HERE[1] > 0.2
 
 
 def test_a_hand_pose_is_reached_and_one_in_another_frame_refused(arm):
