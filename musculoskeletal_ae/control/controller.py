@@ -124,7 +124,7 @@ class Controller:
         if settings.method == 'float':
             self.explore(False)
         if settings.method != before.method and not self.posture.exploring:
-            self._starts = True
+            self._starts, self._follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
             self.posture.start()
 
@@ -158,7 +158,8 @@ class Controller:
         """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
         self.safety.shift(less)
         self._plausibility = Plausibility(self._robot)
-        self._starts |= known != self.safety.zeroed or bool(less.any())
+        if known != self.safety.zeroed or less.any():
+            self._starts, self._follows = True, False
         self.safety.zeroed = known
         self.gentle.start()
 
@@ -183,9 +184,8 @@ class Controller:
             with suppress(MessageError):  # not ready: then by a ramp, once it is
                 planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
                 clamped = self.clamped
-                self._follow(planned)
-                self.motion.exert(effort)
-                self.posture.effort, self.clamped = effort, clamped
+                self._follow(planned, effort=effort)
+                self.clamped = clamped
                 return
         self._starts |= self.posture.exploring or self._follows
         self._follows = False
@@ -254,7 +254,7 @@ class Controller:
         robot = self._robot
         return Setpoint.resting(np.clip(self._estimate, robot.lower, robot.upper))
 
-    def _follow(self, planned: Trajectory, delay: float = 0.0) -> None:
+    def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
         if not self._follows or self._starts:
             self.explore(False)
             self.motion.start()
@@ -263,9 +263,9 @@ class Controller:
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
         try:
             self.motion.follow(planned, delay)
+            self.motion.exert(np.zeros(self._robot.joint_count) if effort is None else effort)
         except Exception as error:  # noqa: BLE001 (as in `step`)
             self.stop(f'fault of control: {type(error).__name__}: {error}')
-        self.motion.effort = np.zeros(self._robot.joint_count)
         self.posture.theta, self.posture.effort = planned.end, self.motion.effort
 
     # -- what is asked --------------------------------------------------------------------------
@@ -279,7 +279,7 @@ class Controller:
         if wanted != self.posture.exploring:
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
-            self._starts = True
+            self._starts, self._follows = True, False
         return ''
 
     def stop(self, cause: str) -> None:
@@ -496,8 +496,11 @@ class Controller:
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
         planned = np.minimum(self.limit, self._robot.tension.limit)
+        if self._starts and self._follows:  # after a pause: on from where it was
+            self._starts = False
+            self.motion.start()
         if self._starts:
-            self._starts = self._follows = False
+            self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.
             kind, command = TENSION if in_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:

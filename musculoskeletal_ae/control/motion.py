@@ -26,7 +26,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import msc_compensation
-from musculoskeletal_ae.control.posture import CORRECTION, Ramp, RestFeedback
+from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFeedback
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
@@ -45,6 +45,7 @@ BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
 TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
+LACKING = 0.05  # [N·m] of torque
 LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
 LARGEST_LAG = 0.1  # [s]
 
@@ -99,6 +100,7 @@ class MotionControl:
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._blend: Ramp | None = None
         self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
+        self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
         self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
         self.start()
 
@@ -110,7 +112,7 @@ class MotionControl:
         touch = getattr(mae, 'touch', None)
         known = np.full(self._robot.muscle_count, FRICTION) if touch is None else touch.friction
         self._friction = known
-        self._resting = self._blend = None
+        self._plan_anew()
 
     def start(self) -> None:
         """Go on from what something else commanded."""
@@ -134,13 +136,20 @@ class MotionControl:
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
         if self._resting is not None:  # on the way, one goes over to the next by itself
-            self._feedback.relief = np.zeros(self._robot.muscle_count)
-            self._resting = self._blend = None
+            self._plan_anew()
 
     def exert(self, effort: Array) -> None:
         """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
-        if effort.any():
-            self.effort, self._resting, self._blend = effort, None, None
+        if (effort != self.effort).any():
+            self.effort = effort
+            self._plan_anew()
+
+    def _plan_anew(self) -> None:
+        """Go over from the last command to another without a jump; at rest, settle again."""
+        if self._resting is not None and self.trajectory is not None:
+            self.time = min(self.time, self.trajectory.duration)
+            self._feedback.relief = np.zeros(self._robot.muscle_count)
+        self._resting = self._blend = None
 
     @property
     def moving(self) -> bool:
@@ -169,6 +178,9 @@ class MotionControl:
             if self.next[1] <= 0.0:
                 trajectory = self.next[0]
                 self._begin(trajectory, -self.next[1])
+        if np.abs(limit - self._limit).max() > REPLAN:
+            self._limit = limit
+            self._plan_anew()
         if self._resting is None:
             self.desired = trajectory.sample(self.time)
         self.error = self.desired.theta - theta
@@ -224,7 +236,8 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     """Return how many times longer a trajectory has to take, so that the winches can follow.
 
     Looked at are moments `SPACING` [s] apart, fewer of a long one; friction, which turns round in
-    a moment, is left out.
+    a moment, is left out, and so are moments at which the muscles lack torque: there tensions jump
+    from one compromise to another, however slowly.
     """
     slower, bias, limit = 1.0, robot.tension.bias, robot.tension.limit
     for _ in range(PLANS):
@@ -235,10 +248,13 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
         pulls = np.broadcast_to(bias, (len(time), len(bias)))
         jacobian = mae.muscle_jacobian(at.theta, pulls)
         motion = map(robot.kinematics.inverse_dynamics, *at)
-        pulls = np.array([least_tension(g, t, bias, limit)[0] for g, t in zip(jacobian, motion)])
+        plans = [least_tension(g, t, bias, limit) for g, t in zip(jacobian, motion)]
+        pulls, missing = (np.array(part) for part in zip(*plans))
         command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
-        fastest = np.abs(np.diff(command, axis=0)).max() * count / tried.duration
-        needed = fastest / (SHARE * settings.rate_limit)
+        change = np.abs(np.diff(command, axis=0)).max(axis=1)
+        lacking = np.abs(missing).max(axis=1) > LACKING
+        change[lacking[1:] | lacking[:-1]] = 0.0
+        needed = change.max() * count / tried.duration / (SHARE * settings.rate_limit)
         if needed <= 1.0:
             break
         slower = min(slower * (1.02 * needed), SLOWNESS)

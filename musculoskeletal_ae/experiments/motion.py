@@ -203,7 +203,7 @@ def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
     mae, rng = study.network(seed), np.random.default_rng([seed, 0x307])
     robot = study.robot
-    count = 2 if study.quick else MOTIONS
+    count = 1 if study.quick else MOTIONS
     arm = study.arm(seed)
     postures = robot.random_postures(TRIES, rng)
     held = holdable_postures(robot, postures, count + 1, arm.individual.muscle_jacobian)

@@ -223,12 +223,12 @@ class Mae:
             weight, bias = last * std[own][:, None], last_bias * std[own] + mean[own]
             si_weight, si_bias = weight / scale[own][:, None], bias / scale[own]
             lengths = si_weight[-sizes[1] :], si_bias[-sizes[1] :]
-            for stacks, layer in (
+            for stacks, final in (
                 (leave, (si_weight, si_bias)),
                 (leave_length, lengths),
                 (leave_scaled, (weight, bias)),
             ):
-                stacks.append(Stack((*before, _transposed(*layer)), activation))
+                stacks.append(Stack((*before, _transposed(*final)), activation))
         all_columns = np.concatenate(columns)
         out = np.argsort(all_columns)
         out_length = np.argsort(np.concatenate([group.muscles for group in groups]))

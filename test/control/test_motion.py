@@ -126,6 +126,16 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
     np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
 
 
+def test_after_a_pause_of_the_controller_it_goes_on_from_where_it_was(bench):
+    bench.core.trajectory(points(OTHER))
+    sent = moved(bench, 50)
+    bench.now += 2.0
+    sent += moved(bench, 200)
+    assert bench.core.follows
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * 0.1 + 1e-9
+
+
 def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
