@@ -13,9 +13,8 @@ from setuptools import find_packages, setup
 from setuptools.command.install_scripts import install_scripts
 
 NAME = 'musculoskeletal_ae'
-NODES = [
-    'bringup_status', 'combined', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim',
-]  # fmt: skip
+NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
+COMBINED = ['combined']
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
 
@@ -80,6 +79,8 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     entry_points={
-        'console_scripts': [f'{name} = {NAME}.start:main' for name in NODES + ROS_TOOLS + TOOLS],
+        'console_scripts': [
+            f'{name} = {NAME}.start:main' for name in NODES + COMBINED + ROS_TOOLS + TOOLS
+        ],
     },
 )

@@ -94,6 +94,7 @@ class Controller:
         self._warm: Array | None = None  # their median [°C], (M,)
         self._estimate: Array | None = None
         self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
+        self.sent_at = 0.0  # when the last command went out; its user says so
         self._time = math.nan
         self._fresh = self._asleep = 0.0  # [s] of data since it was late; of own pauses
         self.pace = Pace()
@@ -433,6 +434,8 @@ class Controller:
 
         `time` is the messages' [s], that of the steady clock if it is not given.
         """
+        # What computing took is over when a command goes out: it may bring no change with it.
+        computing = max(self.sent_at - self.stepped_at, 0.0)
         dt, awake = self._elapsed(now, now if time is None else time)
         late, cause = self._late(now), self.present_cause(now)
         # Before the first command there is nothing to stop.
@@ -457,7 +460,8 @@ class Controller:
         limit = self.limit
         if not self.safety.zeroed:
             limit = np.minimum(limit, gentle_limit(self._robot))
-        command = self.safety.step(desired, limit, 0.0 if waits else dt, fresh)
+        passed = 0.0 if waits else max(dt - computing, 0.0)
+        command = self.safety.step(desired, limit, passed, fresh)
         if self.safety.cause and not self.safety.passing:
             self.explore(False)
         return command

@@ -15,8 +15,7 @@ along the path (inverse dynamics). A wire that is pulled out drags its winch alo
 can help; "winches" is the same beside the least T with that drag. To settle: the time from a target
 under `proposed` until the arm stays within 0.05 rad of it. The circles, of 10 cm, are random ones
 that can be reached; the hand's position is sent by target_pose, 50 times a second, at 0.1 m/s.
-
-Touch. The hand is pushed in random directions, by 10 to 50 N, at rest in random postures that can
+Touch: the hand is pushed in random directions, by 10 to 50 N, at rest in random postures that can
 be held and while the arm explores. `wrench_error` is |‖F_est‖ − ‖F‖| / ‖F‖ after a second; a push
 that drives joints against their stops, which then bear a part of it, counts like any other. Then an
 hour of healthy exploration, spread over the individuals, in which every contact is a false one. In

@@ -188,6 +188,7 @@ class Controller(Shell):
             value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
             message = array_message(value, 'muscle')
             self.publishers_of[command.kind].publish(message)
+            self.core.sent_at = time.monotonic()
             self.recording.heard(f'muscle_{command.kind}_command', message)
         if self.core.follows:
             self._publish_state()

@@ -319,7 +319,7 @@ def test_another_desired_stiffness_is_ramped_to_and_one_that_fits_no_joint_is_re
 
 
 def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm():
-    for method in METHODS:
+    for method in set(METHODS) - {'float'}:
         bench = Bench(method=method, first_duration=0.5)
         bench.target(REST)
         bench.step(60)

@@ -99,12 +99,15 @@ def test_inertia_is_no_force():
     assert largest < 0.5 * free
 
 
-def test_a_joint_at_its_stop_says_nothing():
-    theta = THETA.copy()
-    theta[1] = ARM.upper[1]
+def test_a_joint_at_its_stop_says_nothing_of_what_the_stop_bears():
     tension, length = pulling(THETA)
-    touch = felt(observer(), theta, tension, length)
-    assert touch.torque[1] == 0.0 and np.abs(touch.torque).max() > 0.0
+    torques = []
+    for joint in range(5):
+        for stop, away in ((ARM.upper, -1.0), (ARM.lower, 1.0)):
+            theta = THETA.copy()
+            theta[joint] = stop[joint]
+            torques.append(away * felt(observer(), theta, tension, length).torque[joint])
+    assert max(torques) == 0.0 and min(torques) < -0.1
 
 
 def test_without_statistics_there_is_a_force_but_no_contact():

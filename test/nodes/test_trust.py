@@ -126,6 +126,7 @@ def test_under_use_sim_time_the_ramp_follows_the_clock(graph, arm26, trained_fil
         Controller,
         robot='arm26',
         checkpoint=trained_file,
+        target_duration=0.0,
         first_duration=2.0,
         feedback_gain=0.0,
         max_age=1.0,
