@@ -189,7 +189,9 @@ class MotionControl:
             step = INTEGRAL * dt * self.error
             feedback.correction = np.clip(feedback.correction + step, -CORRECTION, CORRECTION)
             feedback.moving()
-            self._shift = feedback.correction + PROPORTIONAL * self.error
+            # Bounded too: an estimate that is wrong at once must not take the arm along.
+            shift = PROPORTIONAL * np.clip(self.error, -CORRECTION, CORRECTION)
+            self._shift = feedback.correction + shift
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
             command = self._held(mae, muscles.tension, limit, dt)

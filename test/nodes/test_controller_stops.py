@@ -167,7 +167,7 @@ def test_a_killed_learner_changes_nothing_but_its_diagnostics(moving):
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
     arm.kill(learner)
     arm.goes_to(THERE)
-    for node in ('controller', 'estimator', 'hardware_emulator'):
-        assert arm.state(node).level == 'ok', arm.state(node).message
+    for node in ('controller', 'estimator', 'hardware_emulator'):  # once it is at rest
+        arm.graph.wait(lambda node=node: arm.state(node).level == 'ok', f'{node} to be well')
     steps = np.abs(np.diff(arm.sent()[before:], axis=0)).max()
     assert steps <= RATE_LIMIT * LONGEST_STEP + 1e-9
