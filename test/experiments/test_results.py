@@ -84,7 +84,10 @@ def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
     monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(1))
     monkeypatch.setattr(online_learning, 'train_initial', train)
     assert experiment.main(f'all --robot arm26 --seeds 0,1 --out {tmp_path}'.split()) == 1
-    assert f'{[*runner.EXPERIMENTS][-1]} of individual 1: InfeasibleError in' in capsys.readouterr().err
+    assert (
+        f'{[*runner.EXPERIMENTS][-1]} of individual 1: InfeasibleError in'
+        in capsys.readouterr().err
+    )
     results = read(tmp_path)
     assert set(results) == set(runner.EXPERIMENTS)
     assert all(set(result['failed']) == {'0', '1'} for result in results.values())
