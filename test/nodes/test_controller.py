@@ -145,6 +145,12 @@ def test_a_hand_moves_a_floating_arm_and_the_estimator_feels_it(arm):
     pushes = graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
     arm.target(HERE)
     arm.goes_to(HERE)
+
+    def still():
+        postures = [arm.posture() for _ in range(20)]
+        return np.ptp(postures, axis=0).max() < 0.01
+
+    graph.wait(still, 'rest')
     assert graph.set_parameter('controller', 'method', 'float')[0]
     arm.says('floating')
     before = arm.posture()
