@@ -122,8 +122,9 @@ class Graph:
     def spin(self, seconds: float) -> None:
         """Handle messages for a while."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self.executor.spin_once(timeout_sec=left)
+        while time.monotonic() < end:
+            # At a timeout of its own each, rclpy would handle only the first entity that is ready.
+            self.executor.spin_once(timeout_sec=0.05)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Handle messages until a condition holds; fail with what was waited for."""
