@@ -62,7 +62,7 @@ def test_a_robot_nobody_saw_before_is_trained_brought_up_and_estimated(environme
     # The paper's network is trained in a few seconds.
     chosen = ['--preset', 'paper', '--duration', '8', '--seed', '3']
     run = bringup(environment, '--robot', str(robot), *chosen)
-    output, _ = run.process.communicate(timeout=300)
+    output, _ = run.process.communicate(timeout=600)
     assert run.process.returncode == 0, output
     lines = statuses(output)
     assert lines, output  # on a busy machine the sensors are heard late
@@ -156,10 +156,10 @@ def test_a_dead_node_is_named_and_nothing_is_left(environment):
 def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     recording = tmp_path / 'run'
     live = bringup(environment, '--robot', 'arm26', '--duration', '5', '--record', str(recording))
-    output, _ = live.process.communicate(timeout=300)
+    output, _ = live.process.communicate(timeout=600)
     assert live.process.returncode == 0, output
     played = bringup(environment, '--robot', 'arm26', '--bag', str(recording))
-    output, _ = played.process.communicate(timeout=300)
+    output, _ = played.process.communicate(timeout=600)
     assert played.process.returncode == 0, output
     assert len(statuses(output)) >= 3, output
     assert 'hardware_emulator' not in output and 'controller' not in output
@@ -227,7 +227,7 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
 
 def test_without_a_controller_nothing_moves_the_arm(environment):
     run = bringup(environment, '--robot', 'arm26', '--no-controller', '--duration', '3')
-    output, _ = run.process.communicate(timeout=300)
+    output, _ = run.process.communicate(timeout=600)
     assert run.process.returncode == 0, output
     assert 'starting hardware_emulator' in output and 'starting controller' not in output
 
@@ -240,7 +240,7 @@ def test_only_the_description_of_a_robot_says_which_network_it_needs(environment
     for text in ('one', 'two'):
         (robot / 'README.md').write_text(text)
         run = bringup(environment, '--robot', str(robot), '--preset', 'paper', '--duration', '1')
-        runs.append(run.process.communicate(timeout=300)[0])
+        runs.append(run.process.communicate(timeout=600)[0])
     assert 'training the MAE' in runs[0] and 'from an earlier run' in runs[1], runs
 
 
@@ -250,7 +250,7 @@ def test_a_namespace_that_is_in_use_is_refused_by_name(environment):
         if 'logs in' in line:
             break
     second = bringup(environment, '--robot', 'arm26', '--namespace', 'taken')
-    output, _ = second.process.communicate(timeout=300)
+    output, _ = second.process.communicate(timeout=600)
     assert second.process.returncode == 2
     assert "'/taken' is in use" in output and '--namespace' in output
     first.end(signal.SIGINT)
