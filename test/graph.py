@@ -135,7 +135,7 @@ class Graph:
                 status, output = dead[0].end()
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
-                raise AssertionError(f'waited {deadline:g} s in vain for {what}')
+                raise AssertionError(f'waited {deadline:g} s in vain for {what}; {self._told()}')
             self.executor.spin_once(timeout_sec=0.05)
         return value
 
@@ -155,6 +155,15 @@ class Graph:
                     values = {pair.key: pair.value for pair in status.values}
                     return Report(LEVELS[status.level], status.message, values)
         return Report('warn', 'not heard of', {})
+
+    def _told(self) -> str:
+        messages = self.received['/diagnostics'][-200:]
+        last = {
+            s.name: (s.message, {v.key: v.value for v in s.values})
+            for m in messages
+            for s in m.status
+        }
+        return '\n'.join(f'{name}: {said}' for name, said in last.items())
 
     def call(self, kind: type, service: str, request: Any = None) -> Any:
         """Call a service and return its response."""

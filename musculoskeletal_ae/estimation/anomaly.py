@@ -68,7 +68,8 @@ class AnomalyDetector:
         self.judges = True  # whether d and A decide; not while lengths are unknown
         self._statistics: AnomalyStatistics | None = None
         self._farthest = np.inf  # d, or A, of its threshold, where it is calibrated
-        #: [s] without tension, without winding in; l [m] when tension went, when it wound last
+        #: [s] without tension, without winding in; l [m] beyond what the posture explains when
+        #: tension went, and l when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
         self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._beyond = 0
@@ -169,13 +170,15 @@ class AnomalyDetector:
             demand = np.full(len(tension), bias)
         torn = (tension < SLACK * demand) & (demand >= bias)
         begins = torn & (self._torn == 0.0)
-        self._tight = np.where(begins, length, self._tight)
+        # What an arm that moves makes shorter is no slack.
+        beyond = length - self._robot.routes.relative_lengths(theta) if torn.any() else length
+        self._tight = np.where(begins, beyond, self._tight)
         self._torn = np.where(torn, self._torn + dt, 0.0)
         # It winds as long as every DEAD_TIME brings a new shortest length, by the slowest winch's.
         winds = begins | (length < self._wound - self.settings.slack_speed * DEAD_TIME)
         self._wound = np.where(winds, length, self._wound)
         self._stood = np.where(winds | ~torn, 0.0, self._stood + dt)
-        spent = length < self._tight - self.settings.slack_length
+        spent = beyond < self._tight - self.settings.slack_length
         gone = (self._stood >= DEAD_TIME - dt) | spent
         self._winds_slack = torn & ~gone
         dead = (self._torn >= DEAD_TIME) & gone

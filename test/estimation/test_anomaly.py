@@ -15,6 +15,7 @@ from musculoskeletal_ae.estimation.anomaly import (
     AnomalyDetector,
 )
 from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.mae.units import State
 
 DT = 0.01
 
@@ -106,6 +107,26 @@ def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):
     detector, verdicts = judge(mae)
     detector.commanded(tension=np.full(6, 0.5 * robot.tension.bias))
     assert not any(verdict.cause for verdict in verdicts(slack, 100))
+
+
+@pytest.mark.parametrize('moves', [True, False])
+def test_what_the_arm_s_own_motion_shortens_is_no_slack_wound_in(robot, mae, judge, moves):
+    detector, _ = judge(mae)
+    steps = round(1.6 * DEAD_TIME / DT)
+    theta = np.linspace(robot.lower, robot.upper, steps)
+    length = robot.routes.relative_lengths(theta)
+    shortest = int((length[-1] - length[0]).argmin())
+    length = length[:, shortest]
+    assert (np.diff(length) < 0.0).all() and length[0] - length[-1] > Detection().slack_length
+    tension, causes = np.full(6, 60.0), set()
+    tension[shortest] = 0.0
+    for n in range(steps):
+        at = theta[n] if moves else theta[0]
+        each = robot.muscle_lengths(at, tension)
+        each[shortest] = length[n]
+        detector.commanded(length=each - 0.01)
+        causes.add(detector.step(State(at, tension, each), tension, each, DT).cause)
+    assert causes == ({''} if moves else {'', 'no tension where the command demands it'})
 
 
 @pytest.mark.parametrize(

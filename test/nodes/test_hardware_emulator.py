@@ -28,6 +28,7 @@ def arm(graph):
     graph.listen(PoseStamped, 'marker_pose')
     graph.emulator = graph.host(HardwareEmulator, robot='arm26', seed=1)
     graph.next('muscle_states')
+    graph.next('joint_states')
     return graph
 
 
