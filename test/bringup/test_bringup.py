@@ -57,13 +57,20 @@ def statuses(output):
     return [match for line in output.splitlines() if (match := STATUS.match(line))]
 
 
-def test_a_robot_nobody_saw_before_is_trained_brought_up_and_estimated(environment, tmp_path):
+def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(environment, tmp_path):
     robot = write_robot(tmp_path / 'other')
+    with (robot / 'recording.bin').open('wb') as file:
+        file.truncate(2**42)  # to read it would take an hour
     # The paper's network is trained in a few seconds.
-    chosen = ['--preset', 'paper', '--duration', '8', '--seed', '3']
-    run = bringup(environment, '--robot', str(robot), *chosen)
+    chosen = ['--robot', str(robot), '--preset', 'paper', '--seed', '3']
+    run = bringup(environment, *chosen, '--duration', '1')
     output, _ = run.process.communicate(timeout=600)
-    assert run.process.returncode == 0, output
+    assert 'training the MAE' in output, output
+    # Only the description of a robot says which network it needs.
+    (robot / 'README.md').write_text('an arm')
+    run = bringup(environment, *chosen, '--duration', '8')
+    output, _ = run.process.communicate(timeout=600)
+    assert run.process.returncode == 0 and 'from an earlier run' in output, output
     lines = statuses(output)
     assert lines, output  # on a busy machine the sensors are heard late
     # Seeds 0 to 4: 0.08 to 0.30 rad. The middle of the joint range would be 0.58 rad off.
@@ -87,7 +94,7 @@ def test_two_arms_share_a_graph_one_learns_and_ctrl_c_ends_both_cleanly(environm
                 deadline=5 * DEADLINE,
             )
         learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
-        graph.wait(lambda: len(learned) > 10, 'ten updates of the network', 8 * DEADLINE)
+        graph.wait(lambda: len(learned) > 6, 'six updates of the network', 8 * DEADLINE)
         graph.spin(5.0)  # a status line is printed once a second
     finally:
         graph.processes.clear()
@@ -230,18 +237,6 @@ def test_without_a_controller_nothing_moves_the_arm(environment):
     output, _ = run.process.communicate(timeout=600)
     assert run.process.returncode == 0, output
     assert 'starting hardware_emulator' in output and 'starting controller' not in output
-
-
-def test_only_the_description_of_a_robot_says_which_network_it_needs(environment, tmp_path):
-    robot = write_robot(tmp_path / 'big')
-    with (robot / 'recording.bin').open('wb') as file:
-        file.truncate(2**42)  # to read it would take an hour
-    runs = []
-    for text in ('one', 'two'):
-        (robot / 'README.md').write_text(text)
-        run = bringup(environment, '--robot', str(robot), '--preset', 'paper', '--duration', '1')
-        runs.append(run.process.communicate(timeout=600)[0])
-    assert 'training the MAE' in runs[0] and 'from an earlier run' in runs[1], runs
 
 
 def test_a_namespace_that_is_in_use_is_refused_by_name(environment):
