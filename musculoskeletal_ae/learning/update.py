@@ -187,7 +187,7 @@ class BodyUpdater(Updater):
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
-        data = synthetic_samples(body, fit.noise, count, self._rng)
+        data = synthetic_samples(body, fit.noise, count, self._rng, seen)
         self._mix_in_real(data, seen, fit)
         loss_now = self._trainer.train(data, job.steps)
         return Update(
@@ -257,8 +257,16 @@ class TrainingData(NamedTuple):
     true: Array  # what the network is to restore
 
 
+#: share of the wires at rest, those of the nearest tensions, one of which says which way one slid
+NEAR = 0.05
+
+
 def synthetic_samples(
-    body: CorrectedBody, noise: Array, count: int, rng: np.random.Generator
+    body: CorrectedBody,
+    noise: Array,
+    count: int,
+    rng: np.random.Generator,
+    like: Observations | None = None,
 ) -> TrainingData:
     """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
 
@@ -267,13 +275,21 @@ def synthetic_samples(
     Which way each wire slid last, s_r, is not known to an estimator, so that the network sees
     lengths with the friction's and the sensors' scatter and is asked for those without: ② then
     learns to weigh muscles by how far their lengths can be trusted, as weighted least squares do.
+    The tension does tell something of it: muscle stiffness control has wound in what pulls more
+    than T_bias. So s_r is that of a wire with about this tension among the samples `like`.
     """
     robot = body.robot
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = _tensions(robot, count, rng)
-    # Mostly at either end of [−1, 1], where sliding leaves it.
-    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
+    if like is not None and like.known.any():
+        pull, slid = like.tension[like.known], like.direction[like.known]
+        order, reach = np.argsort(pull), max(1.0, 0.5 * NEAR * len(pull))
+        place = np.searchsorted(pull[order], tension) + rng.uniform(-reach, reach, shape)
+        direction = slid[order[np.clip(place, 0, len(pull) - 1).astype(int)]]
+    else:
+        # Mostly at either end of [−1, 1], where sliding leaves it.
+        direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     true, seen = State(theta, tension, length), State(theta, tension, scattered)

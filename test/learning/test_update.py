@@ -8,7 +8,12 @@ import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.training import Training
-from musculoskeletal_ae.learning.update import BodyUpdater, PaperUpdater, learned_steps
+from musculoskeletal_ae.learning.update import (
+    BodyUpdater,
+    PaperUpdater,
+    learned_steps,
+    synthetic_samples,
+)
 from musculoskeletal_ae.presets import PAPER
 
 from .conftest import Stage, drawn_body, job
@@ -55,6 +60,23 @@ def test_a_slipped_joint_sensor_reopens_no_muscle(arm26, initial, stage):
     update = updater.update(job(store, steps=1))
     assert update.changed == ()
     assert len(update.contradicted) > 1
+
+
+def test_the_tension_tells_which_way_a_wire_slid_as_it_did_among_the_samples(other_body, stage):
+    seen = stage.store(30).observations()
+    seen.direction[:] = np.where(seen.tension > 100.0, 1.0, -1.0)
+    tense, scatter = [], []
+    for like in (seen, None):
+        rng = np.random.default_rng(0)
+        data = synthetic_samples(other_body, np.zeros(6), 2000, rng, like)
+        tension = 200.0 * data.seen[:, 2:8]
+        # A wire that was wound in pulls less at its end, and is shorter by less: l is longer.
+        longer = np.sign(data.seen[:, 8:] - data.true[:, 8:])
+        longer *= np.sign([other_body.friction(m) for m in range(6)])
+        tense.append(longer[tension > 130.0].mean())
+        scatter.append(longer[tension < 70.0].mean())
+    assert tense[0] > 0.95 and scatter[0] < -0.95
+    assert abs(tense[1]) < 0.1 and abs(scatter[1]) < 0.1
 
 
 def test_preset_paper_takes_its_hundred_steps(arm26, initial, stage):
