@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of trust: how far healthy networks and messages are from them; which attacks are refused.
 
-    python -m bench gate [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 10]
+    python -m bench gate [--robot NAME|DIR] [--reality kin|foreign] [--seeds 0,1,…] [--minutes 10]
 
 For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
 minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
@@ -24,7 +24,8 @@ import torch
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.estimation.gate import FLOOR, LEAST_CUT, LIMITS, WORSE, Gate
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments.recording import (
@@ -185,11 +186,11 @@ class Spread:
             self.refused.append(f'{name}: {error}')
 
 
-def learned(robot: Robot, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
+def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
     """Let a learner learn of one individual, each of its checkpoints through a gate; the last."""
-    arm, gate = EmulatedArm(robot, seed), Gate(robot)
+    robot, gate = arm.robot, Gate(arm.robot)
 
-    def script(arm: EmulatedArm, time: float) -> None:
+    def script(arm: Arm, time: float) -> None:
         arm.set_payload(LOAD * (time // MINUTE % 2))
 
     stream = record(arm, driver, EXPLORATION_STREAM + seed, MINUTE * minutes, script)
@@ -221,6 +222,7 @@ def main(argv: list[str] | None = None) -> int:
         'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
     )
     parser.add_robot()
+    parser.add_reality()
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_minutes('duration of learning', 10.0)
     args = parser.parse_args(argv)
@@ -236,7 +238,8 @@ def main(argv: list[str] | None = None) -> int:
             spread.take(Gate(robot), mae, 'initial')
         for seed in args.seeds:
             for preset, mae in initial.items():
-                last = learned(robot, mae, initial['default'], seed, args.minutes, spread)
+                arm = make_arm(robot, seed, args.reality)
+                last = learned(arm, mae, initial['default'], seed, args.minutes, spread)
                 networks.append((f'individual {seed}, {preset}', last))
         print(f'{spread.count} healthy networks: largest of each measure, limit')
         for name, value in spread.most.items():
