@@ -6,10 +6,10 @@ A motor that warms its housing, which the surroundings cool (LINEAGE, arXiv 2407
     C₁ ċ₁ = k T² − (c₁ − c₂)/R₁,   C₂ ċ₂ = (c₁ − c₂)/R₁ − (c₂ − c_a)/R₂
 
 The housing's temperature c₂ is measured, the winding's c₁ is not. Only quotients of the constants
-tell in either: κ = k/C₂, τ₁ = R₁C₁, τ₂ = R₂C₂, ρ = C₁/C₂ and c_a. All but ρ are learned while the
+tell in either: κ = k/C₂, τ₁ = R₁C₁, τ₂ = R₂C₂, r = R₁/R₂ and c_a. All but r are learned while the
 arm moves, by an extended Kalman filter of c₁ − c₂, c₂, the logarithms of κ, τ₁ and τ₂, and c_a,
 each a random walk. From T² to c₂ the model is a gain and two poles, three numbers for four: one of
-them has to come from elsewhere, and an error of ρ is one of c₁ − c₂, in proportion.
+them has to come from elsewhere. With r it is the one in proportion to which c₁ − c₂ is off.
 
 The highest tension of a muscle is the one that, held for a time from now on, brings its winding to
 the highest temperature. Held there, it falls slowly to what can be held for good, so that control
@@ -27,7 +27,7 @@ HELD, MOMENT = 60.0, 5.0  # [s] ahead: of what is planned, and of what is never 
 EVERY, LONGEST = 1.0, 10.0  # [s] between two updates, and at most that one takes in
 JUMP = 5.0  # [°C] that no housing changes by in such a time: a sensor, or heat from elsewhere
 NOISE = 0.1  # [°C] of c₂'s mean over EVERY
-SHARE = 0.1  # ρ, of small motors
+RATIO = 0.4  # r; chosen: of small motors, with much spread
 # To begin with: a housing 80 °C above the air if T_limit is held for good; all chosen.
 RISE, WINDING_TIME, HOUSING_TIME, AIR = 80.0, 30.0, 800.0, 25.0
 #: standard deviations of c₁ − c₂, c₂ [°C], log κ, log τ₁, log τ₂, c_a [°C]: to begin with, and of
@@ -44,11 +44,12 @@ def flow(state: Array, square: Array, dt: float) -> Array:
     """Return states (6, ...) after dt [s] of a tension of so large a square [N²] (...)."""
     inner, outer, *logs, air = state
     kappa, winding, housing = np.exp(logs)
-    cooling, tau = (outer - air) / housing, winding / (1.0 + SHARE)
-    settled = tau * (kappa * square / SHARE + cooling)
+    share = winding / (housing * RATIO)  # C₁/C₂
+    cooling, tau = (outer - air) / housing, winding / (1.0 + share)
+    settled = tau * (kappa * square / share + cooling)
     gone = -np.expm1(-dt / tau)
     mean = settled * dt + (inner - settled) * tau * gone
-    after = outer + SHARE / winding * mean - cooling * dt
+    after = outer + share / winding * mean - cooling * dt
     return np.stack([inner + (settled - inner) * gone, after, *logs, air])
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.control.heat import HELD, LEARNED, MOMENT, SHARE, Heat, flow
+from musculoskeletal_ae.control.heat import HELD, LEARNED, MOMENT, RATIO, Heat, flow
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -52,7 +52,8 @@ class Motors:
 def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
     state = Heat(ROBOT)._state
     state[0], state[1] = 10.0, 50.0
-    (kappa, tau, slow), share = np.exp(state[2:5]), SHARE
+    kappa, tau, slow = np.exp(state[2:5])
+    share = tau / (slow * RATIO)
     winding, housing = 60.0, 50.0
     for _ in range(30_000):
         through = (winding - housing) / tau
