@@ -30,6 +30,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
+from musculoskeletal_ae.control.heat import Heat
 from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
 from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
@@ -82,8 +83,10 @@ class Controller:
         self.short = ''  # what the last pose of the hand was out of reach by
         self.floating = FloatControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
-        #: tension limit of each muscle, lowered by heat [N], (M,)
+        self.heat = Heat(robot)
+        #: tensions that heat allows each muscle for long, and for a moment [N], (M,)
         self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
+        self._most = self.limit
         self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
         self._mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
@@ -91,7 +94,6 @@ class Controller:
         self.gentle = GentleMotion(robot, seed)
         self._plausibility = Plausibility(robot)
         self._temperatures: deque[Array] = deque(maxlen=5)
-        self._warm: Array | None = None  # their median [°C], (M,)
         self._estimate: Array | None = None
         self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
         self.sent_at = 0.0  # when the last command went out; its user says so
@@ -141,10 +143,12 @@ class Controller:
         # While zeros are unknown a guess may make any length of them, and any posture.
         known = length if self.safety.zeroed else None
         self._plausibility.check_muscles(tension, known, temperature, now)
-        self._muscles_at = awake = now - self._asleep
+        awake = now - self._asleep
+        since = awake - self._muscles_at if self._muscles_at > -math.inf else 0.0
+        self._muscles_at = awake
         # NaN is not known, and no reason for anything.
         self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
-        self._warm = np.median(np.array(self._temperatures), axis=0)
+        self.heat.step(tension, np.median(np.array(self._temperatures), axis=0), since)
         over = self.safety.muscles(muscles).tension > self._overloads
         self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
 
@@ -332,9 +336,7 @@ class Controller:
         return ''
 
     def _overheat(self) -> str:
-        if self._warm is None:
-            return ''
-        now, bias = self._warm, self._robot.tension.bias
+        now, bias = np.nan_to_num(self.heat.core, nan=-np.inf), self._robot.tension.bias
         highest = self.settings.temperature_limit
         hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
         self._overheated = bool(hot or (self.limit <= bias).all())
@@ -380,7 +382,12 @@ class Controller:
             warnings.append('length zeros are unknown: the arm only explores, gently')
         if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
             warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')
-        limited = zip(robot.muscles, self.limit, robot.tension.max)
+        if np.isfinite(core := self.heat.core).any():
+            windings = (f'{n} {c:.0f} °C' for n, c in zip(robot.muscles, core))
+            values['temperature of windings'] = ', '.join(windings)
+        for m, how in self.heat.changed.items():
+            warnings.append(f'heat: {robot.muscles[m]} {how}')
+        limited = zip(robot.muscles, self.limit, robot.tension.limit)
         hot = {name: limit for name, limit, most in limited if limit < most}
         if hot:
             values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
@@ -457,7 +464,7 @@ class Controller:
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
         fresh = not late.startswith('muscle')
-        limit = self.limit
+        limit = self._most
         if not self.safety.zeroed:
             limit = np.minimum(limit, gentle_limit(self._robot))
         passed = 0.0 if waits else max(dt - computing, 0.0)
@@ -468,9 +475,10 @@ class Controller:
 
     def _limit_by_heat(self, dt: float) -> None:
         """Let no limit fall faster than the rate limit pays out."""
-        if self._warm is not None:
-            limit = safety.thermal_limit(self._robot, self._warm, self.settings.temperature_limit)
-            self.limit = np.maximum(limit, self.limit - self.safety.most_change(TENSION, dt))
+        held, most = self.heat.limits(self.settings.temperature_limit)
+        fall = self.safety.most_change(TENSION, dt)
+        self.limit = np.maximum(held, self.limit - fall)
+        self._most = np.maximum(most, self._most - fall)
 
     def _elapsed(self, now: float, time: float) -> tuple[float, float]:
         """Return how long this step is on the messages' clock, and on the steady one [s]."""

@@ -8,8 +8,8 @@ so the tension limit of a muscle is a length limit,
 
 which may pay a muscle out faster than the rate limit, if its tension is measured above
 tension.limit, and never winds it in. Readings are medians of the last three messages, so that a
-glitch of a sensor moves nothing. The limit of a muscle whose module runs hot falls smoothly from
-tension.max to T_bias, and no faster than the rate limit pays out.
+glitch of a sensor moves nothing. The limit of a muscle whose motor runs hot (`heat.py`) falls from
+tension.max to T_bias, no faster than the rate limit pays out.
 
 A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
 limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate. A stop
@@ -30,8 +30,6 @@ from musculoskeletal_ae.robot.robot import Robot
 
 LENGTH, TENSION = 'length', 'tension'
 
-# Width of the band below the highest temperature in which a muscle's tension limit falls.
-COOLING_BAND = 15.0  # [°C]
 #: [m] by which a true muscle, or its sensor, may be longer than the model's
 LENGTH_MARGIN = 0.03
 
@@ -49,17 +47,6 @@ class Muscles(NamedTuple):
     length: Array
     tension: Array
     temperature: Array
-
-
-def thermal_limit(robot: Robot, temperature: Array, highest: float) -> Array:
-    """Return each muscle's tension limit [N] (M,) for module temperatures [°C] (M,).
-
-    A smooth step from tension.max, at COOLING_BAND below `highest`, to T_bias at `highest`. −inf is
-    not known, and limits nothing.
-    """
-    share = np.clip((highest - temperature) / COOLING_BAND, 0.0, 1.0)
-    smooth = share * share * (3.0 - 2.0 * share)
-    return robot.tension.bias + smooth * (robot.tension.max - robot.tension.bias)
 
 
 def unchanging(robot: Robot, kind: str, muscles: Muscles) -> Command:

@@ -66,7 +66,11 @@ class Settings:
         0.5, 'how long a stop holds the last command; data back by then resumes', 's', 0.0, 60.0
     )
     temperature_limit: float = settable(
-        85.0, 'a module this hot pulls with T_bias only; 20 °C more stop the arm', '°C', 40.0, 200.0
+        85.0,
+        'highest of a winding, by which muscles are limited; 20 °C more stop the arm',
+        '°C',
+        40.0,
+        200.0,
     )
     overload_time: float = settable(
         20.0, 'a tension above tension.limit for this long stops the arm', 's', 0.1, 3600.0

@@ -174,7 +174,7 @@ def _wires_and_modules(
         muscle.tension[m] = muscle.end_tension[m] * math.exp(
             body.cable_friction[m] * muscle.sliding[m]
         )
-        heat(muscle, command, m)
+        heat(modules, muscle, command, m)
 
 
 @njit(cache=True)

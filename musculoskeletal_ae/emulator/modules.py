@@ -31,11 +31,12 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # Chosen, plausible for Musashi's (not public).
 RELEASE_RATE = 100.0  # [N/s] at which a module that went safe approaches T_bias
 MOTOR_GAIN = 0.004  # [m/s/N]
-# Heat: 200 N for good settles at 85 °C at the housing and 105 °C in the winding.
+# Heat: 200 N for good settles at 85 °C at the housing and 105 °C in the winding, of a mean module.
 AMBIENT = 25.0  # [°C]
 LOSS = 5.0e-4  # [W/N²]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
+HEAT_SPREAD = 0.15  # standard deviation of the logarithm of each of the five, as of elastic units
 
 # Sensors; chosen: noise is one standard deviation, then rounded to the
 # resolution, a power of two as a converter's counts are.
@@ -54,6 +55,11 @@ class Modules(NamedTuple):
     stiffness: Array  # K of muscle stiffness control [N/m]
     tension_bias: Array  # [N]
     tension_max: Array
+    loss: Array  # k [W/N²]
+    winding_capacity: Array  # C₁ [J/K]
+    housing_capacity: Array  # C₂
+    winding_resistance: Array  # R₁ [K/W]
+    housing_resistance: Array  # R₂
 
 
 class Command(NamedTuple):
@@ -116,13 +122,13 @@ def wind(
 
 
 @njit(cache=True)
-def heat(muscle: MuscleState, command: Command, m: int) -> None:
+def heat(modules: Modules, muscle: MuscleState, command: Command, m: int) -> None:
     """Warm module m by its tension for one step."""
-    inner = (muscle.winding[m] - muscle.housing[m]) / WINDING_RESISTANCE
-    outer = (muscle.housing[m] - AMBIENT) / HOUSING_RESISTANCE
-    loss = LOSS * muscle.tension[m] * muscle.tension[m]
-    muscle.winding[m] += STEP * (loss - inner) / WINDING_CAPACITY
-    muscle.housing[m] += STEP * (inner - outer) / HOUSING_CAPACITY
+    inner = (muscle.winding[m] - muscle.housing[m]) / modules.winding_resistance[m]
+    outer = (muscle.housing[m] - AMBIENT) / modules.housing_resistance[m]
+    loss = modules.loss[m] * muscle.tension[m] * muscle.tension[m]
+    muscle.winding[m] += STEP * (loss - inner) / modules.winding_capacity[m]
+    muscle.housing[m] += STEP * (inner - outer) / modules.housing_capacity[m]
     muscle.housing[m] = max(muscle.housing[m], command.hot[m])
 
 
@@ -162,6 +168,7 @@ class Arm(ABC):
         self.robot, self._length_bias = robot, length_bias
         self.command_timeout = command_timeout
         self._rng = np.random.default_rng([seed, 0x5E45])
+        self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))
         self._wrench = np.zeros(6)
         self._command = Command(
@@ -174,7 +181,10 @@ class Arm(ABC):
         """Return the constants, for lengths [m] (N, M) of postures and L_e at T_max [m] (M,)."""
         low, high = span.min(axis=0) - stretch - 0.05, span.max(axis=0) + 0.05
         tension = self.robot.tension
-        return Modules(low, high, self.robot.stiffness, tension.bias, tension.max)
+        mean = LOSS, WINDING_CAPACITY, HOUSING_CAPACITY, WINDING_RESISTANCE, HOUSING_RESISTANCE
+        spread = self._heat_rng.normal(0.0, HEAT_SPREAD, (5, self.robot.muscle_count))
+        warmth = np.array(mean)[:, None] * np.exp(spread)
+        return Modules(low, high, self.robot.stiffness, tension.bias, tension.max, *warmth)
 
     def reset(self, theta: Array | None = None) -> None:
         """Put the arm at rest at θ (default: hanging, θ = 0 within the limits), free, mended, cool.
@@ -221,6 +231,11 @@ class Arm(ABC):
     def tension(self) -> Array:
         """True muscle tensions at the modules [N], shape (M,)."""
         return self._muscle.tension.copy()
+
+    @property
+    def winding(self) -> Array:
+        """True temperatures of the motors' windings [°C], shape (M,)."""
+        return self._muscle.winding.copy()
 
     @property
     def broken(self) -> bool:

@@ -221,7 +221,7 @@ def wires_step(
         for i in range(TIMES.shape[0]):
             full = wires.creep[m] * max(0.0, x) if i < 4 else LATE[i - 4] * wires.late[m] * end
             memory.slow[m, i] += STEP / TIMES[i] * (full - memory.slow[m, i])
-        heat(muscle, command, m)
+        heat(modules, muscle, command, m)
         control[m] = -end
 
 

@@ -306,6 +306,9 @@ def _fit_muscle(
             residual, jacobian = linearised(at)
             break
     noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
+    if not used.all():  # a muscle that is learned anew is trusted no more than it is known
+        unknown = np.einsum('ni,ni->n', jacobian, np.linalg.solve(normal, jacobian.T).T)
+        noise = float(np.sqrt(noise**2 + unknown.mean()))
     return residual, noise, weight
 
 

@@ -86,6 +86,9 @@ class Learner:
         self.last_refused = ''
         self._state = None if directory is None else State(directory, robot)
         saved = None if self._state is None else self._state.load(self.samples)
+        # Samples without their network (damaged, or of the robot with a muscle less) bring as many
+        # updates as when they came.
+        self._owed = len(self.samples) if saved is None else 0
         if saved is not None and self._passes(saved):
             self._go_on_from(saved)
         elif mae is not None:
@@ -167,7 +170,7 @@ class Learner:
             and len(self.samples) >= self.training.preset.least_samples
             and self.training.ready
         ):
-            self._news, self._begun, self._forgot = False, now, False
+            self._news, self._begun, self._forgot = self.updates + 1 < self._owed, now, False
             seen, healthy = self.samples.observations(), self._healthy.healthy()
             self.training.submit(Job(seen, healthy, self._statistics_hold, self._steps))
         update = self.training.poll()

@@ -64,9 +64,6 @@ class State:
         self.trouble = ''  # why the disk is not in line with memory
         self._file = self.directory / FILE
         self._robot = robot
-        names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
-        self._seed = zlib.crc32(names.encode())  # of checksums: another robot's records do not fit
-        self._size = HEAD.size + 8 * (1 + robot.joint_count + 4 * robot.muscle_count)
         self._connection: sqlite3.Connection | None = None
         self._next_look = 0.0
         try:
@@ -119,7 +116,8 @@ class State:
     def load(self, samples: SampleStore) -> Mae | None:
         """Fill an empty store with the samples on disk and return the network, if there is one.
 
-        A file that is damaged or another robot's becomes a backup, and what can be used is used.
+        A file that is damaged or another robot's becomes a backup, and what can be used is used:
+        of a robot that had fewer muscles all samples, which say nothing about the others.
 
         Raises:
             StateError: If it can neither be used nor become a backup.
@@ -165,8 +163,13 @@ class State:
             problem = f'{self._file}: damaged ({error})'
             whole = read_start(self._file, old_state.LARGEST)
             places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
-            records = [whole[place : place + self._size] for place in places]
-        unpacked = filter(None, map(self._unpacked, records))
+            size = self._size(self._robot.muscles)
+            records = [whole[place : place + size] for place in places]
+        muscles = self._muscles_of(data)
+        if added := [name for name in self._robot.muscles if name not in muscles]:
+            problem = problem or f'{self._file}: of the robot without {", ".join(added)}; its '
+            problem += 'samples are learned from'
+        unpacked = (read for record in records if (read := self._unpacked(record, muscles)))
         for number, sample, known in sorted(unpacked, key=lambda record: record[0]):
             if number in samples.numbers:  # an older copy: what was forgotten stays so
                 samples.known[samples.numbers.index(number)] &= known
@@ -176,20 +179,46 @@ class State:
             problem = f'{self._file}: made by a learner of other joints and muscles'
         return problem, data
 
+    def _muscles_of(self, data: bytes | None) -> tuple[str, ...]:
+        """Return the muscles of the robot whose state this is, as its checkpoint says: no others.
+
+        They may be fewer than this robot's, which had muscles added.
+        """
+        with suppress(CheckpointError):
+            mae = checkpoints.from_bytes(data or b'')
+            if mae.joints == self._robot.joints and set(mae.muscles) < set(self._robot.muscles):
+                return mae.muscles
+        return self._robot.muscles
+
+    def _size(self, muscles: tuple[str, ...]) -> int:
+        return HEAD.size + 8 * (1 + self._robot.joint_count + 4 * len(muscles))
+
+    def _checksum(self, values: bytes, muscles: tuple[str, ...]) -> int:
+        # Another robot's records do not fit.
+        names = json.dumps({'joints': self._robot.joints, 'muscles': muscles})
+        return zlib.crc32(values, zlib.crc32(names.encode()))
+
     def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
         values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
-        return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
+        return HEAD.pack(MARK, self._checksum(values, self._robot.muscles)) + values
 
-    def _unpacked(self, record: object) -> tuple[int, Sample, Bools] | None:
-        if not isinstance(record, bytes) or len(record) != self._size:
+    def _unpacked(
+        self, record: object, muscles: tuple[str, ...]
+    ) -> tuple[int, Sample, Bools] | None:
+        if not isinstance(record, bytes) or len(record) != self._size(muscles):
             return None
         values, (_, checksum) = record[HEAD.size :], HEAD.unpack_from(record)
-        if checksum != zlib.crc32(values, self._seed):
+        if checksum != self._checksum(values, muscles):
             return None
-        joints, muscles = self._robot.joint_count, self._robot.muscle_count
-        ends = [1, *(1 + joints + muscles * np.arange(4))]
-        number, *parts, known = np.split(np.frombuffer(values).copy(), ends)
-        return int(number[0]), Sample(*parts), known > 0.5
+        robot = self._robot
+        ends = [1, *(1 + robot.joint_count + len(muscles) * np.arange(4))]
+        number, theta, *parts = np.split(np.frombuffer(values).copy(), ends)
+        # What is not known of an added muscle is as the geometric model has it.
+        bias, nothing = robot.tension.bias, np.zeros(robot.muscle_count)
+        whole = np.stack([bias, robot.muscle_lengths(theta, bias), nothing, nothing])
+        whole[:, list(robot.muscle_indices(muscles))] = parts
+        tension, length, direction, known = whole
+        return int(number[0]), Sample(theta, tension, length, direction), known > 0.5
 
     # -- writing --------------------------------------------------------------------------------
 

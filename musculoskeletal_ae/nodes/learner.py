@@ -58,6 +58,7 @@ class Learner(Shell):
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
+        serve(self, Trigger, 'learner/relearn', self._relearn)
         self.create_timer(POLL, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
@@ -94,6 +95,15 @@ class Learner(Shell):
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)
         return 'learning' if request.data else 'stopped; samples and network stay'
+
+    def _relearn(self, _: Trigger.Request) -> str:
+        names = self.parameter('relearn_muscles')
+        if not names:
+            raise MusculoskeletalError(
+                '`relearn_muscles` names no muscle; set that parameter first'
+            )
+        self.core.relearn(self.robot.muscle_indices(names))
+        return f'learning anew: {", ".join(names)}; the others stay'
 
     def _poll(self) -> None:
         data = self.core.poll(self._now())

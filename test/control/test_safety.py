@@ -9,14 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.safety import (
-    COOLING_BAND,
     LENGTH,
     LENGTH_MARGIN,
     TENSION,
     Command,
     Muscles,
     SafetyFilter,
-    thermal_limit,
     unchanging,
 )
 from musculoskeletal_ae.control.settings import Settings
@@ -166,13 +164,3 @@ def test_the_unchanging_command_makes_msc_pull_as_the_muscles_do(tension, length
     pull = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
     np.testing.assert_allclose(pull, np.maximum(tension, BIAS))
     np.testing.assert_array_equal(unchanging(ROBOT, TENSION, now).value, np.maximum(tension, BIAS))
-
-
-def test_heat_lowers_the_limit_smoothly_from_max_to_bias_and_never_below():
-    temperature = np.linspace(20.0, 120.0, 2001)[:, None]
-    limit = thermal_limit(ROBOT, temperature, 85.0)[:, 0]
-    assert limit[0] == MAX
-    assert (limit[temperature[:, 0] >= 85.0] == BIAS).all()
-    assert (limit[temperature[:, 0] <= 85.0 - COOLING_BAND] == MAX).all()
-    assert (np.diff(limit) <= 0.0).all()
-    assert np.abs(np.diff(limit)).max() <= 1.5 * (MAX - BIAS) / COOLING_BAND * 0.05 + 1e-9

@@ -163,23 +163,21 @@ def test_a_length_offset_shifts_the_reading_and_with_it_the_arm(robot, nominal):
     assert np.abs(arm.theta - before).max() > 0.01
 
 
-def test_heat_settles_where_the_two_resistors_say(robot):
+def test_heat_settles_where_the_two_resistors_of_each_module_say(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
-    muscle = arm._muscle
+    muscle, module = arm._muscle, arm._wound
+    assert np.ptp(module.loss) > 0.1 * modules.LOSS  # no two modules are the same
     for _ in range(20):  # the housing's time constant is minutes: start it near its end
-        muscle.housing[:] = modules.AMBIENT + modules.HOUSING_RESISTANCE * (
-            modules.LOSS * muscle.tension**2
+        muscle.housing[:] = modules.AMBIENT + module.housing_resistance * (
+            module.loss * muscle.tension**2
         )
-        arm.command_tension(np.full(robot.muscle_count, 100.0))
         for _ in range(20):
             arm.command_tension(np.full(robot.muscle_count, 100.0))
             arm.step(0.4)
-    heat = modules.LOSS * 100.0**2
-    housing = modules.AMBIENT + heat * modules.HOUSING_RESISTANCE
+    heat = module.loss * 100.0**2
+    housing = modules.AMBIENT + heat * module.housing_resistance
     np.testing.assert_allclose(muscle.housing, housing, rtol=0.03)
-    np.testing.assert_allclose(
-        muscle.winding, housing + heat * modules.WINDING_RESISTANCE, rtol=0.03
-    )
+    np.testing.assert_allclose(arm.winding, housing + heat * module.winding_resistance, rtol=0.03)
 
 
 def test_same_seed_same_life(robot, reality):

@@ -91,3 +91,17 @@ def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_k
     assert abs(body.parameters[2][offset] - before[2][offset] - 0.01) < 0.001
     (found,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
     np.testing.assert_allclose(found[:, 0], known[:, 0], atol=5e-4)
+
+
+def test_a_muscle_that_nothing_is_known_of_is_trusted_as_far_as_it_may_be_off(arm26, stage):
+    store = stage.store(30)
+    known = fit_body(CorrectedBody(arm26), store.observations()).noise
+    store.forget(1)
+    forgotten = fit_body(CorrectedBody(arm26), store.observations()).noise
+    for _ in range(10):
+        store.add(stage.sample())
+    again = fit_body(CorrectedBody(arm26), store.observations()).noise
+    others = np.arange(arm26.muscle_count) != 1
+    np.testing.assert_array_equal(forgotten[others], known[others])
+    assert forgotten[1] > 10.0 * known[1]
+    assert known[1] < again[1] < 0.5 * forgotten[1]

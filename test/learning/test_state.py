@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import copy_robot, read_muscles, write_muscles
 
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.state import FILE, State
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 from .conftest import Stage
@@ -211,6 +213,43 @@ def test_another_robots_state_is_kept_whole_and_not_used(tmp_path, arm26, stage)
     assert (len(found), mae) == (0, None)
     assert 'other joints and muscles' in not_used
     same(read(tmp_path / 'backup-1', arm26)[0], store)
+
+
+def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, stage, initial):
+    added = 2
+    directory = copy_robot('arm26', tmp_path / 'small')
+    document = read_muscles(directory)
+    del document['muscles'][added]
+    small = Robot.load(write_muscles(directory, document))
+    kept = [m for m in range(arm26.muscle_count) if m != added]
+    network = initial_mae(small, 'default', steps=2).mae
+    store, state = SampleStore(), State(tmp_path, small)
+    state.load(store)
+    for _ in range(4):
+        theta, *parts = stage.sample()
+        store.add(Sample(theta, *(part[kept] for part in parts)))
+    store.forget(0, newest=1)
+    state.keep(store, checkpoint.to_bytes(network))
+    state.close()
+    learner = Learner(arm26, initial, directory=tmp_path, training=Prepared)
+    found = learner.samples
+    assert found.numbers == store.numbers
+    for one, other in zip(found.samples, store.samples, strict=True):
+        np.testing.assert_array_equal(one.theta, other.theta)
+        np.testing.assert_array_equal(one.length[kept], other.length)
+        np.testing.assert_array_equal(one.direction[kept], other.direction)
+    np.testing.assert_array_equal(np.array(found.known)[:, kept], store.known)
+    assert not np.array(found.known)[:, added].any()
+    told = learner.report().values['saved state not used']
+    assert arm26.muscles[added] in told
+    assert 'are learned from' in told
+    # They bring as many updates as when they came; then all waits for new ones.
+    for now in range(10):
+        learner.poll(2.0 * now)
+    assert learner.updates == 4
+    learner.close()
+    same(read(tmp_path / 'backup-1', small)[0], store)
+    same(read(tmp_path, arm26)[0], found)
 
 
 def test_a_file_that_is_damaged_while_it_is_used_is_written_anew(tmp_path, arm26, stage):

@@ -219,8 +219,18 @@ def test_relearning_names_legal_muscles(host, graph, arm26):
     success, reason = graph.set_parameter('learner', 'relearn_muscles', ['no_such_muscle'])
     assert not success
     assert arm26.muscles[0] in reason
+    nameless = graph.call(Trigger, 'learner/relearn')
+    assert not nameless.success
+    assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
     assert not any(known[1] for known in learner.node.core.samples.known)
+    # What came since then is forgotten again by the service.
+    samples = learner.samples
+    learner.learn(lambda: learner.samples > samples, 'a sample')
+    assert any(known[1] for known in learner.node.core.samples.known)
+    assert graph.call(Trigger, 'learner/relearn').success
+    assert not any(known[1] for known in learner.node.core.samples.known)
+    assert all(known[0] for known in learner.node.core.samples.known)
 
 
 # -- real processes -------------------------------------------------------------------------------

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How hot the windings are, and what each muscle may pull for how long.
+
+A motor that warms its housing, which the surroundings cool (LINEAGE, arXiv 2407.08055):
+
+    C₁ ċ₁ = k T² − (c₁ − c₂)/R₁,   C₂ ċ₂ = (c₁ − c₂)/R₁ − (c₂ − c_a)/R₂
+
+The housing's temperature c₂ is measured, the winding's c₁ is not. Only quotients of the constants
+tell in either: κ = k/C₂, τ₁ = R₁C₁, τ₂ = R₂C₂, r = R₁/R₂ and c_a. All but r are learned while the
+arm moves, by an extended Kalman filter of c₁ − c₂, c₂, the logarithms of κ, τ₁ and τ₂, and c_a,
+each a random walk. From T² to c₂ the model is a gain and two poles, three numbers for four: one of
+them has to come from elsewhere. With r it is the one in proportion to which c₁ − c₂ is off.
+
+The highest tension of a muscle is the one that, held for a time from now on, brings its winding to
+the highest temperature. Held there, it falls slowly to what can be held for good, so that control
+that plans within it leaves a muscle that warms to those that are cool.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
+
+HELD, MOMENT = 60.0, 5.0  # [s] ahead: of what is planned, and of what is never exceeded
+EVERY, LONGEST = 1.0, 10.0  # [s] between two updates, and at most that one takes in
+JUMP = 5.0  # [°C] that no housing changes by in such a time: a sensor, or heat from elsewhere
+NOISE = 0.1  # [°C] of c₂'s mean over EVERY
+RATIO = 0.4  # r; chosen: of small motors, with much spread
+# To begin with: a housing 80 °C above the air if T_limit is held for good; all chosen.
+RISE, WINDING_TIME, HOUSING_TIME, AIR = 80.0, 30.0, 800.0, 25.0
+#: standard deviations of c₁ − c₂, c₂ [°C], log κ, log τ₁, log τ₂, c_a [°C]: to begin with, and of
+#: what a second brings
+SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
+WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
+FAR = 2.5  # [log] that no constant goes from where it began
+SLOPE = 1e-4  # of numerical derivatives
+# A constant that changed: by what factor since it was known, and how well it must be [log].
+LEARNED, CHANGED, KNOWN = 1200.0, 1.5, 0.2  # [s]
+
+
+def flow(state: Array, square: Array, dt: float) -> Array:
+    """Return states (6, ...) after dt [s] of a tension of so large a square [N²] (...)."""
+    inner, outer, *logs, air = state
+    kappa, winding, housing = np.exp(logs)
+    share = winding / (housing * RATIO)  # C₁/C₂
+    cooling, tau = (outer - air) / housing, winding / (1.0 + share)
+    settled = tau * (kappa * square / share + cooling)
+    gone = -np.expm1(-dt / tau)
+    mean = settled * dt + (inner - settled) * tau * gone
+    after = outer + share / winding * mean - cooling * dt
+    return np.stack([inner + (settled - inner) * gone, after, *logs, air])
+
+
+class Heat:
+    """Learns every module's constants, and says what its muscle may pull."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._tension, count = robot.tension, robot.muscle_count
+        begin = np.array([0.0, AIR, 0.0, *np.log([WINDING_TIME, HOUSING_TIME]), AIR])
+        self._state: Array = np.tile(begin[:, None], count)
+        self._state[2] = np.log(RISE / HOUSING_TIME / self._tension.limit**2)
+        self._begin = self._state[2:5].copy()
+        self._covariance: Array = np.tile(np.diag(SPREAD**2), (count, 1, 1))
+        self._known = np.zeros(count, dtype=bool)  # whether there is a temperature of the housing
+        self._age: Array = np.zeros(count)  # [s] of learning
+        self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ as first known
+        self._sums: Array = np.zeros((2, count))
+        self._passed, self._messages = 0.0, 0
+        self._ahead: list[tuple[Array, Array]] = []  # c₁ without tension [°C], per T² [K/N²]
+
+    @property
+    def core(self) -> Array:
+        """Estimated temperatures of the windings [°C] (M,); NaN where the housing's is unknown."""
+        return np.where(self._known, self._state[0] + self._state[1], np.nan)
+
+    @property
+    def changed(self) -> dict[int, str]:
+        """Muscles whose constants are not what they were when they were first known, and how."""
+        factor = np.exp(self._state[[2, 4]] - self._reference)
+        told = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
+        return {
+            int(m): f'{told[k].format(factor[k, m])} as much as it did'
+            for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
+        }
+
+    def limits(self, highest: float) -> tuple[Array, Array]:
+        """Return the tensions [N] (M,) that bring no winding above so many °C within HELD, MOMENT.
+
+        Between T_bias and tension.max; an unknown temperature limits nothing.
+        """
+        if not self._ahead:
+            return self._tension.max, self._tension.max
+        found = []
+        for free, warming in self._ahead:
+            square = np.where(self._state[1] < highest, (highest - free) / warming, 0.0)
+            most = np.sqrt(np.maximum(square, 0.0))
+            most = np.where(self._known, most, np.inf)
+            found.append(np.clip(most, self._tension.bias, self._tension.max))
+        return found[0], found[1]
+
+    def step(self, tension: Array, housing: Array, dt: float) -> None:
+        """Take T [N] and temperatures of the housings [°C] (M,), dt [s] after the last ones.
+
+        What is not finite is not known.
+        """
+        known, measured = np.isfinite(housing), self._state[1]
+        strange = known & ((np.abs(housing - measured) > JUMP) | ~self._known)
+        self._state[1] = np.where(strange, housing, measured)
+        hidden, self._known = (known != self._known).any(), known
+        self._sums += tension * tension, np.where(known, housing, 0.0)
+        self._messages, self._passed = self._messages + 1, self._passed + dt
+        if strange.any() or hidden:  # nothing to learn from
+            self._look_ahead()
+        elif self._passed >= EVERY:
+            square, mean = self._sums / self._messages
+            self._update(square, mean, min(self._passed, LONGEST))
+            self._look_ahead()
+        else:
+            return
+        self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
+
+    def _update(self, square: Array, housing: Array, dt: float) -> None:
+        before, covariance = self._state, self._covariance
+        after = flow(before, square, dt)
+        moved = flow(before[:, None] + SLOPE * np.eye(6)[:, :, None], square, dt)
+        slope = ((moved - after[:, None]) / SLOPE).transpose(2, 0, 1)
+        covariance = slope @ covariance @ slope.transpose(0, 2, 1) + np.diag(WALK**2 * dt)
+        gain = covariance[:, :, 1] / (covariance[:, 1, 1] + NOISE**2)[:, None]
+        corrected = covariance - gain[:, :, None] * covariance[:, None, 1]
+        after = after + np.where(self._known, gain.T * (housing - after[1]), 0.0)
+        after[2:5] = np.clip(after[2:5], self._begin - FAR, self._begin + FAR)
+        self._state = after
+        self._covariance = np.where(self._known[:, None, None], corrected, self._covariance)
+        self._age += np.where(self._known, dt, 0.0)
+        logs, unsure = after[[2, 4]], self._covariance[:, [2, 4], [2, 4]].max(axis=1)
+        first = (self._age > LEARNED) & (unsure < KNOWN**2) & np.isnan(self._reference[0])
+        self._reference = np.where(first, logs, self._reference)
+
+    def _look_ahead(self) -> None:
+        """Find what windings come to without tension, and how much more with some, by two times."""
+        pulled = np.array([0.0, 1.0])[:, None] * self._tension.limit**2
+        state = np.repeat(self._state[:, None], 2, axis=1)
+        self._ahead = []
+        for n in range(round(HELD / MOMENT)):
+            state = flow(state, pulled, MOMENT)
+            if n in (0, round(HELD / MOMENT) - 1):
+                free, warm = state[0] + state[1]
+                self._ahead.insert(0, (free, (warm - free) / self._tension.limit**2))

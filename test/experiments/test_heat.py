@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The measurement of heat runs and says how hot the windings are."""
+
+from __future__ import annotations
+
+from musculoskeletal_ae.experiments import heat
+from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.mae import checkpoint
+
+
+def test_the_windings_of_an_emulated_arm_are_known_within_a_few_degrees(
+    arm26, networks, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(heat, 'HELD', 8.0)
+    study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
+    checkpoint.save(networks['default'], study.network_file('default', 0))
+    numbers, traces = heat.measure(study, 0)
+    assert numbers['core_error_k'] <= numbers['core_error_worst_k'] < 5.0
+    assert numbers['heat_alarms'] == 0
+    # It is the true winding that is compared with, which is warmer than the air.
+    assert numbers['hottest_winding_c'] > 25.5
+    assert traces['error'].shape == traces['core'].shape == (30, arm26.muscle_count)
