@@ -32,7 +32,7 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.files import read_start
 from musculoskeletal_ae.learning import old_state
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -66,7 +66,12 @@ class State:
         self._robot = robot
         names = json.dumps({'joints': robot.joints, 'muscles': robot.muscles})
         self._seed = zlib.crc32(names.encode())  # of checksums: another robot's records do not fit
-        self._size = HEAD.size + 8 * (1 + robot.joint_count + 4 * robot.muscle_count)
+        joints, muscles = robot.joint_count, robot.muscle_count
+        #: where a record's number, θ, T, l, s and known end, and its spread
+        self._ends = np.cumsum([1, joints, *4 * [muscles], joints])
+        whole = self._ends[-1] + 3 * len(robot.kinematics.parent)
+        #: of a record, and of one from before samples told their spread and gravity
+        self._sizes = [HEAD.size + 8 * int(size) for size in (whole, self._ends[-2])]
         self._connection: sqlite3.Connection | None = None
         self._next_look = 0.0
         try:
@@ -165,7 +170,7 @@ class State:
             problem = f'{self._file}: damaged ({error})'
             whole = read_start(self._file, old_state.LARGEST)
             places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
-            records = [whole[place : place + self._size] for place in places]
+            records = [whole[place : place + size] for place in places for size in self._sizes]
         unpacked = filter(None, map(self._unpacked, records))
         for number, sample, known in sorted(unpacked, key=lambda record: record[0]):
             if number in samples.numbers:  # an older copy: what was forgotten stays so
@@ -177,18 +182,27 @@ class State:
         return problem, data
 
     def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
-        values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
+        spread, gravity = sample.spread, sample.gravity
+        if not spread.size:
+            spread = np.zeros(self._robot.joint_count)
+        if not gravity.size:
+            gravity = np.full(3 * len(self._robot.kinematics.parent), np.nan)
+        parts = [number], *sample[:4], known, spread, gravity
+        values = np.concatenate(parts).astype('<f8').tobytes()
         return HEAD.pack(MARK, zlib.crc32(values, self._seed)) + values
 
     def _unpacked(self, record: object) -> tuple[int, Sample, Bools] | None:
-        if not isinstance(record, bytes) or len(record) != self._size:
+        if not isinstance(record, bytes) or len(record) not in self._sizes:
             return None
         values, (_, checksum) = record[HEAD.size :], HEAD.unpack_from(record)
         if checksum != zlib.crc32(values, self._seed):
             return None
-        joints, muscles = self._robot.joint_count, self._robot.muscle_count
-        ends = [1, *(1 + joints + muscles * np.arange(4))]
-        number, *parts, known = np.split(np.frombuffer(values).copy(), ends)
+        split = np.split(np.frombuffer(values).copy(), self._ends)
+        number, *parts, known, spread, gravity = split
+        if spread.any():
+            parts.append(spread)
+        if np.isfinite(gravity).any():
+            parts += [*([] if spread.any() else [NOTHING]), gravity]
         return int(number[0]), Sample(*parts), known > 0.5
 
     # -- writing --------------------------------------------------------------------------------
