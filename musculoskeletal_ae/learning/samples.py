@@ -117,9 +117,9 @@ class SampleStore:
 
     def observations(self) -> Observations:
         """Return all samples as arrays."""
-        *columns, spread, gravity = zip(*self.samples, strict=True)
+        *columns, spreads, gravities = zip(*self.samples, strict=True)
         theta, tension, length, direction = map(np.array, columns)
-        spread, gravity = _filled(spread, 0.0), _filled(gravity, np.nan)
+        spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
         known = np.array(self.known)
         return Observations(theta, tension, length, direction, known, spread, gravity)
 

@@ -81,7 +81,7 @@ class HardwareEmulator(Arm):
             self.pose_due = max(self.pose_due + 1.0 / self.marker_pose_rate, now)
             self._publish_pose()
 
-    def _publish_imu(self, publisher: Publisher[Imu]) -> None:
+    def _publish_imu(self, publisher: Publisher) -> None:
         link, message = self.parameter('imu_link'), Imu()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.parameter('frame_prefix') + link

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.training import Training
 from musculoskeletal_ae.learning.update import BodyUpdater, PaperUpdater, learned_steps
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.presets import PAPER
 
 from .conftest import Stage, drawn_body, job
@@ -126,3 +128,16 @@ def test_a_network_of_geometry_brings_no_body(arm26, initial):
     assert learned_steps(initial) == 0
     body = BodyUpdater(arm26, initial).body
     assert all((parameters == 0.0).all() for parameters in body.parameters)
+
+
+def test_a_network_tells_how_far_its_estimates_may_be_off(arm26, learned):
+    mae, _, _, stage = learned
+    theta, tension, length = stage.states(1000)
+    error = mae.estimate(tension, length).theta - theta
+    distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
+    inside = (distance <= chi2.ppf(0.95, 2)).mean()
+    assert inside > 0.8  # of a body of the very kind that is looked for, without friction
+    spread = np.sqrt(np.diag(mae.covariance))
+    assert (spread < 5.0 * error.std(axis=0)).all()
+    again = checkpoint.from_bytes(checkpoint.to_bytes(mae), arm26)
+    np.testing.assert_array_equal(again.covariance, mae.covariance)
