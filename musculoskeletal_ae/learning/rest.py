@@ -177,6 +177,7 @@ class RestCollector:
         A `blind` one rests without joint angles, too; those that there are spread by `spread`.
         """
         self._robot, self._healthy, self._spread = robot, healthy, spread
+        self._no_gravity = np.full(3 * len(robot.kinematics.parent), np.nan)
         self.gravity: Array = NOTHING  # what an IMU says now, see `Sample`
         self.anomaly = False  # closes the gate
         # Messages that no sensor measures, and rests that are not learned from, by reason.
@@ -213,8 +214,11 @@ class RestCollector:
         direction = self._direction.step(length, dt)
         nothing = np.full(self._robot.joint_count, np.nan)
         theta = nothing if theta is None else theta
-        reading = Sample(theta, tension, length, direction, self._spread, self.gravity)
+        gravity = self.gravity if self.gravity.size else self._no_gravity
+        reading = Sample(theta, tension, length, direction, self._spread, gravity)
         rest = self._detector.step(reading, dt)
+        if rest is not None and np.isnan(rest.gravity).all():
+            rest = rest._replace(gravity=NOTHING)
         if self.anomaly or self._time < self._closed_until:
             if rest is not None:
                 self.rejected['anomaly'] += 1
