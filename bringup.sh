@@ -30,6 +30,10 @@ doc/your_robot.md leads from a robot of your own to one that learns.
   --reality kin|foreign|FILE.xml
                              its body: the first, a second one whose mechanics are foreign to the
                              learner, or a MuJoCo model with the robot's names (default: kin)
+  --joint-source sensor|marker|none
+                             what the learner knows of joint angles: all of them, what a camera sees of
+                             the hand, or nothing; the status line shows the emulator's own angles
+                             (default: sensor)
   --namespace NS             run everything under /NS
   --duration S               stop after S seconds, counted from when the system is up
                              (default: run until Ctrl-C)
@@ -57,6 +61,7 @@ explore= # on, but for hardware
 preset=default
 seed=0
 reality=kin
+joint_source=sensor
 namespace=
 learner=true
 controller=true
@@ -73,7 +78,7 @@ while [ $# -gt 0 ]; do
   # Both "--seed 1" and "--seed=1".
   if [[ $1 == --*=* ]]; then set -- "${1%%=*}" "${1#*=}" "${@:2}"; fi
   case $1 in
-    --robot | --checkpoint | --bag | --preset | --seed | --reality | --namespace | --duration | --record | --port)
+    --robot | --checkpoint | --bag | --preset | --seed | --reality | --joint-source | --namespace | --duration | --record | --port)
       if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
       ;;
   esac
@@ -94,12 +99,13 @@ while [ $# -gt 0 ]; do
     --preset) preset=$2 && shift ;;
     --seed) seed=$2 && shift ;;
     --reality) reality=$2 && shift ;;
+    --joint-source) joint_source=$2 && shift ;;
     --namespace) namespace=$2 && shift ;;
     --duration) duration=$2 && shift ;;
     -h | --help) usage && exit ;;
     *)
       refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
- --no-controller, --combined, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --namespace, --duration, --record, --view, --port,\
+ --no-controller, --combined, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --joint-source, --namespace, --duration, --record, --view, --port,\
  --read-only, --help"
       ;;
   esac
@@ -147,6 +153,10 @@ case $reality in
     [ -f "$reality" ] || refuse "--reality '$reality' must be kin, foreign or an MJCF file"
     reality=$(realpath "$reality")
     ;;
+esac
+case $joint_source in
+  sensor | marker | none) ;;
+  *) refuse "--joint-source '$joint_source' must be sensor, marker or none" ;;
 esac
 if [ -n "$duration" ]; then
   [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
@@ -305,7 +315,9 @@ remap=()
 if [ -n "$bag" ]; then
   common+=(-p use_sim_time:=true)
 elif [ $hardware = false ]; then
-  start hardware_emulator hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")"
+  camera=()
+  [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
+  start hardware_emulator hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")" "${camera[@]}"
 fi
 
 [ -n "$checkpoint" ] || train_once
@@ -328,7 +340,8 @@ start sim sim "${common[@]}"
 # the same arm tomorrow, and the learner goes on from where it was.
 kept=(-p "state_directory:=$(quoted "$logs/learner")")
 [ $hardware = false ] || kept=()
-[ $learner = false ] || start learner learner "${common[@]}" "${kept[@]}"
+[ $learner = false ] || start learner learner "${common[@]}" "${kept[@]}" \
+  -p "joint_source:=$joint_source"
 [ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"
 if [ -n "$bag" ]; then
   start replay replay "$bag" --clock "${remap[@]}"

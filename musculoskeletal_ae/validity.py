@@ -24,6 +24,7 @@ MOST_ENTRIES = 10_000
 # What a hand can take [N], [N·m]: a third of what the emulated arms do, any axis and posture.
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
 MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the hand
+LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] that an accelerometer reads on an arm
 LAST_VELOCITY = 1e-6  # [rad/s] at which a trajectory ends
 MOST_EFFORT = 1000.0  # [N·m] asked of one joint
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
@@ -62,12 +63,13 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
 
 
 def read_joints(
-    message: Any, joints: Sequence[str], foreign_allowed: bool
+    message: Any, joints: Sequence[str], foreign_allowed: bool, some: bool = False
 ) -> dict[str, tuple[float, float]]:
     """Return name → (position, effort) of the listed joints in a JointState; no effort is 0.
 
     Where foreign joints are allowed (`joint_states`), those the robot does not list are ignored,
-    and all that it lists are asked for; else (targets) they are refused, and a subset will do.
+    and all that it lists are asked for, unless `some` are enough; else (targets) they are refused,
+    and a subset will do.
     """
     names, efforts, speeds = list(message.name), message.effort, message.velocity
     counts = len(names), len(message.position), len(efforts), len(speeds)
@@ -94,7 +96,7 @@ def read_joints(
         if abs(effort) > MOST_EFFORT:
             raise MessageError('oversized', f'effort {effort:g}, at most {MOST_EFFORT:g}')
         values[name] = (message.position[i], effort)
-    if foreign_allowed and len(values) < len(joints):
+    if foreign_allowed and len(values) < (1 if some else len(joints)):
         missing = [name for name in joints if name not in values]
         raise MessageError('missing joint', ', '.join(missing))
     if not np.isfinite(list(values.values())).all() or not (
@@ -104,10 +106,26 @@ def read_joints(
     return values
 
 
-def read_posture(message: Any, joints: Sequence[str]) -> Array:
-    """Return θ [rad] (D,) of a JointState that has all listed joints, others ignored."""
-    values = read_joints(message, joints, foreign_allowed=True)
-    return np.array([values[name][0] for name in joints])
+def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
+    """Return θ [rad] (D,) of a JointState that has all listed joints, others ignored.
+
+    Where `some` are enough, the others are NaN.
+    """
+    values = read_joints(message, joints, foreign_allowed=True, some=some)
+    return np.array([values[name][0] if name in values else np.nan for name in joints])
+
+
+def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
+    """Return the link and the acceleration [m/s²] (3,) of an Imu, whose frame is that link."""
+    link, read = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
+    if link not in links:
+        told = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
+        raise MessageError('wrong frame', told)
+    acceleration = np.array([read.x, read.y, read.z])
+    norm = float(np.linalg.norm(acceleration))
+    if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
+        raise MessageError('no gravity', f'{norm:.3g} m/s², an arm at rest has 9.81')
+    return link, acceleration
 
 
 def read_wrench(message: Any, root_link: str) -> Array:

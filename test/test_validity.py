@@ -108,6 +108,13 @@ def test_a_wrong_measurement_is_rejected_by_reason(message, reason):
     assert error.value.reason == reason
 
 
+def test_a_measurement_of_some_joints_leaves_the_others_open():
+    message = JointState(name=['x', 'b'], position=[1.0, 2.0])
+    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
+    with pytest.raises(MessageError, match='a, b'):
+        read_posture(JointState(name=['x'], position=[1.0]), JOINTS, some=True)
+
+
 def test_a_target_may_name_a_subset_and_effort():
     message = JointState(name=['b'], position=[2.0], effort=[3.0])
     assert read_joints(message, JOINTS, foreign_allowed=False) == {'b': (2.0, 3.0)}

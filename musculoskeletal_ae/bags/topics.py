@@ -39,6 +39,7 @@ TOPICS = {
     'target_twist': Topic('geometry_msgs/msg/TwistStamped', sent=True),
     'controller_state': Topic(_TRAJECTORY),
     'estimated_joint_states': Topic(_JOINTS),
+    'estimated_joint_covariance': Topic(_ARRAY),
     'estimated_muscle_states': Topic(_ARRAY),
     'estimated_external_wrench': Topic(_WRENCH),
     'muscle_length_zeros': Topic(_ARRAY, latched=True),

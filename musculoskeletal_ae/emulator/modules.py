@@ -44,6 +44,7 @@ ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
+ACCELERATION_NOISE = 0.05  # [m/s²]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
 
 
@@ -137,6 +138,13 @@ def seen_by_camera(pose: pin.SE3, rng: np.random.Generator) -> pin.SE3:
     turn = pin.exp3(rng.normal(0.0, MARKER_TURN_NOISE, 3))
     shift = rng.normal(0.0, MARKER_NOISE, 3)
     return pin.SE3(pose.rotation @ turn, pose.translation + shift)
+
+
+def felt_at_rest(robot: Robot, theta: Array, link: str, rng: np.random.Generator) -> Array:
+    """Return what an accelerometer in a link's axes reads of a resting arm [m/s²], shape (3,)."""
+    turn = robot.kinematics.link_pose(theta, link).rotation
+    held: Array = -turn.T @ robot.kinematics.model.gravity.linear
+    return held + rng.normal(0.0, ACCELERATION_NOISE, 3)
 
 
 def noisy(value: Array, noise: float, resolution: float, rng: np.random.Generator) -> Array:
@@ -328,6 +336,10 @@ class Arm(ABC):
     def marker_pose(self) -> pin.SE3:
         """See the end effector's pose in the root link's frame, with a camera's noise."""
         return seen_by_camera(self.hand, self._rng)
+
+    def accelerometer(self, link: str) -> Array:
+        """Return what an accelerometer in a link's axes reads at rest [m/s²], shape (3,)."""
+        return felt_at_rest(self.robot, self.theta, link, self._rng)
 
     @abstractmethod
     def route_points(self) -> Array:

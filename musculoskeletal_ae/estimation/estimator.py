@@ -189,6 +189,10 @@ class Estimator:
             'checkpoint version': str(self.mae.version),
             'anomaly calibrated': str(self.detector.calibrated),
         }
+        if self.mae.covariance is not None:
+            spread = np.sqrt(np.diag(self.mae.covariance))
+            told = (f'{name} {s:.3f}' for name, s in zip(self._robot.joints, spread, strict=True))
+            values['joint uncertainty'] = ', '.join(told) + ' rad'
         if self._verdict is not None:
             values |= {
                 'A': f'{self._verdict.anomaly:.4f}',

@@ -11,4 +11,5 @@ NAMES = (
     'body_change',
     'motion',
     'robustness',
+    'sensors',
 )

@@ -9,27 +9,26 @@ Fourier features over the joints that the muscle crosses), and a wire that slide
 that differs from the one at its elastic unit (μ: friction of the route, s: direction of the last
 sliding, +1 wound in, −1 paid out). All parameters zero is the geometric model itself.
 
-The fit to samples is maximum a posteriori, muscle by muscle, robustly:
+The fit to samples is maximum a posteriori and robust, together with the samples' postures
+(`postures`), from where the last fit ended. The prior spreads s are physical: how far a hand places
+an attachment, how far elastic units of one kind differ. Where postures are known for sure, muscles
+are fitted one by one:
 
     min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k (w_k / s_k)²
 
-by Gauss–Newton from where the last fit ended. The prior spreads s are physical: how far a hand
-places an attachment, how far elastic units of one kind differ. The weights ω are those of a
-Student distribution, so that a sample taken while the arm was touched, or a glitch, counts little.
-
-The torque balance at rest, g(θ) + Gᵀ T = 0 (PIMBS), is not fitted: what is learned from the lengths
-alone meets it as well as the true body does, which is as well as friction lets anyone
-(`bench/torque_residual` measures both).
+The weights ω are those of a Student distribution, so that a sample taken while the arm was touched,
+or a glitch, counts little.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.learning.postures import FREEDOM, fit_jointly
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -183,7 +182,6 @@ class CorrectedBody:
 
 # -- the fit --------------------------------------------------------------------------------------
 
-FREEDOM = 4.0  # of the Student distribution
 ROUNDS = 6  # of Gauss–Newton per fit
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a Gauss–Newton step, tried until one lowers the cost
 FIRST_NOISE = 0.002  # [m], before anything is known
@@ -231,32 +229,40 @@ class Fit(NamedTuple):
     residual: Array  # l − l(θ, T; w) [m], (N, M)
     noise: Array  # σ of each muscle [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample says nothing about a muscle
+    theta: Array  # where the arm was [rad], (N, D)
+    root: list[tuple[Ints, Array]]  # muscles of a group, R with (RᵀR)⁻¹ the covariance of theirs
 
 
 def fit_body(
     body: CorrectedBody,
     seen: Observations,
     prior_mean: list[Array] | None = None,
-    least_noise: float = LEAST_NOISE,
+    guess: Array | None = None,
 ) -> Fit:
-    """Fit the parameters of a body in place, from the present ones.
+    """Fit the parameters of a body in place, from the present ones, and the samples' postures.
+
+    Angles that were not read are looked for from `guess` [rad] (N, D), or the middle of the range.
 
     A muscle with samples that say nothing about it any more was changed: what they said is where
     its new parameters are looked for. In the place of the geometric model come the parameters
     `prior_mean` where some were learned before, without the samples that they came from.
     """
-    poses = body.poses(seen.theta)
-    parts = []
+    robot = body.robot
+    if guess is None:
+        guess = np.tile(0.5 * (robot.lower + robot.upper), (len(seen), 1))
+    start = np.where(np.isnan(seen.theta), np.clip(guess, robot.lower, robot.upper), seen.theta)
+    means, spreads = [], []
     for m, layout in enumerate(body.layouts):
         known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
         if prior_mean is not None:
             mean = prior_mean[m]
         if (~known).sum() >= LEAST_ANCHOR:
-            _fit_muscle(body, poses, seen, ~known, mean, spread, least_noise, m)
+            before = replace(seen, theta=start)
+            _fit_muscle(body, body.poses(start), before, ~known, mean, spread, LEAST_NOISE, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
-        parts.append(_fit_muscle(body, poses, seen, known, mean, spread, least_noise, m))
-    residual, noise, weight = zip(*parts, strict=True)
-    return Fit(np.stack(residual, axis=1), np.array(noise), np.stack(weight, axis=1))
+        means.append(mean)
+        spreads.append(spread)
+    return Fit(*fit_jointly(body, seen, start, means, spreads, LEAST_NOISE))
 
 
 def _fit_muscle(
@@ -306,9 +312,6 @@ def _fit_muscle(
             residual, jacobian = linearised(at)
             break
     noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
-    if not used.all():  # a muscle that is learned anew is trusted no more than it is known
-        unknown = np.einsum('ni,ni->n', jacobian, np.linalg.solve(normal, jacobian.T).T)
-        noise = float(np.sqrt(noise**2 + unknown.mean()))
     return residual, noise, weight
 
 
@@ -339,4 +342,7 @@ def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
     everything = np.ones(shape, dtype=bool)
     lengths = mae.lengths(theta, tension)
     seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
-    fit_body(body, seen, least_noise=NETWORK_ERROR)
+    poses = body.poses(theta)
+    for m, layout in enumerate(body.layouts):
+        prior = PRIOR.mean(layout), PRIOR.spread(layout)
+        _fit_muscle(body, poses, seen, everything[:, m], *prior, NETWORK_ERROR, m)

@@ -18,13 +18,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.estimation.touch import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.rest import RestCollector
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
 from musculoskeletal_ae.learning.state import State
 from musculoskeletal_ae.learning.training import Job, Training, Update
@@ -36,6 +38,11 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: between the beginnings of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
+#: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
+SENSOR, MARKER, NONE = JOINT_SOURCES = 'sensor', 'marker', 'none'
+SPREAD = 0.02  # of θ as a camera sees it [rad]
+TILT_AGE = 0.5  # [s] that what an IMU says holds
+LEAST_BLIND = 20  # samples to begin with where no θ is known
 
 
 class Learner:
@@ -51,6 +58,7 @@ class Learner:
         steps: int = STEPS,  # of training per update, in preset default
         period: float = 0.01,  # of the messages of the muscle modules [s]
         settings: Settings = DEFAULT,  # what counts as rest, and as new
+        joint_source: str = SENSOR,  # what θ comes from
         training: Callable[[Robot, str, int], Training] = Training,
         directory: Path | None = None,  # where samples and network are kept; None for nowhere
     ) -> None:
@@ -70,9 +78,14 @@ class Learner:
         self.updates = self.published = 0  # updates made, checkpoints given out
         self._pairing = Pairing(period)
         self._healthy = Reservoir(robot.muscle_count, seed, settings)
-        self._rests = RestCollector(robot, settings, self._healthy)
+        spread = np.full(robot.joint_count, SPREAD) if joint_source == MARKER else NOTHING
+        blind = joint_source != SENSOR
+        self._rests = RestCollector(robot, settings, self._healthy, blind, spread)
+        self._tilted = -math.inf  # when an IMU was heard last [s]
         self._torque = HealthyTorque(robot)
         self.rejected = self._rests.rejected  # what was not learned from, by reason
+        least = self.training.preset.least_samples
+        self._least_samples = least if joint_source == SENSOR else max(least, LEAST_BLIND)
         self._steps = steps
         self._news = True  # to learn from, since the last update began
         self._begun = self._given = -math.inf  # the last update, the last checkpoint [s]
@@ -107,12 +120,28 @@ class Learner:
         """Take a θ [rad] (D,) that came at `time` [s]."""
         self._pairing.joints(time, theta)
 
+    def imu(self, time: float, link: str, acceleration: Array) -> None:
+        """Take what an accelerometer in a link's axes read at `time` [m/s²] (3,).
+
+        At rest that is what holds it against gravity, so that it tells where down is.
+        """
+        kinematics = self.robot.kinematics
+        joint, placement = kinematics.placement(link)
+        count = len(kinematics.parent)
+        gravity = np.full((count, 3), np.nan)
+        if self._rests.gravity.size:
+            gravity = self._rests.gravity.reshape(count, 3).copy()
+        gravity[joint] = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
+        self._rests.gravity, self._tilted = gravity.ravel(), time
+
     def muscles(self, time: float, tension: Array, length: Array) -> None:
         """Take T [N] and l [m] (M,) that came at `time` [s]."""
         paired = self._pairing.muscles(time, tension, length)
         if paired is None or not (self.enabled and self._zeroed):
             return
         _, tension, length, dt, theta = paired
+        if not 0.0 <= time - self._tilted < TILT_AGE:
+            self._rests.gravity = NOTHING
         self._gate_time += dt
         self._gate.message(tension, length, self._gate_time)
         if self._mae is not None and not self._rests.anomaly:
@@ -167,7 +196,7 @@ class Learner:
             and not _lately(self._begun, now)
             and self.enabled
             and not self._rests.anomaly
-            and len(self.samples) >= self.training.preset.least_samples
+            and len(self.samples) >= self._least_samples
             and self.training.ready
         ):
             self._news, self._begun, self._forgot = self.updates + 1 < self._owed, now, False

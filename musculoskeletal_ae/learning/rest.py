@@ -3,7 +3,8 @@
 
 The arm rests while the means of the two halves of a short window differ by no more than the given
 rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
-sensor's). The rest is averaged until it ends, or for `LONGEST` at a time.
+sensor's). The rest is averaged until it ends, or for `LONGEST` at a time. An arm without joint
+sensors (`blind`) rests while its muscles do, and θ is averaged where there is any.
 
 What comes within `MARGIN` before an anomaly is noticed was already wrong; rests and healthy
 messages therefore wait that long before they count.
@@ -19,7 +20,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Reservoir
-from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.robot import Robot
@@ -33,9 +34,9 @@ SURE = 3.0  # standard errors that a difference of means may have by chance
 class RestDetector:
     """Turns the stream of readings into one mean per rest."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, blind: bool = False) -> None:
         """Start with an empty window."""
-        self.settings = settings
+        self.settings, self.blind = settings, blind
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
         self.reset()
 
@@ -60,12 +61,12 @@ class RestDetector:
             return None
         if self._still:
             new = [reading] if was_still else [reading for _, reading in self._window]
-            self._rest += filter(_measured, new)
+            self._rest += new if self.blind else filter(_measured, new)
             self._span = self._span + dt if was_still else self.settings.rest_time
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
         rest, self._rest, self._span = self._rest, [], 0.0
-        return Sample(*(np.mean(column, axis=0) for column in zip(*rest))) if rest else None
+        return Sample(*(_mean(np.array(column)) for column in zip(*rest))) if rest else None
 
     def _is_still(self) -> bool:
         half = 0.5 * self.settings.rest_time
@@ -74,16 +75,24 @@ class RestDetector:
         middle = self._time - half
         halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]
         angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
-        if min(map(len, angles)) < LEAST_READINGS:
-            return False
         lengths = [np.array([r.length for r in part]) for part in halves]
-        return _unmoved(angles, self.settings.rest_joint_rate * half) and _unmoved(
-            lengths, self.settings.rest_length_rate * half
-        )
+        if not _unmoved(lengths, self.settings.rest_length_rate * half):
+            return False
+        if min(map(len, angles)) < LEAST_READINGS:
+            return self.blind
+        read = np.isfinite(angles[0][0])  # a robot has a sensor at a joint or has none
+        return _unmoved([part[:, read] for part in angles], self.settings.rest_joint_rate * half)
 
 
 def _measured(reading: Sample) -> bool:
-    return not math.isnan(reading.theta[0])
+    return not np.isnan(reading.theta).all()
+
+
+def _mean(values: Array) -> Array:
+    """Return the mean of rows where they are numbers, NaN where none is."""
+    known = np.isfinite(values)
+    mean: Array = np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), mean, np.nan)
 
 
 def _unmoved(halves: list[Array], allowed: float) -> bool:
@@ -155,13 +164,25 @@ class Waiting(NamedTuple):
 class RestCollector:
     """Steps through the messages and gives out the rests that may be learned from."""
 
-    def __init__(self, robot: Robot, settings: Settings, healthy: Reservoir) -> None:
-        """Watch `robot`; messages of the healthy arm go to `healthy`."""
-        self._robot, self._healthy = robot, healthy
+    def __init__(
+        self,
+        robot: Robot,
+        settings: Settings,
+        healthy: Reservoir,
+        blind: bool = False,
+        spread: Array = NOTHING,
+    ) -> None:
+        """Watch `robot`; messages of the healthy arm go to `healthy`.
+
+        A `blind` one rests without joint angles, too; those that there are spread by `spread`.
+        """
+        self._robot, self._healthy, self._spread = robot, healthy, spread
+        self._no_gravity = np.full(3 * len(robot.kinematics.parent), np.nan)
+        self.gravity: Array = NOTHING  # what an IMU says now, see `Sample`
         self.anomaly = False  # closes the gate
         # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
-        self._detector = RestDetector(settings)
+        self._detector = RestDetector(settings, blind)
         self._hole = max(HOLE, settings.rest_time)
         self._plausibility = Plausibility(robot)
         self._direction = FrictionDirection()
@@ -181,7 +202,9 @@ class RestCollector:
             self._direction.reset()
             dt = self._hole
         judge = self._plausibility
-        error = judge.levels(tension, length) or (theta is not None and judge.outside(theta))
+        error = judge.levels(tension, length)
+        if error is None and theta is not None:
+            error = judge.outside(np.where(np.isnan(theta), self._robot.lower, theta))
         if error:
             self.rejected[error.reason] += 1
             self._skipped = dt
@@ -190,8 +213,12 @@ class RestCollector:
         self._time += dt
         direction = self._direction.step(length, dt)
         nothing = np.full(self._robot.joint_count, np.nan)
-        reading = Sample(nothing if theta is None else theta, tension, length, direction)
+        theta = nothing if theta is None else theta
+        gravity = self.gravity if self.gravity.size else self._no_gravity
+        reading = Sample(theta, tension, length, direction, self._spread, gravity)
         rest = self._detector.step(reading, dt)
+        if rest is not None and np.isnan(rest.gravity).all():
+            rest = rest._replace(gravity=NOTHING)
         if self.anomaly or self._time < self._closed_until:
             if rest is not None:
                 self.rejected['anomaly'] += 1

@@ -9,7 +9,8 @@ always stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -19,26 +20,43 @@ from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
 
 CAPACITY = 400
+NOTHING: Array = np.zeros(0)
+#: length that counts as a joint angle where none was read, per radian: a usual moment arm [m]
+MOMENT_ARM = 0.04
 
 
 class Sample(NamedTuple):
     """Means over a rest."""
 
-    theta: Array  # θ [rad], (D,)
+    theta: Array  # θ [rad], (D,); NaN where nothing was read
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
     direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (M,)
+    #: how far each θ may be off [rad], (D,); 0 or nothing: as a joint sensor, but for its zero
+    spread: Array = NOTHING
+    #: direction of gravity in the frames of the tree's joints, (3J,); NaN or nothing: no IMU there
+    gravity: Array = NOTHING
 
 
 @dataclass(frozen=True)
 class Observations:
     """N samples as arrays."""
 
-    theta: Array  # θ [rad], (N, D)
+    theta: Array  # θ [rad], (N, D); NaN where nothing was read
     tension: Array  # T at the motors [N], (N, M)
     length: Array  # l [m], (N, M)
     direction: Array  # s in [−1, 1], (N, M)
     known: Bools  # which of them say something about which muscle, (N, M)
+    spread: Array = field(default_factory=lambda: NOTHING)  # see `Sample`, (N, D)
+    #: (N, 3J), or (N, 0): no IMU anywhere
+    gravity: Array = field(default_factory=lambda: NOTHING)
+
+    def __post_init__(self) -> None:
+        """Fill in what was left out."""
+        if self.spread.size == 0:
+            object.__setattr__(self, 'spread', np.zeros_like(self.theta))
+        if self.gravity.size == 0:
+            object.__setattr__(self, 'gravity', np.zeros((len(self.theta), 0)))
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -49,6 +67,10 @@ class Observations:
     def state(self) -> State:
         """Return (θ, T, l)."""
         return State(self.theta, self.tension, self.length)
+
+    def seen_whole(self) -> Observations:
+        """Return those of which all joint angles are known."""
+        return self[np.flatnonzero(np.isfinite(self.theta).all(axis=1))]
 
 
 class SampleStore:
@@ -68,7 +90,7 @@ class SampleStore:
         """Whether a sample differs enough from every stored one."""
         stored = np.array([self._scaled(s) for s in self.samples])
         return not self.samples or bool(
-            np.abs(stored - self._scaled(sample)).max(axis=1).min() > 1.0
+            np.nanmax(np.abs(stored - self._scaled(sample)), axis=1).min() > 1.0
         )
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
@@ -95,15 +117,21 @@ class SampleStore:
 
     def observations(self) -> Observations:
         """Return all samples as arrays."""
-        theta, tension, length, direction = map(np.array, zip(*self.samples, strict=True))
-        return Observations(theta, tension, length, direction, np.array(self.known))
+        *columns, spreads, gravities = zip(*self.samples, strict=True)
+        theta, tension, length, direction = map(np.array, columns)
+        spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
+        known = np.array(self.known)
+        return Observations(theta, tension, length, direction, known, spread, gravity)
 
     def _scaled(self, sample: Sample) -> Array:
-        theta = sample.theta / self._settings.new_joint_distance
-        return np.concatenate([theta, sample.tension / self._settings.new_tension_distance])
+        joint, tension = self._settings.new_joint_distance, self._settings.new_tension_distance
+        unread = np.isnan(sample.theta).any()
+        # Of a posture that was not read the lengths tell whether it is another one.
+        length = sample.length / (MOMENT_ARM * joint) if unread else np.nan * sample.length
+        return np.concatenate([sample.theta / joint, sample.tension / tension, length])
 
     def _dispensable(self) -> int:
-        points = np.array([self._scaled(s) for s in self.samples])
+        points = np.nan_to_num(np.array([self._scaled(s) for s in self.samples]))
         square = np.sum(points**2, axis=1)
         distance = square[:, None] + square - 2.0 * points @ points.T
         distance[np.diag_indices_from(distance)] = np.inf
@@ -111,3 +139,9 @@ class SampleStore:
         lost = 1.0 - np.array(self.known).mean(axis=1)
         distance /= 1.0 + lost[:, None] + lost
         return int(min(np.unravel_index(np.argmin(distance), distance.shape)))
+
+
+def _filled(parts: Sequence[Array], nothing: float) -> Array:
+    """Return parts of equal size, or of none, as one array."""
+    size = max(part.size for part in parts)
+    return np.array([part if part.size else np.full(size, nothing) for part in parts])

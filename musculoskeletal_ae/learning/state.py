@@ -28,11 +28,11 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.arrays import Bools, Ints
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.files import read_start
 from musculoskeletal_ae.learning import old_state
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -163,8 +163,8 @@ class State:
             problem = f'{self._file}: damaged ({error})'
             whole = read_start(self._file, old_state.LARGEST)
             places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
-            size = self._size(self._robot.muscles)
-            records = [whole[place : place + size] for place in places]
+            sizes = self._sizes(self._robot.muscles)
+            records = [whole[place : place + size] for place in places for size in sizes]
         muscles = self._muscles_of(data)
         if added := [name for name in self._robot.muscles if name not in muscles]:
             problem = problem or f'{self._file}: of the robot without {", ".join(added)}; its '
@@ -190,8 +190,17 @@ class State:
                 return mae.muscles
         return self._robot.muscles
 
-    def _size(self, muscles: tuple[str, ...]) -> int:
-        return HEAD.size + 8 * (1 + self._robot.joint_count + 4 * len(muscles))
+    def _ends(self, muscles: tuple[str, ...]) -> Ints:
+        """Return where a record's number, θ, T, l, s, known and spread end."""
+        joints = self._robot.joint_count
+        ends: Ints = np.cumsum([1, joints, *4 * [len(muscles)], joints])
+        return ends
+
+    def _sizes(self, muscles: tuple[str, ...]) -> tuple[int, ...]:
+        """Return the size of a record, and of one from before samples told spread and gravity."""
+        *_, before, end = self._ends(muscles)
+        whole = end + 3 * len(self._robot.kinematics.parent)
+        return tuple(HEAD.size + 8 * int(size) for size in (whole, before))
 
     def _checksum(self, values: bytes, muscles: tuple[str, ...]) -> int:
         # Another robot's records do not fit.
@@ -199,26 +208,40 @@ class State:
         return zlib.crc32(values, zlib.crc32(names.encode()))
 
     def _packed(self, number: int, sample: Sample, known: Bools) -> bytes:
-        values = np.concatenate([[number], *sample, known]).astype('<f8').tobytes()
+        spread, gravity = sample.spread, sample.gravity
+        if not spread.size:
+            spread = np.zeros(self._robot.joint_count)
+        if not gravity.size:
+            gravity = np.full(3 * len(self._robot.kinematics.parent), np.nan)
+        parts = [number], *sample[:4], known, spread, gravity
+        values = np.concatenate(parts).astype('<f8').tobytes()
         return HEAD.pack(MARK, self._checksum(values, self._robot.muscles)) + values
 
     def _unpacked(
         self, record: object, muscles: tuple[str, ...]
     ) -> tuple[int, Sample, Bools] | None:
-        if not isinstance(record, bytes) or len(record) != self._size(muscles):
+        if not isinstance(record, bytes) or len(record) not in self._sizes(muscles):
             return None
         values, (_, checksum) = record[HEAD.size :], HEAD.unpack_from(record)
         if checksum != self._checksum(values, muscles):
             return None
-        robot = self._robot
-        ends = [1, *(1 + robot.joint_count + len(muscles) * np.arange(4))]
-        number, theta, *parts = np.split(np.frombuffer(values).copy(), ends)
+        robot, split = self._robot, np.split(np.frombuffer(values).copy(), self._ends(muscles))
+        number, theta, *parts, spread, gravity = split
         # What is not known of an added muscle is as the geometric model has it.
         bias, nothing = robot.tension.bias, np.zeros(robot.muscle_count)
-        whole = np.stack([bias, robot.muscle_lengths(theta, bias), nothing, nothing])
+        there = robot.muscle_lengths(np.nan_to_num(theta), bias)
+        whole = np.stack([bias, there, nothing, nothing])
         whole[:, list(robot.muscle_indices(muscles))] = parts
         tension, length, direction, known = whole
-        return int(number[0]), Sample(theta, tension, length, direction), known > 0.5
+        sample = Sample(
+            theta,
+            tension,
+            length,
+            direction,
+            spread if spread.any() else NOTHING,
+            gravity if np.isfinite(gravity).any() else NOTHING,
+        )
+        return int(number[0]), sample, known > 0.5
 
     # -- writing --------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ needs many, and gets them from the body. Preset `paper` trains on the samples al
 from __future__ import annotations
 
 import copy
+import math
 import re
 import time
 from abc import ABC, abstractmethod
@@ -23,6 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
@@ -35,7 +38,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
-from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.mae.units import State, scale_vector
 from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -57,14 +60,18 @@ class Updater(ABC):
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
         estimate = self._mae.estimate(newest.tension, newest.length).theta
-        error = float(np.linalg.norm(estimate - newest.theta, axis=1).mean())
+        seen = np.isfinite(newest.theta)
+        away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
+        error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
         update = self._learn(job)
         return update._replace(error=error, seconds=time.perf_counter() - begun)
 
     @abstractmethod
     def _learn(self, job: Job) -> Update: ...
 
-    def _published(self, network: Network, preset: str, steps: int, job: Job) -> Mae:
+    def _published(
+        self, network: Network, preset: str, steps: int, job: Job, fit: Fit | None = None
+    ) -> Mae:
         """Return the network that runs, with its statistics, and with what it has learned."""
         origin, samples = self._origin, len(job.seen)
         history = (
@@ -77,6 +84,9 @@ class Updater(ABC):
         if self.body is not None:
             friction = np.array([self.body.friction(m) for m in range(self._robot.muscle_count)])
             mae = replace(mae, touch=TouchStatistics(friction, np.ones(self._robot.joint_count)))
+        if fit is not None and self.body is not None:
+            covariance = estimate_covariance(mae, self.body, fit, np.random.default_rng(self._seed))
+            mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
 
@@ -123,8 +133,8 @@ class PaperUpdater(Updater):
     def _learn(self, job: Job) -> Update:
         """Learn one newest sample among stored ones; `job.steps` is the paper's own here."""
         # The print knows no changed muscle: a sample that says nothing about one is none.
-        whole = np.flatnonzero(job.seen.known.all(axis=1))
-        values = job.seen[whole].state().scaled()
+        seen = job.seen.seen_whole()
+        values = seen[np.flatnonzero(seen.known.all(axis=1))].state().scaled()
         batches = []
         for _ in range(BATCHES if len(values) >= PAPER.least_samples else 0):
             stored = self._rng.choice(len(values) - 1, DATA, replace=False)
@@ -178,7 +188,8 @@ class BodyUpdater(Updater):
     def _learn(self, job: Job) -> Update:
         seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
-        fit = fit_body(body, seen, prior_mean=self._prior_mean)
+        guess = self._mae.estimate(seen.tension, seen.length).theta
+        fit = fit_body(body, seen, self._prior_mean, guess)
         contradicted = contradicted_muscles(seen, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
         # the robust weights leave such samples out until they are the rule.
@@ -188,10 +199,10 @@ class BodyUpdater(Updater):
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
         data = synthetic_samples(body, fit.noise, count, self._rng, seen)
-        self._mix_in_real(data, seen, fit)
+        self._mix_in_real(data, replace(seen, theta=fit.theta), fit)
         loss_now = self._trainer.train(data, job.steps)
         return Update(
-            self._published(self._trainer.network, 'default', self._trainer.steps, job),
+            self._published(self._trainer.network, 'default', self._trainer.steps, job, fit),
             loss_now,
             fit.noise,
             contradicted if alone else (),
@@ -203,6 +214,7 @@ class BodyUpdater(Updater):
 
         That shows once there are a few samples, and is worse than no body at all.
         """
+        seen = seen.seen_whole()
         if self._prior_mean is None or self._prior_mean_confirmed or len(seen) < IN_A_ROW:
             return self.body
         self._prior_mean_confirmed = True
@@ -294,6 +306,40 @@ def synthetic_samples(
     scattered = scattered + noise * rng.standard_normal(shape)
     true, seen = State(theta, tension, length), State(theta, tension, scattered)
     return TrainingData(seen.scaled(), true.scaled())
+
+
+BODIES, EACH = 10, 100  # bodies that the samples allow, and samples of each
+INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
+
+
+def estimate_covariance(mae: Mae, body: CorrectedBody, fit: Fit, rng: np.random.Generator) -> Array:
+    """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
+
+    What the samples leave open of the body is drawn from the fit's posterior (Laplace), and of each
+    such body what the network says of its samples is compared with where it is. Errors have heavier
+    tails than a normal distribution: the covariance is scaled so that its ellipsoid of 95 % holds
+    as many of them.
+    """
+    errors = []
+    for _ in range(BODIES):
+        drawn = copy.copy(body)
+        drawn.parameters = list(body.parameters)
+        for muscles, root in fit.root:
+            step = solve_triangular(root, rng.standard_normal(len(root)))
+            ends = np.cumsum([body.layouts[m].size for m in muscles])
+            for m, part in zip(muscles, np.split(step, ends)):
+                drawn.parameters[m] = body.parameters[m] + part
+        data = synthetic_samples(drawn, fit.noise, EACH, rng)
+        joints, muscle_count = len(mae.joints), len(mae.muscles)
+        theta, tension, length = np.split(
+            data.seen / scale_vector(joints, muscle_count), [joints, -muscle_count], axis=1
+        )
+        errors.append(mae.estimate(tension, length).theta - theta)
+    error = np.concatenate(errors)
+    covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
+    distance = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
+    covariance *= np.quantile(distance, INSIDE) / chi2.ppf(INSIDE, error.shape[1])
+    return 0.5 * (covariance + covariance.T)
 
 
 def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

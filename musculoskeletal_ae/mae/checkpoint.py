@@ -72,6 +72,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
     groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None = None  # none: no statistics
+    uncertain: bool = False  # whether it tells the covariance of its estimates
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -123,6 +124,8 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             shapes['anomaly.postures'] = self.anomaly_postures, len(self.joints)
         if self.touch_time is not None:
             shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
+        if self.uncertain:
+            shapes['covariance'] = len(self.joints), len(self.joints)
         return shapes
 
 
@@ -150,6 +153,8 @@ def to_bytes(mae: Mae) -> bytes:
     if (touch := mae.touch) is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
         entries['touch_time'] = touch.time
+    if mae.covariance is not None:
+        tensors['covariance'], entries['uncertain'] = mae.covariance, True
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
@@ -237,22 +242,23 @@ def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, A
     if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
         told = f'tensor touch.friction holds ±{most:g}; at most {LARGEST_FRICTION:g} is legal'
         raise CheckpointError(told)
-    if 'anomaly.covariance' in tensors:
-        _check_covariance(tensors['anomaly.covariance'])
+    for name in ('anomaly.covariance', 'covariance'):
+        if name in tensors:
+            _check_covariance(name, tensors[name])
     return tensors
 
 
-def _check_covariance(covariance: Array) -> None:
+def _check_covariance(name: str, covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
-        raise CheckpointError('tensor anomaly.covariance is not symmetric')
+        raise CheckpointError(f'tensor {name} is not symmetric')
     try:
         least, *_, most = np.linalg.eigvalsh(covariance)
     except np.linalg.LinAlgError as error:
-        raise CheckpointError('tensor anomaly.covariance has no eigenvalues') from error
+        raise CheckpointError(f'tensor {name} has no eigenvalues') from error
     # Nearer to singular it could not be inverted, as the detector does.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
-            f'tensor anomaly.covariance has eigenvalues from {least:g} to {most:g}; the least must '
+            f'tensor {name} has eigenvalues from {least:g} to {most:g}; the least must '
             f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
         )
 
@@ -283,6 +289,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         std=tensors['std'],
         anomaly=anomaly,
         touch=touch,
+        covariance=tensors.get('covariance'),
         groups=meta.groups,
         **{name: getattr(meta, name) for name in SHARED},
     )

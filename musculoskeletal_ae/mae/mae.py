@@ -185,6 +185,7 @@ class Mae:
     training: str = ''  # how it was trained, for people to read
     anomaly: AnomalyStatistics | None = None  # residuals of healthy data
     touch: TouchStatistics | None = None  # friction and healthy torques, once some are learned
+    covariance: Array | None = None  # of θ_est − θ [rad²] (D, D), once a body is learned
     groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)

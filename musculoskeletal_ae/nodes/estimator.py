@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
-muscle_states → estimated_joint_states, estimated_muscle_states, anomaly, anomaly_detected,
+muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
+anomaly, anomaly_detected,
 estimated_external_wrench, muscle_length_zeros (joint_states help to find those), estimated/markers;
 on request muscle_joint_states and /tf;
 marker_pose → vision_joint_states, the joint angles that a camera sees.
@@ -50,6 +51,8 @@ class Estimator(Shell):
         self.plausibility = Plausibility(self.robot)
         self.joints = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscles = self.create_publisher(Float64MultiArray, 'estimated_muscle_states', RELIABLE)
+        topic = 'estimated_joint_covariance'
+        self.covariance = self.create_publisher(Float64MultiArray, topic, RELIABLE)
         self.anomaly = self.create_publisher(Float64, 'anomaly', RELIABLE)
         self.wrench = self.create_publisher(WrenchStamped, 'estimated_external_wrench', RELIABLE)
         self.detected = self.create_publisher(Bool, 'anomaly_detected', LATCHED)
@@ -143,6 +146,8 @@ class Estimator(Shell):
             self.gate.message(tension, from_zero, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
+        if self.core.mae is not None and (covariance := self.core.mae.covariance) is not None:
+            self.covariance.publish(array_message(covariance, 'joint', 'joint'))
         restored = np.stack([state.length, state.tension])
         self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
         self.anomaly.publish(Float64(data=estimate.anomaly))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `hardware_emulator`: an arm with muscle modules, and faults on request.
 
-muscle_length_command, muscle_tension_command → joint_states, muscle_states, marker_pose, markers.
+muscle_length_command, muscle_tension_command → joint_states, muscle_states, marker_pose,
+markers; on request imu.
 """
 
 from __future__ import annotations
@@ -11,14 +12,18 @@ from functools import partial
 from typing import Any
 
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.robot.kinematics import body_frames
 
 
 class HardwareEmulator(Arm):
@@ -39,6 +44,13 @@ class HardwareEmulator(Arm):
         self.follow_parameter('marker_pose_rate', partial(setattr, self, 'marker_pose_rate'))
         self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
+        self.imu = None
+        if link := self.parameter('imu_link'):
+            links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
+            if link not in links:
+                told = f'{link!r}; legal: {", ".join(links)}'
+                raise MusculoskeletalError(f'parameter imu_link: {told}')
+            self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_muscles('muscle_length_command', self.arm.command_length)
         self.follow_muscles('muscle_tension_command', self.arm.command_tension)
         self.follow_wrench(self.arm.set_wrench)
@@ -63,9 +75,20 @@ class HardwareEmulator(Arm):
         self.reading = self.arm.sense()
         for reading in self.arm.faults.delivered(self.reading, now):
             self.publish_state(*reading)
+        if self.imu is not None:
+            self._publish_imu(self.imu)
         if self.marker_pose_rate > 0.0 and now >= self.pose_due:
             self.pose_due = max(self.pose_due + 1.0 / self.marker_pose_rate, now)
             self._publish_pose()
+
+    def _publish_imu(self, publisher: Publisher) -> None:
+        link, message = self.parameter('imu_link'), Imu()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = self.parameter('frame_prefix') + link
+        message.orientation_covariance[0] = -1.0  # no orientation is measured
+        held = self.arm.accelerometer(link).tolist()
+        message.linear_acceleration = Vector3(**dict(zip('xyz', held)))
+        publisher.publish(message)
 
     def _publish_pose(self) -> None:
         pose = self.arm.marker_pose()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: learns the body online and hands the network to the other nodes.
 
-joint_states or vision_joint_states, muscle_states, anomaly_detected → mae_checkpoint.
+joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_detected →
+mae_checkpoint.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -18,10 +20,12 @@ from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message, serve
+from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.validity import read_imu
 
 POLL = 0.05  # [s] between looks at the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
@@ -40,6 +44,7 @@ class Learner(Shell):
             steps=value('update_steps'),
             period=1.0 / self.rate,
             settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
+            joint_source=value('joint_source'),
             training=TrainingProcess,
             directory=self._directory(value('state_directory')),
         )
@@ -50,8 +55,12 @@ class Learner(Shell):
         indices, core = self.robot.muscle_indices, self.core
         self.follow_parameter('relearn_muscles', lambda names: core.relearn(indices(names)))
         self.running = True
-        self.needed = [JOINT_TOPICS[value('joint_source')], 'muscle_states']
-        self.follow_posture(self.needed[0], lambda theta: core.joints(self._now(), theta))
+        self.needed = ['muscle_states']
+        if topic := JOINT_TOPICS.get(value('joint_source')):
+            self.needed.insert(0, topic)
+            self.follow_posture(topic, lambda theta: core.joints(self._now(), theta), some=True)
+        self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
+        self.listen(Imu, 'imu', self._take_imu, SENSOR)
         self.follow_zeros(lambda known, _: core.zeros(known))
         # length, tension, temperature
         self.follow_muscle_states(lambda states: core.muscles(self._now(), *states[1::-1]))
@@ -91,6 +100,10 @@ class Learner(Shell):
 
     def _now(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
+
+    def _take_imu(self, message: Imu) -> None:
+        prefix = self.parameter('frame_prefix')
+        self.core.imu(self._now(), *read_imu(message, self.links, prefix))
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)

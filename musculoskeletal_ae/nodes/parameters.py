@@ -99,6 +99,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'marker_pose_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
+        'imu_link': Parameter('', 'link that carries an accelerometer (empty: none does)'),
         'command_timeout': Parameter(
             0.5, 'time without a command until the modules go safe', 's', (0.01, 60), settable=True
         ),
@@ -116,7 +117,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'preset': PRESET,
         'seed': SEED,
         'joint_source': Parameter(
-            'sensor', 'joint_states, or vision_joint_states', legal=('sensor', 'marker')
+            'sensor',
+            'joint_states (of any joints), vision_joint_states (now and then), or neither',
+            legal=('sensor', 'marker', 'none'),
         ),
         'relearn_muscles': Parameter(
             ('',), 'replaced or re-wired muscles, whose constants are learned anew', settable=True

@@ -291,10 +291,15 @@ class Shell(Node):
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
-    def follow_posture(self, topic: str, follow: Callable[[Array], object]) -> None:
-        """Give `follow` the θ [rad] (D,) that comes on a topic of joint states."""
+    def follow_posture(
+        self, topic: str, follow: Callable[[Array], object], some: bool = False
+    ) -> None:
+        """Give `follow` the θ [rad] (D,) that comes on a topic of joint states.
+
+        If `some` joints are enough, the others are NaN.
+        """
         joints = self.robot.joints
-        self.listen(JointState, topic, lambda m: follow(read_posture(m, joints)), SENSOR)
+        self.listen(JointState, topic, lambda m: follow(read_posture(m, joints, some)), SENSOR)
 
     # -- diagnostics ----------------------------------------------------------------------------
 

@@ -31,6 +31,8 @@ KEYS = {
     'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m '
     'wrench_error false_contacts',
     'robustness': 'kin foreign ablation_rad',
+    'sensors': 'all_rad elbow_only_rad none_rad marker_tenth_rad imu_rad before_rad '
+    'ellipsoid_share',
 }
 REALITY = (
     'before_rad after_rad paper_after_rad oracle_rad informed_oracle_rad frozen_after_rad '

@@ -102,6 +102,6 @@ def test_a_muscle_that_nothing_is_known_of_is_trusted_as_far_as_it_may_be_off(ar
         store.add(stage.sample())
     again = fit_body(CorrectedBody(arm26), store.observations()).noise
     others = np.arange(arm26.muscle_count) != 1
-    np.testing.assert_array_equal(forgotten[others], known[others])
+    np.testing.assert_allclose(forgotten[others], known[others], rtol=0.01)
     assert forgotten[1] > 10.0 * known[1]
     assert known[1] < again[1] < 0.5 * forgotten[1]

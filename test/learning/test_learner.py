@@ -236,3 +236,53 @@ def test_a_replaced_network_starts_anew_and_counts_on(learner, initial, stage):
     assert learner.checkpoint is None
     learner.accept(stage.sample())
     assert learner.poll(5.0) is None
+
+
+class Partly(Arm):
+    """Rests with readings of the given joints only."""
+
+    read = ()
+
+    def rest(self, seconds, sample=None):
+        sample = sample or self.stage.sample()
+        theta = np.full(2, np.nan)
+        theta[list(self.read)] = sample.theta[list(self.read)]
+        theta = theta if self.read else None
+        return super().rest(seconds, sample._replace(theta=theta))
+
+
+def test_an_arm_without_joint_sensors_rests_while_its_muscles_do(arm26, initial, stage):
+    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    arm = Partly(learner, stage)
+    for _ in range(25):
+        arm.rest(1.1)
+    assert len(learner.samples) >= 20
+    assert np.isnan(learner.samples.observations().theta).all()
+    assert len(learner.training.jobs[0].seen) == 20  # fewer say too little
+
+
+def test_with_joint_sensors_a_rest_needs_one_of_them(arm26, initial, stage):
+    for read, samples in (((), 0), ((1,), 3)):
+        learner = Learner(arm26, initial, training=Prepared)
+        arm = Partly(learner, stage)
+        arm.read = read
+        for _ in range(6):
+            arm.rest(1.1)
+        assert len(learner.samples) >= samples
+        assert (len(learner.samples) > 0) == (samples > 0)
+        for sample in learner.samples.samples:
+            assert np.isfinite(sample.theta).tolist() == [False, True]
+
+
+def test_an_accelerometer_tells_where_down_is_while_it_is_heard(arm26, initial, stage):
+    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    arm = Partly(learner, stage)
+    arm.rest(1.0)
+    joint, placement = arm26.kinematics.placement('forearm')
+    learner.imu(arm.time, 'forearm', placement.rotation.T @ [0.0, 0.0, 9.8])
+    arm.rest(0.4)
+    (gravity,) = learner._rests.gravity.reshape(1, -1, 3)
+    np.testing.assert_allclose(gravity[joint], [0.0, 0.0, -1.0], atol=1e-9)
+    assert np.isnan(np.delete(gravity, joint, axis=0)).all()
+    arm.rest(1.0)
+    assert not learner._rests.gravity.size

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import resource
 import shutil
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.state import FILE, State
+from musculoskeletal_ae.learning.state import FILE, HEAD, MARK, State
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -226,7 +226,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     store, state = SampleStore(), State(tmp_path, small)
     state.load(store)
     for _ in range(4):
-        theta, *parts = stage.sample()
+        theta, *parts, _, _ = stage.sample()
         store.add(Sample(theta, *(part[kept] for part in parts)))
     store.forget(0, newest=1)
     state.keep(store, checkpoint.to_bytes(network))
@@ -497,3 +497,35 @@ def test_no_file_of_a_state_can_be_anything_else(tmp_path, arm26, stage, name, k
     finally:
         if state is not None:
             state.close()
+
+
+def test_what_a_camera_and_an_accelerometer_said_survives(arm26, tmp_path):
+    gravity = np.full(3 * len(arm26.kinematics.parent), np.nan)
+    gravity[3:6] = 0.0, 0.6, -0.8
+    plain = Sample(np.array([0.1, np.nan]), np.full(6, 50.0), np.zeros(6), np.ones(6))
+    told = plain._replace(spread=np.full(2, 0.02), gravity=gravity)
+    store, again = SampleStore(), SampleStore()
+    for sample in (plain, told, plain._replace(gravity=gravity)):
+        store.add(sample)
+    with closing(State(tmp_path, arm26)) as state:
+        state.save(store, None)
+    with closing(State(tmp_path, arm26)) as state:
+        state.load(again)
+    for before, after in zip(store.samples, again.samples, strict=True):
+        for one, two in zip(before, after, strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_samples_from_before_they_told_their_spread_are_read(arm26, tmp_path, monkeypatch):
+    store, again = SampleStore(), SampleStore()
+    store.add(Sample(np.array([0.1, 0.2]), np.full(6, 50.0), np.zeros(6), np.ones(6)))
+    with closing(State(tmp_path, arm26)) as state:
+        record = state._packed(1, store.samples[0], store.known[0])
+        values = record[HEAD.size : state._sizes(arm26.muscles)[1]]
+        old = HEAD.pack(MARK, state._checksum(values, arm26.muscles)) + values
+        monkeypatch.setattr(state, '_packed', lambda *_: old)
+        state.save(store, None)
+    with closing(State(tmp_path, arm26)) as state:
+        state.load(again)
+        assert not state.not_used
+    np.testing.assert_array_equal(again.samples[0].theta, store.samples[0].theta)

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
 
@@ -251,3 +252,16 @@ def test_a_wrong_parameter_is_one_clear_line(graph, parameters, expected):
     assert process.process.returncode == 1
     assert output.startswith('error: ') and output.count('\n') == 1
     assert expected in output
+
+
+def test_a_network_that_knows_its_uncertainty_tells_it(graph, arm26, trained_file, tmp_path):
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    mae = replace(checkpoint.load(trained_file, arm26), covariance=covariance)
+    file = tmp_path / 'sure.safetensors'
+    checkpoint.save(mae, file)
+    node = graph.host(Estimator, robot='arm26', checkpoint=str(file))
+    told = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
+    graph.host(HardwareEmulator, robot='arm26')
+    message = graph.wait(lambda: told and told[-1], 'the covariance')
+    np.testing.assert_array_equal(np.reshape(message.data, (2, 2)), covariance)
+    assert '0.020' in node.report().values['joint uncertainty']

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -212,3 +212,14 @@ def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
 def test_no_such_reality_ends_it_with_a_reason(graph):
     with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
         graph.host(HardwareEmulator, robot='arm26', reality='no/such.xml')
+
+
+def test_an_accelerometer_on_request_tells_where_down_is(graph):
+    graph.host(HardwareEmulator, robot='arm26', imu_link='hand', frame_prefix='left/')
+    read = graph.listen(Imu, 'imu')
+    message = graph.wait(lambda: read and read[-1], 'the accelerometer')
+    assert message.header.frame_id == 'left/hand'
+    held = message.linear_acceleration
+    assert abs(np.linalg.norm([held.x, held.y, held.z]) - 9.81) < 0.5
+    with pytest.raises(MusculoskeletalError, match='forearm'):
+        graph.host(HardwareEmulator, robot='arm26', imu_link='knee')

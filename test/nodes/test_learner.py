@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -78,6 +78,10 @@ class HostedLearner:
     @property
     def samples(self):
         return len(self.node.core.samples)
+
+    @property
+    def tilted(self):
+        return self.node.core._rests.gravity.size > 0
 
     @property
     def updates(self):
@@ -307,6 +311,26 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
         return 'rejected marker_pose: wrong frame' in graph.report('estimator').values
 
     graph.wait(refused, 'the refusal of another frame')
+
+
+def test_learning_needs_no_joint_sensors(host, graph):
+    learner = host(joint_source='none')
+    learner.learn(lambda: learner.samples >= 2, 'samples without angles')
+    assert np.isnan(learner.node.core.samples.observations().theta).all()
+    assert 'joint_states' not in learner.node.needed
+    publisher = graph.publisher(Imu, 'imu')
+    message = Imu()
+    message.linear_acceleration.z = 9.81
+    for frame, reason in (('forearm', ''), ('nowhere', 'imu: wrong frame')):
+        message.header.frame_id = frame
+
+        def taken(reason=reason):
+            publisher.publish(message)
+            learner.step()
+            told = learner.node.rejected
+            return reason in told if reason else learner.tilted
+
+        graph.wait(taken, f'what came of {frame}')
 
 
 def test_two_learners_do_not_share_a_directory(graph, host, state):

@@ -22,7 +22,11 @@ def rights(node: str, kind: str, action: str) -> set[str]:
 def test_a_node_uses_the_rights_that_the_policy_gives_it(graph, name, tmp_path):
     module = importlib.import_module(f'musculoskeletal_ae.nodes.{name}')
     kind = getattr(module, ''.join(word.title() for word in name.split('_')))
-    extra = {'learner': {'state_directory': str(tmp_path)}, 'estimator': {'mirror_muscles': True}}
+    extra = {
+        'learner': {'state_directory': str(tmp_path)},
+        'estimator': {'mirror_muscles': True},
+        'hardware_emulator': {'imu_link': 'forearm'},
+    }
     node = graph.host(kind, robot='arm26', **extra.get(name, {}))
     private = f'{graph.namespace}/{name}/'
 

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fewer sensors.
+
+Paper. Musashi has joint sensors at few joints, and a marker on the hand takes their place; what a
+part of them or none is worth is not measured.
+
+Here. The messages of the default network’s exploration teach learners that see less of them: all
+joint sensors; only those of the elbow (joints so named, else the last one); none; none but a marker
+on the hand in one of ten samples, by inverse kinematics as in the estimator; none but an
+accelerometer on the link of the hand. All are judged on the held-out motion. "In the ellipsoid" is
+the share of its messages whose true angles lie in the ellipsoid of 95 % that the network tells,
+with all joint sensors and with none. The arm explored with the network that saw all joint sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import chi2
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
+from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments.recording import (
+    SAMPLE_TIME,
+    Recording,
+    estimation_error,
+)
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
+from musculoskeletal_ae.experiments.table import NOTHING, Row
+from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
+from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
+
+CAMERA = 10  # messages to one picture, or to one of the accelerometer
+SIGHTED = 10  # samples to one that the marker is seen in
+INSIDE = 0.95
+
+#: told learner, number of a message, true θ (D,) and what sensors read; returns θ (D,) or None
+See = Callable[[Learner, int, Array, Array], Array | None]
+
+
+def measure(study: Study, seed: int) -> Measured:
+    """Teach learners that see less and less of an individual."""
+    robot, held_out = study.robot, study.stream(seed, 'held_out')
+    rng = np.random.default_rng([seed, 0x5E])
+    elbow = np.array([name.startswith('elbow') for name in robot.joints])
+    elbow[-1] |= not elbow.any()
+    hand = robot.description.end_effector
+
+    def marker(learner: Learner, n: int, theta: Array, _: Array) -> Array | None:
+        if n % CAMERA or len(learner.samples) % SIGHTED:
+            return None
+        pose = seen_by_camera(robot.kinematics.end_effector_pose(theta), rng)
+        guess = learner.mae.estimate(tension[n], length[n]).theta
+        return inverse_kinematics(robot, pose, guess).theta
+
+    def tilt(learner: Learner, n: int, theta: Array, _: Array) -> None:
+        if n % CAMERA == 0:
+            learner.imu(SAMPLE_TIME * n, hand, felt_at_rest(robot, theta, hand, rng))
+
+    ways: dict[str, tuple[str, See]] = {
+        'all': (SENSOR, lambda _l, _n, _t, read: read),
+        'elbow_only': (SENSOR, lambda _l, _n, _t, read: np.where(elbow, read, np.nan)),
+        'none': (NONE, lambda *_: None),
+        'marker_tenth': (MARKER, marker),
+        'imu': (NONE, tilt),
+    }
+    stream = study.stream(seed, 'exploring')
+    length, tension = stream.length, stream.tension
+    numbers = {'before_rad': estimation_error(study.network(None, 'default'), held_out)}
+    for name, (source, see) in ways.items():
+        mae = _taught(study, seed, source, see, stream)
+        numbers[f'{name}_rad'] = estimation_error(mae, held_out)
+        if mae.covariance is not None and name in ('all', 'none'):
+            key = 'ellipsoid_share' if name == 'all' else 'none_ellipsoid_share'
+            numbers[key] = ellipsoid_share(mae, held_out)
+    return Measured(numbers, {})
+
+
+def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -> Mae:
+    initial, steps = study.network(None, 'default'), STEPS // 5 if study.quick else STEPS
+    learner = Learner(study.robot, initial, 'default', seed, steps=steps, joint_source=source)
+    for n, (theta, read, length, tension, _) in enumerate(zip(*stream, strict=True)):
+        learner.step(SAMPLE_TIME * n, see(learner, n, theta, read), tension, length)
+    return learner.mae
+
+
+def ellipsoid_share(mae: Mae, recording: Recording) -> float:
+    """Return the share of messages whose true θ lies in the ellipsoid of 95 %."""
+    assert mae.covariance is not None  # asked by the caller
+    error = mae.estimate(recording.tension, recording.length).theta - recording.theta
+    distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
+    return float((distance <= chi2.ppf(INSIDE, error.shape[1])).mean())
+
+
+BARS = {
+    'before_rad': 'before learning',
+    'none_rad': 'none',
+    'imu_rad': 'none, accelerometer',
+    'elbow_only_rad': 'elbow only',
+    'marker_tenth_rad': 'marker in 1 of 10',
+    'all_rad': 'all joint sensors',
+}
+
+
+def sensors(_: Study, rows: Rows) -> Plot:
+    """Draw the error that is left with less and less sensors."""
+    figure, (panel,) = plots.new_figure(9.0, 4.2)
+    values = np.array([[row.numbers[key] for key in BARS] for row in rows.values()])
+    bars = panel.bar(range(len(BARS)), values.mean(axis=0), 0.6, color=plots.AFTER)
+    panel.bar_label(bars, fmt='%.3f', fontsize=9)
+    for each in values:
+        panel.plot(range(len(BARS)), each, 'o', color=plots.MARK, ms=3)
+    panel.set_xticks(range(len(BARS)), BARS.values(), rotation=15)
+    plots.tidy(panel, '', 'mean error, held-out motion [rad]')
+    return figure, (
+        'Error on the motion never used for learning, by what the learner sees of the joints: '
+        f'means over individuals {", ".join(map(str, rows))}; dots: each.'
+    )
+
+
+ROWS = (
+    Row('learned with all joint sensors [rad]', NOTHING, '', 'all_rad', '', 0.035),
+    Row('learned with the elbow’s sensors only [rad]', NOTHING, '', 'elbow_only_rad', '', 0.05),
+    Row('learned without joint sensors [rad]', NOTHING, '', 'none_rad', '', 0.09),
+    Row('… and a marker in one of ten samples [rad]', NOTHING, '', 'marker_tenth_rad', '', 0.045),
+    Row('… and an accelerometer on the hand [rad]', NOTHING, '', 'imu_rad', '', 0.06),
+    Row('true angles in the ellipsoid of 95 %', NOTHING, '', 'ellipsoid_share', digits=2),
+)  # fmt: skip
+EXPERIMENT = Experiment(__doc__, measure, (sensors,), 24.0, ROWS)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Body and postures found together, from whatever sensors there are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from learning.conftest import Stage
+from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
+from musculoskeletal_ae.learning.postures import _GroupFit
+from musculoskeletal_ae.learning.samples import Observations
+
+
+class Resting(Stage):
+    """Gives samples of a body that its muscles hold against its weight, as a real rest is."""
+
+    def observations(self, count: int) -> Observations:
+        robot, body = self.body.robot, self.body
+        theta = robot.random_postures(count, self.rng)
+        weight = robot.kinematics.holding_torque(theta)
+        tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
+        direction = self.rng.choice([-1.0, 1.0], tension.shape)
+        steps = 1e-4 * np.eye(robot.joint_count)
+        for _ in range(3):  # the nearest tensions that hold the arm
+            slope = np.stack(
+                [
+                    body.lengths(theta + step, tension, direction)[0]
+                    - body.lengths(theta - step, tension, direction)[0]
+                    for step in steps
+                ],
+                axis=-1,
+            )
+            slope /= 2e-4
+            missing = weight + np.einsum('nm,nmi->ni', tension, slope)
+            inverse = np.linalg.pinv(slope.swapaxes(1, 2))
+            tension = np.maximum(tension - np.einsum('nmi,ni->nm', inverse, missing), 5.0)
+        (length,) = body.lengths(theta, tension, direction)
+        length = length + 1e-4 * self.rng.standard_normal(length.shape)
+        return Observations(theta, tension, length, direction, np.ones(length.shape, dtype=bool))
+
+
+@pytest.fixture(scope='module')
+def resting(other_body) -> Resting:
+    return Resting(other_body, seed=5)
+
+
+@pytest.fixture(scope='module')
+def seen(resting) -> Observations:
+    return resting.observations(60)
+
+
+def blind(seen: Observations) -> Observations:
+    nothing = np.full_like(seen.theta, np.nan)
+    return replace(seen, theta=nothing, spread=np.zeros_like(nothing))
+
+
+def errors(arm26, seen, truth) -> tuple[float, float]:
+    """Return how far postures are off before and after the fit [rad]."""
+    rng = np.random.default_rng(1)
+    guess = truth + rng.normal(0.0, 0.15, truth.shape)
+    found = fit_body(CorrectedBody(arm26), seen, guess=guess).theta
+    return tuple(float(np.linalg.norm(t - truth, axis=1).mean()) for t in (guess, found))
+
+
+def test_postures_are_found_from_the_muscles_alone(arm26, seen):
+    before, after = errors(arm26, blind(seen), seen.theta)
+    assert after < before / 3.0
+
+
+def test_each_anchor_brings_them_nearer(arm26, seen):
+    truth, rng = seen.theta, np.random.default_rng(2)
+    _, nothing = errors(arm26, blind(seen), truth)
+    sighted = blind(seen)
+    sighted.theta[::10] = truth[::10] + rng.normal(0.0, 0.01, truth[::10].shape)
+    sighted.spread[::10] = 0.02
+    assert errors(arm26, sighted, truth)[1] < nothing
+    partly = blind(seen)
+    partly.theta[:, 1] = truth[:, 1]
+    assert errors(arm26, partly, truth)[1] < nothing
+    kinematics = arm26.kinematics
+    turn = kinematics.joint_poses(truth).rotation
+    gravity = np.full((len(truth), len(kinematics.parent), 3), np.nan)
+    down = kinematics.model.gravity.linear / np.linalg.norm(kinematics.model.gravity.linear)
+    gravity[:, -1] = turn[:, -1].swapaxes(1, 2) @ down
+    tilted = replace(blind(seen), gravity=gravity.reshape(len(truth), -1))
+    assert errors(arm26, tilted, truth)[1] < nothing
+
+
+def test_the_zero_of_a_joint_sensor_is_no_error_of_the_body(arm26, seen):
+    off = replace(seen, theta=seen.theta + [0.03, 0.0])
+    found = fit_body(CorrectedBody(arm26), off).theta
+    left = np.abs(found - seen.theta).mean(axis=0)
+    assert left[0] < 0.03
+    assert left[1] < 0.01
+
+
+def test_angles_that_are_read_stay_where_they_are_read(arm26, seen):
+    found = fit_body(CorrectedBody(arm26), seen).theta
+    assert np.abs(found - seen.theta).max() < 0.03
+
+
+def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
+    part = seen[np.arange(8)]
+    body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
+    joints, muscles = np.arange(2), np.arange(6)
+    mean = [np.zeros(layout.size) for layout in body.layouts]
+    spread = [np.ones(layout.size) for layout in body.layouts]
+    fit = _GroupFit(body, part, joints, muscles, mean, spread, 3e-4)
+    zero, step = np.zeros(2), 1e-6
+    rows = fit.rows(part.theta, zero)
+    column = 0
+    for m, layout in enumerate(body.layouts):
+        for k in (0, layout.friction, layout.size - 1):
+            at = body.parameters[m][k]
+            body.parameters[m][k] = at + step
+            moved = fit.rows(part.theta, zero)
+            body.parameters[m][k] = at
+            # Residuals are what was seen less the body's.
+            slope = -(moved.length[:, m] - rows.length[:, m]) / step
+            np.testing.assert_allclose(rows.by_body[m][:, k], slope, atol=1e-5)
+            slope = -(moved.torque - rows.torque) / step
+            expected = rows.torque_by_body[:, :, column + k]
+            np.testing.assert_allclose(expected, slope, atol=1e-2 + 1e-3 * np.abs(slope).max())
+        column += layout.size
