@@ -38,7 +38,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
-from musculoskeletal_ae.mae.units import State, scale_vector
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -85,7 +85,8 @@ class Updater(ABC):
             friction = np.array([self.body.friction(m) for m in range(self._robot.muscle_count)])
             mae = replace(mae, touch=TouchStatistics(friction, np.ones(self._robot.joint_count)))
         if fit is not None and self.body is not None:
-            covariance = estimate_covariance(mae, self.body, fit, np.random.default_rng(self._seed))
+            rng, tension = np.random.default_rng(self._seed), job.seen.tension
+            covariance = estimate_covariance(mae, self.body, fit, tension, rng)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
@@ -312,30 +313,29 @@ BODIES, EACH = 10, 100  # bodies that the samples allow, and samples of each
 INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
 
 
-def estimate_covariance(mae: Mae, body: CorrectedBody, fit: Fit, rng: np.random.Generator) -> Array:
+def estimate_covariance(
+    mae: Mae, body: CorrectedBody, fit: Fit, tension: Array, rng: np.random.Generator
+) -> Array:
     """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
 
-    What the samples leave open of the body is drawn from the fit's posterior (Laplace), and of each
-    such body what the network says of its samples is compared with where it is. Errors have heavier
-    tails than a normal distribution: the covariance is scaled so that its ellipsoid of 95 % holds
-    as many of them.
+    What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
+    taken as linear in it), and what the network says of such bodies' lengths, at postures and
+    tensions [N] (N, M) of the samples, is compared with where they are. Errors have heavier tails
+    than a normal distribution: the covariance is scaled so that its ellipsoid of 95 % holds as many
+    of them.
     """
-    errors = []
-    for _ in range(BODIES):
-        drawn = copy.copy(body)
-        drawn.parameters = list(body.parameters)
-        for muscles, root in fit.root:
-            step = solve_triangular(root, rng.standard_normal(len(root)))
-            ends = np.cumsum([body.layouts[m].size for m in muscles])
-            for m, part in zip(muscles, np.split(step, ends)):
-                drawn.parameters[m] = body.parameters[m] + part
-        data = synthetic_samples(drawn, fit.noise, EACH, rng)
-        joints, muscle_count = len(mae.joints), len(mae.muscles)
-        theta, tension, length = np.split(
-            data.seen / scale_vector(joints, muscle_count), [joints, -muscle_count], axis=1
-        )
-        errors.append(mae.estimate(tension, length).theta - theta)
-    error = np.concatenate(errors)
+    bodies = np.repeat(np.arange(BODIES), EACH)
+    theta = fit.theta[rng.integers(len(fit.theta), size=len(bodies))]
+    tension = tension[rng.integers(len(tension), size=len(bodies))]
+    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
+    poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
+    for muscles, root in fit.root:
+        steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
+        ends = np.cumsum([body.layouts[m].size for m in muscles])
+        for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
+            seen, slope = body.linearised(poses, theta, tension[:, m], direction[:, m], m)
+            length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
+    error = mae.estimate(tension, length).theta - theta
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
     covariance *= np.quantile(distance, INSIDE) / chi2.ppf(INSIDE, error.shape[1])

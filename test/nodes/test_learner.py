@@ -314,6 +314,7 @@ def test_learning_goes_on_from_the_vision_of_the_estimator(graph, arm26, trained
 
 
 def test_learning_needs_no_joint_sensors(host, graph):
+    graph.listen(JointState, 'joint_states')  # the learner does not
     learner = host(joint_source='none')
     learner.learn(lambda: learner.samples >= 2, 'samples without angles')
     assert np.isnan(learner.node.core.samples.observations().theta).all()
