@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the recordings of this folder on the emulated arm, in real time.
 
-    . .ci/environment.sh … (see README.md), then: python bags/make.py exploration|rupture|faults
+    . .ci/environment.sh … (see README.md), then: python bags/make.py NAME
 
 Runs emulator, estimator and controller at 20 Hz on a graph of its own and records what hardware and
 controller send.
@@ -25,44 +25,60 @@ os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 import rclpy
+from geometry_msgs.msg import WrenchStamped
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
 from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = 'musashi_left_arm'
 # One individual in all bags, so that what is learned from one can be tried on another.
 INDIVIDUAL = 1
 RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
 TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
+# Of `teaching`, which is short: also what is shown, how the hand is pushed, and what is sent then.
+TEACHING_RATE = 50.0  # [Hz]
+TAUGHT = 'muscle_tension_command,estimated_joint_states,joint_trajectory'
+PUSHED = 'hardware_emulator/external_wrench'
+POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 
 
 class Arm:
     """The running nodes, ended by pid."""
 
-    def __init__(self, bag: Path, checkpoint: Path, exploration: int) -> None:
-        """Start emulator, estimator, controller and recorder."""
+    def __init__(self, bag: Path, checkpoint: Path, exploration: int | None) -> None:
+        """Start emulator, estimator, controller and recorder; None: do not explore."""
         self._processes: list[subprocess.Popen[bytes]] = []
-        common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={RATE}']
+        rate = RATE if exploration else TEACHING_RATE
+        common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={rate}']
         network = ['-p', f'checkpoint:={checkpoint}']
-        explore = ['-p', 'explore:=true', '-p', f'seed:={exploration}']
+        explore = ['-p', 'explore:=true', '-p', f'seed:={exploration}'] if exploration else []
+        topics = TOPICS if exploration else f'{TOPICS},{TAUGHT},{PUSHED}'
         self._start('hardware_emulator', *common, '-p', f'seed:={INDIVIDUAL}')
         self._start('estimator', *common, *network)
-        self._start('record', '-o', str(bag), '--topics', TOPICS)
+        self._start('record', '-o', str(bag), '--topics', topics)
         self._start('controller', *common, *network, *explore, '-p', 'max_age:=0.5')
         rclpy.init()
         self.node = rclpy.create_node('make_bag')
-        self._emulator = AsyncParameterClient(self.node, 'hardware_emulator')
-        if not self._emulator.wait_for_services(timeout_sec=60.0):
-            raise TimeoutError('the emulator did not start within 60 s')
+        names = 'hardware_emulator', 'controller'
+        self._parameters = {name: AsyncParameterClient(self.node, name) for name in names}
+        for name, client in self._parameters.items():
+            if not client.wait_for_services(timeout_sec=60.0):
+                raise TimeoutError(f'{name} did not start within 60 s')
 
     def _start(self, name: str, *arguments: str) -> None:
+        self._processes.append(self.run(name, *arguments))
+
+    def run(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start an executable."""
         for prefix in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep):
             file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
             if file.exists():
-                self._processes.append(subprocess.Popen([sys.executable, str(file), *arguments]))
-                return
+                return subprocess.Popen([sys.executable, str(file), *arguments])
         raise FileNotFoundError(f'{name}: not installed; run ./bringup.sh once')
 
     def spend(self, seconds: float) -> None:
@@ -71,10 +87,10 @@ class Arm:
         while time.monotonic() < end:
             rclpy.spin_once(self.node, timeout_sec=0.1)
 
-    def set(self, name: str, value: Any) -> None:
-        """Set a parameter of the emulator."""
+    def set(self, name: str, value: Any, node: str = 'hardware_emulator') -> None:
+        """Set a parameter of a node."""
         print(f'{name}: {value}')
-        future = self._emulator.set_parameters([Parameter(name, value=value)])
+        future = self._parameters[node].set_parameters([Parameter(name, value=value)])
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
 
     def close(self) -> None:
@@ -114,10 +130,42 @@ def faults(arm: Arm) -> None:
         broken.publish(Float64MultiArray(data=array('d', data)))
 
 
-RECORDINGS: dict[str, tuple[Callable[[Arm], None], int]] = {
+def teaching(arm: Arm) -> None:
+    """A hand moves the floating arm; what it showed is recorded, and then repeated."""
+    targets = arm.node.create_publisher(JointState, 'target_joint_states', 10)
+    hand = arm.node.create_publisher(WrenchStamped, PUSHED, 10)
+    joints = Robot.load(ROBOT).joints
+    # So that the recorder listens before `replay` sends its one message.
+    arm.node.create_publisher(JointTrajectory, 'joint_trajectory', 10)
+    arm.spend(5.0)
+    targets.publish(JointState(name=joints, position=POSTURE))
+    arm.spend(6.0)
+    arm.set('method', 'float', 'controller')
+    with tempfile.TemporaryDirectory() as scratch:
+        shown = str(Path(scratch) / 'shown')
+        recorder = arm.run('record', '-o', shown, '--topics', 'estimated_joint_states')
+        arm.spend(4.0)
+        for force in PUSHES:
+            push = WrenchStamped()
+            push.wrench.force.x, push.wrench.force.y, push.wrench.force.z = force
+            hand.publish(push)
+            arm.spend(1.5)
+        arm.spend(1.5)
+        recorder.send_signal(signal.SIGTERM)
+        recorder.wait(timeout=30)
+        arm.set('method', 'proposed', 'controller')
+        arm.spend(2.0)
+        arm.run('replay', shown, '--as-trajectory', '--wait', '20').wait(timeout=60)
+    arm.spend(20.0)
+
+
+# [N] of the hand, one after the other.
+PUSHES = ((15.0, 0.0, 10.0), (0.0, 0.0, 0.0), (-10.0, 8.0, 12.0), (0.0, 0.0, 0.0))
+RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None]] = {
     'exploration': (exploration, 101),
     'rupture': (rupture, 102),
     'faults': (faults, 103),
+    'teaching': (teaching, None),
 }
 
 

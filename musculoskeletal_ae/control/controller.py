@@ -423,7 +423,7 @@ class Controller:
     @property
     def slowed(self) -> str:
         """By how much the last trajectory was slowed, or ''."""
-        last = self.motion.next[0] if self.motion.next else self.motion.trajectory
+        last = self.motion.latest
         if last is None or last.slowed == 1.0:
             return ''
         return f'slowed to {100.0 / last.slowed:.0f} % of its speed for the winches'

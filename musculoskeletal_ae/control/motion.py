@@ -157,6 +157,11 @@ class MotionControl:
         going = self.trajectory is not None and self.time < self.trajectory.duration
         return going or self.next is not None
 
+    @property
+    def latest(self) -> Trajectory | None:
+        """What was to be followed last, whether it has begun or is to come."""
+        return self.next[0] if self.next is not None else self.trajectory
+
     def ahead(self, delay: float) -> Setpoint:
         """Return what will be desired in `delay` [s], as far as is known now."""
         assert self.trajectory is not None

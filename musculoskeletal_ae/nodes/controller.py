@@ -3,15 +3,17 @@
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
 muscle_states, anomaly_detected → muscle_length_command, or muscle_tension_command with method
-`tension`; controller_state.
+`tension`; controller_state. Action follow_joint_trajectory, where control_msgs is installed.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -68,6 +70,14 @@ class Controller(Shell):
         self.listen(PoseStamped, 'target_pose', self._pose, RELIABLE)
         self.listen(TwistStamped, 'target_twist', self._twist, RELIABLE)
         self.states = self.create_publisher(JointTrajectory, 'controller_state', RELIABLE)
+        self.action: Any = None
+        with suppress(ImportError):  # control_msgs
+            kind = import_module('control_msgs.action').FollowJointTrajectory
+            module = import_module('musculoskeletal_ae.nodes.follow_joint_trajectory')
+            refuse = self._reception.reject
+            self.action = module.FollowJointTrajectory(
+                self, kind, self.core, self._trajectory, refuse
+            )
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
@@ -146,7 +156,7 @@ class Controller(Shell):
         if slowed := self.core.slowed:
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
-    def _publish_state(self) -> None:
+    def _state(self) -> JointTrajectory:
         """Say what is desired, what is estimated, and the error, as three points."""
         motion = self.core.motion
         desired, names = motion.desired, ('positions', 'velocities', 'accelerations')
@@ -160,7 +170,7 @@ class Controller(Shell):
         points[0].time_from_start = Duration(seconds=motion.time).to_msg()
         message = JointTrajectory(joint_names=self.robot.joints, points=points)
         message.header.stamp = self.get_clock().now().to_msg()
-        self.states.publish(message)
+        return message
 
     def _explore(self, request: SetBool.Request) -> str:
         if reason := self.core.explore(request.data):
@@ -191,7 +201,9 @@ class Controller(Shell):
             self.core.sent_at = time.monotonic()
             self.recording.heard(f'muscle_{command.kind}_command', message)
         if self.core.follows:
-            self._publish_state()
+            self.states.publish(self._state())
+        if self.action is not None:
+            self.action.step(self._state)
         safety, before = self.core.safety, self.latched
         self.latched = bool(safety.cause) and not safety.passing
         if self.latched and not before:

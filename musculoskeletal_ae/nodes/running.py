@@ -19,6 +19,7 @@ from typing import Any
 
 import rclpy
 from rclpy.constants import S_TO_NS
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -34,6 +35,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
+from rclpy.waitable import NumberOfEntities
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.parameters import COMBINED, OF_RCLPY, check_names, help_text
@@ -71,18 +73,19 @@ class LeanExecutor(SingleThreadedExecutor):
 
     rclpy builds its wait set anew, in Python, for every message, with every event of every topic in
     it, and wakes itself twice after each callback: more than half of what a node costs. Here it is
-    built when the node's entities change, and holds messages, timers and requests. Tasks and, once
-    a second, events of quality of service go rclpy's way.
+    built when the node's entities change, and holds messages, timers and requests. Actions and
+    tasks, at once, and events of quality of service, once a second, go rclpy's way.
 
     What a callback lets out is told to the node, rclpy's own for /clock and parameters included.
     """
 
     _wait_set: Any = None
     _urgent: tuple[tuple[list[Any], Any, str, Any], ...] = ()
+    _actions: tuple[Any, ...] = ()
     _rest_at = 0.0
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         self._held = ExitStack()
 
     def spin(self) -> None:
@@ -94,7 +97,7 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Let go of the node's entities, and of this executor's own."""
-        self._wait_set, self._urgent = None, ()
+        self._wait_set, self._urgent, self._actions = None, (), ()
         return super().shutdown(timeout_sec)
 
     def _spin_messages(self) -> bool:
@@ -106,6 +109,8 @@ class LeanExecutor(SingleThreadedExecutor):
         for entities, add, _, _ in self._urgent:
             for entity in entities:
                 add(entity.handle)
+        for action in self._actions:
+            action.add_to_wait_set(waiting)
         waiting.wait(EVENTS_EVERY * S_TO_NS)
         if not self.context.ok():
             raise ExternalShutdownException
@@ -116,7 +121,9 @@ class LeanExecutor(SingleThreadedExecutor):
             for entity in entities if pointers else ():
                 if entity.handle.pointer in pointers and self._is_due(entity):
                     self._run(entity, take)
-        return time.monotonic() < self._rest_at
+        # rclpy asks them again.
+        asked = any(action.is_ready(waiting) for action in self._actions)
+        return not asked and time.monotonic() < self._rest_at
 
     @staticmethod
     def _is_due(entity: Any) -> bool:
@@ -140,12 +147,18 @@ class LeanExecutor(SingleThreadedExecutor):
             [entity for node in nodes for entity in node.clients],
             [entity for node in nodes for entity in node.services],
         ]
+        waitables = chain(*(node.waitables for node in nodes))
+        self._actions = tuple(w for w in waitables if not isinstance(w, EventHandler))
         self._held.close()
-        for entity in chain(*kinds):
-            self._held.enter_context(entity.handle)
+        for entity in (*(entity.handle for entity in chain(*kinds)), *self._actions):
+            self._held.enter_context(entity)
+        count = NumberOfEntities(*map(len, kinds))
+        for action in self._actions:
+            count += action.get_num_entities()
         new = self._wait_set = rclpy_implementation.WaitSet(
-            *map(len, kinds), 0, self.context.handle
-        )
+            count.num_subscriptions, count.num_guard_conditions, count.num_timers,
+            count.num_clients, count.num_services, count.num_events, self.context.handle,
+        )  # fmt: skip
         messages, guards, timers, clients, services = kinds
         self._urgent = (
             (timers, new.add_timer, 'timer', self._take_timer),

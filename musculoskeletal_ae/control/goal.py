@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of a trajectory that is an action's goal, by joint_trajectory_controller's rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.exceptions import MessageError
+
+# Error codes of control_msgs/action/FollowJointTrajectory.
+SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
+
+
+def read_tolerances(given: Iterable[Any], joints: Sequence[str]) -> Array:
+    """Return by how far each joint may be off [rad] (D,), of control_msgs/JointTolerance.
+
+    A position of 0 (the default, which is none here) and a negative one are no bound. Velocities
+    and accelerations are not estimated, and bounds on them are left alone.
+    """
+    bounds = np.full(len(joints), np.inf)
+    for one in given:
+        if one.name not in joints:
+            raise MessageError('unknown joint', f'{one.name!r}; legal: {", ".join(joints)}')
+        if not np.isfinite(one.position):
+            raise MessageError('not finite', f'a tolerance of {one.name}')
+        if one.position > 0.0:
+            bounds[joints.index(one.name)] = one.position
+    return bounds
+
+
+class FollowedGoal:
+    """The trajectory that a controller has been given last."""
+
+    def __init__(
+        self, core: Controller, joints: Sequence[str], path: Array, goal: Array, patience: float
+    ) -> None:
+        """Watch it within tolerances [rad] (D,) on its way and at its end.
+
+        To come within the latter it has so much time after its end [s]; 0 is for ever.
+        """
+        self._core, self._trajectory = core, core.motion.latest
+        self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
+
+    def outcome(self) -> tuple[int, str] | None:
+        """Return an error code and what happened, or None while the goal is pursued."""
+        core, motion, trajectory = self._core, self._core.motion, self._trajectory
+        if cause := core.safety.cause:
+            return INVALID, f'stopped: {cause}'
+        if not core.follows or motion.latest is not trajectory or trajectory is None:
+            return INVALID, 'replaced by another target'
+        if motion.trajectory is not trajectory:
+            return None  # it is still to begin
+        late, off = motion.time - trajectory.duration, np.abs(motion.error)
+        if late < 0.0:
+            return self._beyond(BEYOND_PATH, off, self._path)
+        if missed := self._beyond(BEYOND_GOAL, off, self._goal):
+            return missed if 0.0 < self._patience < late else None
+        return SUCCESSFUL, ''
+
+    def _beyond(self, code: int, off: Array, bounds: Array) -> tuple[int, str] | None:
+        m = int((off - bounds).argmax())
+        if off[m] <= bounds[m]:
+            return None
+        return code, f'{self._joints[m]} is off by {off[m]:.3f} rad, tolerance {bounds[m]:.3g} rad'

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of an action's goal: reached, off its path, late at its end, replaced, stopped."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from control_bench import OTHER, REST, ROBOT, Bench
+
+from musculoskeletal_ae.control.goal import (
+    BEYOND_GOAL,
+    BEYOND_PATH,
+    INVALID,
+    SUCCESSFUL,
+    FollowedGoal,
+    read_tolerances,
+)
+from musculoskeletal_ae.control.trajectory import Points
+from musculoskeletal_ae.exceptions import MessageError
+
+FREE = np.full(2, np.inf)
+TIGHT = np.array([0.05, np.inf])
+
+
+class Followed:
+    """A bench that follows a second's trajectory, and what becomes of it."""
+
+    def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
+        self.bench = Bench()
+        self.bench.target(REST)
+        self.bench.step(5)
+        self.start(delay)
+        self.goal = FollowedGoal(self.bench.core, ROBOT.joints, path, goal, patience)
+
+    def start(self, delay=0.0):
+        still = np.zeros((1, 2))
+        points = Points(np.arange(2), np.array([1.0]), OTHER[None], still, still)
+        self.bench.core.trajectory(points, delay)
+
+    def run(self, steps=1000, moves=True):
+        """Return what becomes of it, and after how many steps."""
+        for step in range(steps):
+            if outcome := self.goal.outcome():
+                return outcome, step
+            self.bench.step()
+            if moves and self.bench.core.follows:
+                self.bench.theta = self.bench.core.motion.desired.theta.copy()
+        return None, steps
+
+
+def test_a_goal_that_is_reached_succeeds_when_its_time_is_over():
+    followed = Followed(path=TIGHT, goal=TIGHT)
+    (code, told), steps = followed.run()
+    assert (code, told) == (SUCCESSFUL, '')
+    duration = followed.bench.core.motion.trajectory.duration
+    assert 100.0 * duration - 1.5 <= steps <= 100.0 * duration + 5.0
+
+
+def test_a_goal_in_the_future_is_waited_for():
+    followed = Followed(path=TIGHT, delay=0.5)
+    (code, _), steps = followed.run()
+    assert code == SUCCESSFUL
+    assert steps >= 150
+
+
+def test_an_arm_that_does_not_come_along_is_off_the_path_and_its_joint_named():
+    (code, told), steps = Followed(path=TIGHT).run(moves=False)
+    assert code == BEYOND_PATH
+    assert ROBOT.joints[0] in told
+    assert steps < 100
+
+
+def test_an_arm_that_does_not_arrive_is_waited_for_as_long_as_asked():
+    assert Followed(goal=TIGHT).run(400, moves=False) == (None, 400)
+    followed = Followed(goal=TIGHT, patience=0.5)
+    (code, _), steps = followed.run(moves=False)
+    assert code == BEYOND_GOAL
+    assert steps > 100.0 * (followed.bench.core.motion.trajectory.duration + 0.5) - 2.0
+
+
+@pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])
+def test_what_ends_the_trajectory_ends_the_goal(event):
+    followed = Followed()
+    assert followed.run(20)[0] is None
+    core = followed.bench.core
+    if event == 'trajectory':
+        followed.start()
+    elif event == 'target':
+        followed.bench.target(REST)
+    elif event == 'stop':
+        core.stop('asked')
+    else:
+        followed.bench.configure(method='tension')
+    (code, told), steps = followed.run()
+    assert (code, steps) == (INVALID, 0)
+    assert ('stopped: asked' if event == 'stop' else 'replaced') in told
+
+
+def test_tolerances_of_unknown_joints_are_refused_and_none_is_no_bound():
+    def one(position, name=ROBOT.joints[1]):
+        return SimpleNamespace(name=name, position=position, velocity=0.0, acceleration=0.0)
+
+    assert read_tolerances([], ROBOT.joints).tolist() == [np.inf, np.inf]
+    assert read_tolerances([one(0.1)], ROBOT.joints).tolist() == [np.inf, 0.1]
+    for none in (0.0, -1.0):
+        assert read_tolerances([one(none)], ROBOT.joints).tolist() == [np.inf, np.inf]
+    with pytest.raises(MessageError, match='unknown joint'):
+        read_tolerances([one(0.1, 'no_joint')], ROBOT.joints)
+    with pytest.raises(MessageError, match='not finite'):
+        read_tolerances([one(np.nan)], ROBOT.joints)
