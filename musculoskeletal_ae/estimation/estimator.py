@@ -6,12 +6,17 @@
     θ, T, l ─→ what pushes the arm from outside (`touch`)
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
 
-What was detected first names the suspect for as long as the latch holds.
+What was detected first names the suspect for as long as the latch holds. With `on_anomaly:
+isolate` the suspect is isolated at once and verified (`verification`): if it is broken it stays
+isolated, else it is used again, and either way the anomaly is over. The robot in here is the
+estimator's own: its isolated muscles are those of which it knows.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +25,13 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
+from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
 from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.plausibility import SLACK
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -38,6 +46,8 @@ SILENCE = 1.0  # [s]
 MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 JOINTS_AGE = 0.05  # [s] that joint angles belong to a message
 SHIFTED = 0.02  # [m] by which a guess of a zero may be off before it is told anew
+# So many suspects that turn out healthy within so many seconds, and the arm stays stopped.
+ACQUITTALS, WITHIN = 2, 60.0
 
 
 class Estimate(NamedTuple):
@@ -54,8 +64,13 @@ class Estimator:
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
         """Wait for a network; the preset says what decides that there is an anomaly."""
-        self._robot = robot
-        self.mae: Mae | None = None  # the network in use
+        self.robot = self._robot = robot = copy.copy(robot)
+        self.mae: Mae | None = None  # the network in use, without the isolated muscles
+        self._whole: Mae | None = None  # the same as it came
+        self._verification: Verification | None = None
+        self._acquitted: list[float] = []  # when [s]
+        self._command: Array | None = None  # l_target [m], (M,)
+        self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self._external = ExternalTorque(robot)
         self._touch: Touch | None = None
@@ -71,16 +86,24 @@ class Estimator:
 
     def use(self, mae: Mae) -> None:
         """Take a network and the healthy statistics it brings."""
-        self.detector.use(mae)
-        self._external.use(mae)
-        self.mae = mae
+        less = mae.without(self._robot.isolated)
+        self.detector.use(less)
+        self._external.use(less)
+        self._whole, self.mae = mae, less
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Go on without these muscles, places in T and l, and with all others."""
+        self._robot.isolate(muscles)
+        if self._whole is not None:
+            self.use(self._whole)
+        self.detector.reset()
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
     ) -> None:
         """Note the target lengths [m] or tensions [N] (M,) sent to the modules."""
         self.detector.commanded(length, tension)
-        self._commanded_at = now
+        self._command, self._commanded_at = length, now
 
     def joints(self, theta: Array, now: float) -> None:
         """Take measured θ [rad] (D,): only zeroing uses it, where there is any."""
@@ -123,6 +146,7 @@ class Estimator:
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
+            self._command = None
         guess: Zeros | None = self.zeros
         if self._zeroing is not None:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
@@ -130,16 +154,64 @@ class Estimator:
             return None
         state = self.mae.estimate(tension, length - guess.offset)
         self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
+        if self._verification is not None:
+            self._verify(self._verification, state.theta, tension, length, dt, now)
         verdict = self._verdict = self.detector.step(state, tension, length, dt)
         detected = bool(verdict.cause) and not self.cause
         if detected:
-            self._suspect = self._robot.muscles[verdict.suspect]
+            suspect = self._suspected(self.mae, verdict, tension, length)
+            self._suspect = self._robot.muscles[suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
+            self._begin_verification(suspect, now)
         before, self._touch = self._touch, None
         if self.zeros.known:
-            self._touch = touch = self._external.step(state.theta, tension, length, dt)
+            pulled = tension * self._robot.used
+            self._touch = touch = self._external.step(state.theta, pulled, length, dt)
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
+
+    def _suspected(self, mae: Mae, verdict: Verdict, tension: Array, length: Array) -> int:
+        """Return the muscle without which the rest is most likely."""
+        robot = self._robot
+        slack = tension[verdict.suspect] < SLACK * robot.tension.bias[verdict.suspect]
+        if verdict.sure or slack or not self.detector.calibrated:
+            return verdict.suspect
+        isolated, distance = robot.isolated, np.full(robot.muscle_count, np.inf)
+        for muscle in np.flatnonzero(robot.used).tolist():
+            less = mae.without((*isolated, muscle))
+            assert less.anomaly is not None
+            error = residuals(less.estimate(tension, length), tension, length, less.isolated)
+            centred = error - less.anomaly.mean
+            distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
+        return int(distance.argmin())
+
+    def _begin_verification(self, suspect: int, now: float) -> None:
+        robot = self._robot
+        recent = [at for at in self._acquitted if now - at < WITHIN]
+        if self.detector.settings.on_anomaly == 'stop' or len(recent) >= ACQUITTALS:
+            return
+        constants = robot.tension.bias[suspect], robot.stiffness[suspect]
+        self._verification = Verification(suspect, *map(float, constants))
+        self.isolate((*robot.isolated, suspect))
+
+    def _verify(
+        self, suspect: Verification, theta: Array, tension: Array, length: Array, dt: float,
+        now: float,
+    ) -> None:  # fmt: skip
+        assert self.mae is not None
+        m = suspect.muscle
+        command = None if self._command is None else float(self._command[m])
+        pulls = np.clip(tension, 0.0, self._robot.description.tension.limit)
+        likely = self.mae.lengths(theta, pulls)
+        found = suspect.step(float(tension[m]), float(length[m]), command, float(likely[m]), dt)
+        if not found:
+            return
+        self.verified = f'{self._robot.muscles[m]}: {found}'
+        if found == HEALTHY:
+            self._acquitted.append(now)
+        else:
+            self._verification = None
+        self.reset()
 
     def _zero_on(
         self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
@@ -173,6 +245,9 @@ class Estimator:
     def reset(self) -> None:
         """Clear the anomaly."""
         self.cause = self._suspect = ''
+        suspect, self._verification = self._verification, None
+        if suspect is not None:  # whoever resets it says that it is sound
+            self.isolate(m for m in self._robot.isolated if m != suspect.muscle)
         self.detector.reset()
 
     def clock_jumped_back(self) -> None:
@@ -189,6 +264,11 @@ class Estimator:
             'checkpoint version': str(self.mae.version),
             'anomaly calibrated': str(self.detector.calibrated),
         }
+        isolated = ', '.join(self._robot.muscles[m] for m in self._robot.isolated)
+        if isolated:
+            values['isolated muscles'] = isolated
+        if self.verified:
+            values['last verified'] = self.verified
         if self._verdict is not None:
             values |= {
                 'A': f'{self._verdict.anomaly:.4f}',
@@ -209,10 +289,13 @@ class Estimator:
         far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
         values['posture'] = f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'
         if self.cause:
-            return Report('error', f'anomaly detected: {self.cause}', values)
+            doing = '; verifying it' if self._verification is not None else ''
+            return Report('error', f'anomaly detected: {self.cause}{doing}', values)
         if now - self._stepped_at > SILENCE:
             return Report('warn', 'no muscle_states', values)
         if self._zeroing is not None:
             return Report('warn', f'finding the length zeros: {self._zeroing.progress}', values)
         calibrated = '' if self.detector.calibrated else ', uncalibrated'
+        if isolated:
+            return Report('warn', f'estimating{calibrated} without {isolated}', values)
         return Report('ok', f'estimating{calibrated}', values)

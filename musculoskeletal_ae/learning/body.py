@@ -241,9 +241,10 @@ def fit_body(
 ) -> Fit:
     """Fit the parameters of a body in place, from the present ones.
 
-    A muscle with samples that say nothing about it any more was changed: what they said is where
-    its new parameters are looked for. In the place of the geometric model come the parameters
-    `prior_mean` where some were learned before, without the samples that they came from.
+    A muscle with samples that say nothing about it any more was changed, unless it was isolated
+    when they came: what they said is where its new parameters are looked for. In the place of the
+    geometric model come the parameters `prior_mean` where some were learned before, without the
+    samples that they came from.
     """
     poses = body.poses(seen.theta)
     parts = []
@@ -251,8 +252,9 @@ def fit_body(
         known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
         if prior_mean is not None:
             mean = prior_mean[m]
-        if (~known).sum() >= LEAST_ANCHOR:
-            _fit_muscle(body, poses, seen, ~known, mean, spread, least_noise, m)
+        before = ~known & (seen.tension[:, m] > 0.0)  # 0 N: it was isolated then
+        if before.sum() >= LEAST_ANCHOR:
+            _fit_muscle(body, poses, seen, before, mean, spread, least_noise, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
         parts.append(_fit_muscle(body, poses, seen, known, mean, spread, least_noise, m))
     residual, noise, weight = zip(*parts, strict=True)

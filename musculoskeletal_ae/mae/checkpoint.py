@@ -72,6 +72,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
     groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None = None  # none: no statistics
+    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()  # places of muscles
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -88,6 +89,10 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for names, places in zip((self.joints, self.muscles), zip(*self.whole), strict=True):
             if sorted(chain(*places)) != [*range(len(names))] or not all(places):
                 raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
+        if len(set(self.isolated)) < len(self.isolated) or max(self.isolated, default=0) >= len(
+            self.muscles
+        ):
+            raise ValueError(f'isolated {self.isolated}; legal: different places of muscles')
         # Encoder and decoder have the same hidden layers, so the latent one stands in the middle.
         for (joints, muscles), sizes in zip(self.whole, self.sizes_by_group(), strict=True):
             d, m = len(joints), len(muscles)
@@ -147,6 +152,8 @@ def to_bytes(mae: Mae) -> bytes:
     }
     if len(mae.groups) > 1:
         entries['groups'] = mae.groups
+    if mae.isolated:
+        entries['isolated'] = mae.isolated
     if (touch := mae.touch) is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
         entries['touch_time'] = touch.time
@@ -284,6 +291,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         anomaly=anomaly,
         touch=touch,
         groups=meta.groups,
+        isolated=meta.isolated,
         **{name: getattr(meta, name) for name in SHARED},
     )
 
