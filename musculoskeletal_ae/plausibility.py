@@ -81,6 +81,7 @@ class Plausibility:
         self._before: Array | None = None  # the last lengths that were believed
         self._came: Array = np.zeros(robot.muscle_count)  # the last ones, whatever they were
         self._came_at, self._settled_since = -math.inf, math.inf
+        self.jumped: int | None = None  # the one muscle whose last jump of l was taken
 
     def check_muscles(
         self, tension: Array, length: Array | None, temperature: Array, now: float
@@ -147,6 +148,8 @@ class Plausibility:
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > SETTLED:
+            (far,) = np.nonzero(step > allowed)
+            self.jumped = int(far[0]) if len(far) == 1 else None
             self._before, self._settled_since = length, math.inf
             return None
         m = int(step.argmax())

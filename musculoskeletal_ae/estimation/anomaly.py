@@ -18,9 +18,6 @@ zero while much is commanded has no wire, or a slack one. Slack is wound in by a
 longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
 ② restores it: slack wire is too long, and what is left of a cut one too short.
 
-A sensor that says exactly the same for STILL_TIME, while what ② restores of it moves by MOVED, is
-dead or frozen, however little that disturbs the estimate.
-
 Preset `paper` decides on A alone, against the checkpoint's threshold of A.
 """
 
@@ -44,8 +41,6 @@ DISTANCE, NORM = 'distance', 'norm'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-STILL_TIME = 1.0  # [s]
-MOVED = 0.006, 15.0  # of l [m] and T [N]; both follow what is read
 #: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
 NEAR, WIDEST = 0.25, 3.0
 
@@ -78,8 +73,6 @@ class AnomalyDetector:
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
         self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._beyond = 0
-        self._same: Array | None = None  # l and T that were read, (2, M)
-        self._span: Array = np.zeros((3, 2, robot.muscle_count))
         self.commanded()
 
     def use(self, mae: Mae) -> None:
@@ -100,7 +93,7 @@ class AnomalyDetector:
     def reset(self) -> None:
         """Forget counts, as after a jump of the clock or a reset by the user."""
         self._torn[:] = self._stood[:] = 0.0
-        self._beyond, self._same = 0, None
+        self._beyond = 0
 
     def commanded(self, length: Array | None = None, tension: Array | None = None) -> None:
         """Note the targets that the modules follow, [m] or [N] (M,); neither: they follow none."""
@@ -123,9 +116,6 @@ class AnomalyDetector:
         dead = self._dead(state.theta, tension, length, dt)
         if dead is not None and self.whitened:
             return Verdict(size, distance, dead, 'no tension where the command demands it', True)
-        still = self._still(state, tension, length, dt)
-        if still is not None and self.whitened and self.calibrated and self.judges:
-            return Verdict(size, distance, still, 'a sensor stands still while the arm moves', True)
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
@@ -164,20 +154,6 @@ class AnomalyDetector:
         if self._beyond < IN_A_ROW:
             return ''
         return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running{where}'
-
-    def _still(self, state: State, tension: Array, length: Array, dt: float) -> int | None:
-        """Return a muscle with a sensor that stands still, if there is one."""
-        read, restored = np.array([length, tension]), np.array([state.length, state.tension])
-        since, low, high = self._span
-        same = np.zeros(read.shape, dtype=bool) if self._same is None else read == self._same
-        self._same = read
-        since[:] = np.where(same, since + dt, 0.0)
-        low[:] = np.where(same, np.minimum(low, restored), restored)
-        high[:] = np.where(same, np.maximum(high, restored), restored)
-        moved = (high - low > np.array(MOVED)[:, None]) & (since > STILL_TIME) & self._robot.used
-        # A muscle without tension has another rule.
-        moved &= tension > SLACK * self._robot.tension.bias
-        return int(np.argmax(moved.any(axis=0))) if moved.any() else None
 
     def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
         bias, demand = self._robot.tension.bias, self._tension_command

@@ -7,8 +7,9 @@
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
 
 What was detected first names the suspect for as long as the latch holds. With `on_anomaly:
-isolate` the suspect is isolated at once and verified (`verification`): if it is broken it stays
-isolated, else it is used again, and either way the anomaly is over. The robot in here is the
+isolate` the suspect is isolated at once and verified (`verification`), also one whose length has
+jumped: if it is broken it stays isolated, else it is used again, and either way the anomaly is
+over. The robot in here is the
 estimator's own: its isolated muscles are those of which it knows.
 """
 
@@ -46,6 +47,9 @@ SILENCE = 1.0  # [s]
 MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 JOINTS_AGE = 0.05  # [s] that joint angles belong to a message
 SHIFTED = 0.02  # [m] by which a guess of a zero may be off before it is told anew
+# A sensor that says exactly the same for so long, while the others say that the muscle moves by so
+# much, is dead or frozen, however little that disturbs the estimate.
+STILL_TIME, MOVED = 1.0, 0.006  # [s], [m]
 # So many suspects that turn out healthy within so many seconds, and the arm stays stopped.
 ACQUITTALS, WITHIN = 2, 60.0
 
@@ -70,6 +74,9 @@ class Estimator:
         self._verification: Verification | None = None
         self._acquitted: list[float] = []  # when [s]
         self._command: Array | None = None  # l_target [m], (M,)
+        self._read: Array | None = None  # l and T of the last message, and for how long so far [s]
+        self._same: Array = np.zeros((2, robot.muscle_count))
+        self._moved: tuple[Mae, float, float] | None = None  # without it: its l at least, at most
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self._external = ExternalTorque(robot)
@@ -157,6 +164,10 @@ class Estimator:
         if self._verification is not None:
             self._verify(self._verification, state.theta, tension, length, dt, now)
         verdict = self._verdict = self.detector.step(state, tension, length, dt)
+        still = self._stands_still(self.mae, tension, length, dt)
+        if still is not None and not verdict.cause:
+            why = 'a sensor stands still while the arm moves'
+            verdict = verdict._replace(suspect=still, cause=why, sure=True)
         detected = bool(verdict.cause) and not self.cause
         if detected:
             suspect = self._suspected(self.mae, verdict, tension, length)
@@ -184,6 +195,35 @@ class Estimator:
             centred = error - less.anomaly.mean
             distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
         return int(distance.argmin())
+
+    def _stands_still(self, mae: Mae, tension: Array, length: Array, dt: float) -> int | None:
+        """Return the muscle of a sensor that says the same though the others say that it moves."""
+        robot, read, before = self._robot, np.array([length, tension]), self._read
+        self._read = read
+        self._same = np.where(read == before, self._same + dt, 0.0)
+        # One without tension has another rule.
+        judged = robot.used & (tension > SLACK * robot.tension.bias)
+        since = judged * self._same.max(axis=0)
+        muscle = int(since.argmax())
+        if since[muscle] < STILL_TIME or not (self.detector.calibrated and self.detector.judges):
+            self._moved = None
+            return None
+        less, low, high = self._moved or (mae, np.inf, -np.inf)
+        isolated = tuple(sorted((*robot.isolated, muscle)))
+        if less.isolated != isolated:
+            less, low, high = mae.without(isolated), np.inf, -np.inf
+        theta = less.estimate(tension, length).theta
+        likely = float(less.lengths(theta, np.minimum(tension, robot.tension.limit))[muscle])
+        self._moved = less, min(low, likely), max(high, likely)
+        return muscle if self._moved[2] - self._moved[1] > MOVED else None
+
+    def jumped(self, muscle: int, now: float) -> None:
+        """Take that the length of a muscle, and of no other, jumped and stayed there."""
+        verifies = self.detector.settings.on_anomaly == 'isolate' and self.detector.judges
+        if verifies and not self.cause and self._robot.used[muscle]:
+            self._suspect = self._robot.muscles[muscle]
+            self.cause = f'{self._suspect}: its length jumped'
+            self._begin_verification(muscle, now)
 
     def _begin_verification(self, suspect: int, now: float) -> None:
         robot = self._robot

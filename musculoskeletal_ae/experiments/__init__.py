@@ -10,5 +10,6 @@ NAMES = (
     'loss_change',
     'body_change',
     'motion',
+    'resilience',
     'robustness',
 )

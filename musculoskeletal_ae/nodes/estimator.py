@@ -184,6 +184,9 @@ class Estimator(Shell):
         clock, now = self.get_clock().now(), time.monotonic()
         from_zero = length - self.zeros.offset if self.zeros.known else None
         self.plausibility.check_muscles(tension, from_zero, temperature, now)
+        if (jumped := self.plausibility.jumped) is not None:
+            self.plausibility.jumped = None
+            self.core.jumped(jumped, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         self._tell_zeros()
         if self.mirror is not None and from_zero is not None:
