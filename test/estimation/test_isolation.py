@@ -16,7 +16,7 @@ BIAS, STIFFNESS, DT = 30.0, 1e4, 0.01
 NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
 
 
-def verdict(tension, length, likely=0.0, commands=None):
+def verdict(tension, length, likely=0.0):
     """Wind in by 3 mm after a while; T and l are functions of T_ref and of the row's number."""
     watched = Verification(0, BIAS, STIFFNESS)
     for n, (shake, stir) in enumerate(NOISE):
@@ -40,12 +40,12 @@ def still(_, stir):
     ('tension', 'length', 'likely', 'found'),
     [
         (follows, still, 0.004, HEALTHY),
-        (lambda _, __: 0.0, lambda n, stir: -0.15 + stir, 0.0, 'ruptured'),
+        (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, 'ruptured'),
         (lambda _, __: 0.0, lambda n, stir: stir - 0.0002 * n, -0.05, 'ruptured'),
         (lambda _, __: 0.0, still, 0.0, 'its tension sensor stands still'),
         (lambda _, __: 71.0, still, 0.0, 'its tension sensor stands still'),
         (follows, lambda _, __: 0.0, 0.03, 'its length sensor stands still'),
-        (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0, 'its length sensor is off'),
+        (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0, 'its length sensor is'),
         (lambda _, shake: BIAS - 12.0 + shake, still, 0.0, 'jammed'),
     ],
 )  # fmt: skip

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
+
 from learning.conftest import job
 from learning.test_learner import Prepared
-
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae import checkpoint
