@@ -81,7 +81,9 @@ class Plausibility:
         self._before: Array | None = None  # the last lengths that were believed
         self._came: Array = np.zeros(robot.muscle_count)  # the last ones, whatever they were
         self._came_at, self._settled_since = -math.inf, math.inf
-        self.jumped: int | None = None  # the one muscle whose last jump of l was taken
+        #: the one muscle whose jump of l was taken; whose jump is not taken yet
+        self.jumped: int | None = None
+        self._jumps: int | None = None
 
     def check_muscles(
         self, tension: Array, length: Array | None, temperature: Array, now: float
@@ -144,12 +146,14 @@ class Plausibility:
         if before is None or (step := np.abs(length - before) * used).max() <= allowed:
             self._before, self._settled_since = length, math.inf
             return None
+        if self._settled_since == math.inf:  # later others may have moved as far
+            (far,) = np.nonzero(step > allowed)
+            self._jumps = int(far[0]) if len(far) == 1 else None
         if (np.abs(length - came) * used).max() > allowed:
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > SETTLED:
-            (far,) = np.nonzero(step > allowed)
-            self.jumped = int(far[0]) if len(far) == 1 else None
+            self.jumped = self._jumps
             self._before, self._settled_since = length, math.inf
             return None
         m = int(step.argmax())

@@ -44,7 +44,7 @@ EVERY = 10  # messages of the held-out motion
 TARGETS = 2
 #: [s] before a fault, at most until it is isolated, and after that
 MOVING, DECIDED, AFTERWARDS = 12.0, 10, 6.0
-GOING = 10.0  # [s] to a target
+GOING, SETTLING = 30.0, 4.0  # [s] to a target at most (winches slow it), and there
 HEALTHY_TIME = 18_000.0  # [s] over all individuals
 PUSH_EVERY, PUSH = 10.0, (10.0, 30.0)  # [s], [N]
 
@@ -146,7 +146,11 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
     for theta in held[:TARGETS]:
         try:
             loop.core.target({n: (a, 0.0) for n, a in zip(robot.joints, theta.tolist())})
-            loop.run(GOING)
+            for _ in range(round(GOING)):
+                loop.run(1.0)
+                if not loop.core.motion.moving:
+                    break
+            loop.run(SETTLING)
             ended.append(float(np.linalg.norm(loop.arm.theta - theta)))
         except MessageError:
             ended.append(None)
