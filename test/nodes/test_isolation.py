@@ -74,10 +74,10 @@ def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
     graph, arm26, trained
 ):
     known = replace(trained['default'].without((4,)), version=5)
-    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    network.publish(bytes_message(checkpoint.to_bytes(known)))
     told = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
+    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    network.publish(bytes_message(checkpoint.to_bytes(known)))
     graph.wait(lambda: told, 'the list')
     assert told[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
