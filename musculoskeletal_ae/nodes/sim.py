@@ -49,7 +49,6 @@ class Sim(Arm):
         if not as_robot:
             self.follow_muscle_states(self._note)
         self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
-        self.isolated: tuple[int, ...] = ()
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
@@ -58,14 +57,13 @@ class Sim(Arm):
     def _use_checkpoint(self, mae: Mae) -> None:
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
-            arm.isolate(self.isolated)
+            arm.isolate(self.gate.isolated)
             arm.settle()
             self.arm = arm
         else:
             self.arm.use(mae)
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
-        self.isolated = muscles
         if self.arm is not None:
             self.arm.isolate(muscles)
 
