@@ -81,16 +81,21 @@ class Plausibility:
         self._before: Array | None = None  # the last lengths that were believed
         self._came: Array = np.zeros(robot.muscle_count)  # the last ones, whatever they were
         self._came_at, self._settled_since = -math.inf, math.inf
+        #: the one muscle whose jump of l was taken; whose jump is not taken yet
+        self.jumped: int | None = None
+        self._jumps: int | None = None
 
     def check_muscles(
         self, tension: Array, length: Array | None, temperature: Array, now: float
     ) -> None:
         """Take T [N], l [m] and temperatures [°C] (M,) as they came; no l while zeros are unknown.
 
-        A MessageError says that no muscle of this arm can say that.
+        A MessageError says that no muscle of this arm can say that; isolated ones may say anything.
         """
         wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
-        error = self.levels(tension, length, temperature, wound)
+        used = self._robot.used
+        known = None if length is None else length * used
+        error = self.levels(tension * used, known, temperature, wound)
         if error is None and length is not None:
             error = self._step(length, now)
         self.muscles.note(error, now)
@@ -137,13 +142,18 @@ class Plausibility:
         allowed = SLIP + SPEED * min(max(now - self._came_at, 0.0), HOLE)
         before, came = self._before, self._came
         self._came, self._came_at = length, now
-        if before is None or (step := np.abs(length - before)).max() <= allowed:
+        used = self._robot.used
+        if before is None or (step := np.abs(length - before) * used).max() <= allowed:
             self._before, self._settled_since = length, math.inf
             return None
-        if np.abs(length - came).max() > allowed:
+        if self._settled_since == math.inf:  # later others may have moved as far
+            (far,) = np.nonzero(step > allowed)
+            self._jumps = int(far[0]) if len(far) == 1 else None
+        if (np.abs(length - came) * used).max() > allowed:
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > SETTLED:
+            self.jumped = self._jumps
             self._before, self._settled_since = length, math.inf
             return None
         m = int(step.argmax())

@@ -45,6 +45,7 @@ TOPICS = {
     'muscle_length_zeros': Topic(_ARRAY, latched=True),
     'anomaly': Topic('std_msgs/msg/Float64'),
     'anomaly_detected': Topic('std_msgs/msg/Bool', latched=True),
+    'isolated_muscles': Topic('std_msgs/msg/String', latched=True),
     'mae_checkpoint': Topic('std_msgs/msg/UInt8MultiArray', latched=True),
     'marker_pose': Topic(_POSE, sent=True),
     'vision_joint_states': Topic(_JOINTS),

@@ -4,6 +4,11 @@
     target     ─→ posture (lengths) or torque (tensions) ─┐
     trajectory ─→ motion (lengths) ───────────────────────┴─→ safety ─→ command
 
+An isolated muscle has no tension in any plan, and its module is told to hold it slack. The robot in
+here is the controller's own: its isolated muscles are those of which it was told. A muscle that is
+isolated while there is an anomaly is the suspect: the stopped arm winds it in a little, and goes on
+when the anomaly is over.
+
 A stop latches on missing or implausible sensor data, an anomaly, an unfit checkpoint, overload,
 overheating, a fault of control's own, or on request (doc/interface.md, stop and resume). `reset`
 clears it once no cause is left; then the last target, which may be a trajectory's end, is resumed
@@ -18,9 +23,10 @@ to SLOWEST; a fast one makes no age shorter. The controller's own pauses make no
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -37,7 +43,7 @@ from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
-from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.presets import PRESETS
@@ -53,6 +59,9 @@ PACE_SPAN = 1.0  # [s] over which the messages' clock is compared
 OVERHEATED = 20.0  # [°C] above temperature_limit
 OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
 NOTABLE = 0.05  # [N·m] of missing torque
+AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
+#: causes of a stop that may be a broken muscle's doing
+BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
 ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
 
 
@@ -74,13 +83,14 @@ class Controller:
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
-        self._robot, self.settings = robot, settings or Settings()
+        self._robot, self.settings = copy.copy(robot), settings or Settings()
+        robot = self._robot
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
         self._follows = False  # a trajectory, or holds where it ended
         self._hand = Hand(robot)
-        self.short = ''  # what the last pose of the hand was out of reach by
+        self.short = ''  # what the last target was out of reach by
         self.floating = FloatControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
         self.heat = Heat(robot)
@@ -107,7 +117,10 @@ class Controller:
         self._overloads = np.array([limits.limit, 0.5 * (limits.limit + limits.max)])
         #: since when each muscle pulls above each of them
         self._tense_since: Array = np.full((2, robot.muscle_count), math.inf)
-        self._anomaly = False
+        self._anomaly = self._explored = False
+        # whether a suspect is verified; whether the arm is to go on by itself, and may
+        self._verifies = self._resumes = self._may_resume = False
+        self._isolated_at, self._anomaly_at = (-1, -math.inf), math.inf
         # Whether the next command starts a method anew, from how the muscles pull then.
         self._starts = True
 
@@ -169,10 +182,31 @@ class Controller:
         self.gentle.start()
 
     def anomaly(self, detected: bool) -> None:
-        """Take anomaly_detected."""
-        self._anomaly = detected
+        """Take anomaly_detected; once a suspect was verified, the arm goes on when it is over."""
+        if detected and not self._anomaly:
+            self._anomaly_at, self._explored = self.stepped_at, self.posture.exploring
+        self._resumes |= self._verifies and not detected
+        self._verifies, self._anomaly = self._verifies and detected, detected
         if detected:
             self.stop('anomaly_detected')
+        self._note_suspect()
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Go on without these muscles, places in T and l, and with all others."""
+        muscles, before = set(muscles), set(self._robot.isolated)
+        self._robot.isolate(muscles)
+        if added := muscles - before:
+            self._isolated_at = max(added), self.stepped_at
+        if self._mae is not None:
+            self.use(self._mae)
+        self._note_suspect()
+
+    def _note_suspect(self) -> None:
+        muscle, at = self._isolated_at  # whichever was told first
+        here = self._anomaly and at > self._anomaly_at - AT_ONCE
+        here = here and muscle in self._robot.isolated
+        self.safety.suspect = muscle if here else None
+        self._verifies |= here
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
@@ -184,16 +218,17 @@ class Controller:
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         inside = np.clip(theta, robot.lower, robot.upper)
+        inside, short = self._within_reach(inside)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
         if self._quick and not self.safety.cause:
             with suppress(MessageError):  # not ready: then by a ramp, once it is
                 planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
                 clamped = self.clamped
                 self._follow(planned, effort=effort)
-                self.clamped = clamped
+                self.clamped, self.short = clamped, short
                 return
         self._starts |= self.posture.exploring or self._follows
-        self._follows = False
+        self._follows, self.short = False, short
         self.posture.set_target(inside, effort)
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
@@ -218,7 +253,9 @@ class Controller:
         else:
             planned = Trajectory.through(start, points, max(-delay, 0.0))
             planned.check(robot)
+            _, short = self._within_reach(planned.end)
             self._follow(planned, max(delay, 0.0))
+            self.short = short
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Bring the end effector to a pose in the root link's frame, or to its position only.
@@ -230,7 +267,7 @@ class Controller:
         nearest = chosen.unreachable == 'nearest'
         theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
         self._follow(self._hand.towards(start, pose, theta, chosen.hand_speed, now))
-        self.short = short
+        self.short = short and f'{short}; nearest approached'
 
     def twist(self, twist: Array) -> None:
         """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
@@ -240,6 +277,26 @@ class Controller:
         start, mae = self._ready(), self._mae
         assert mae is not None
         self._follow(self._hand.moved(mae, start, twist))
+
+    def _within_reach(self, theta: Array) -> tuple[Array, str]:
+        """Return where to go for θ [rad] (D,) without the isolated muscles, and what θ lacks.
+
+        A MessageError says that they are needed, unless the nearest posture is wished.
+        """
+        if self._robot.used.all() or self._mae is None or self._estimate is None:
+            return theta, ''
+        nearest, short = self._hand.held(self._mae, self._estimate, theta)
+        if not short:
+            return theta, ''
+        angles = ', '.join(f'{n} {a:.2f}' for n, a in zip(self._robot.joints, nearest))
+        short = f'{short} without {self._left_out}; nearest posture held: {angles} rad'
+        if self.settings.unreachable == 'refuse':
+            raise MessageError('out of reach', short)
+        return nearest, f'{short}; nearest approached'
+
+    @property
+    def _left_out(self) -> str:
+        return ', '.join(self._robot.muscles[m] for m in self._robot.isolated)
 
     def _refuse_floating(self) -> None:
         if self.settings.method == 'float':
@@ -282,6 +339,7 @@ class Controller:
         if wanted and self.settings.method == 'float':
             return 'method float: a hand moves the arm; set another method first'
         if wanted != self.posture.exploring:
+            self.short = ''
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts, self._follows = True, False
@@ -289,6 +347,9 @@ class Controller:
 
     def stop(self, cause: str) -> None:
         """Latch a safe stop."""
+        if not self.safety.cause or self.safety.passing:
+            self._may_resume = True
+        self._may_resume &= cause.startswith(BY_MUSCLE)
         self.explore(False)
         self.safety.stop(cause)
 
@@ -370,14 +431,16 @@ class Controller:
         if self._follows:
             missing = self.motion.missing_torque
             values['lag of the winches'] = f'{1000.0 * self.motion.winches.lag:.0f} ms'
-            if self.short:
-                warnings.append(f'hand pose out of reach by {self.short}: nearest approached')
             if self.motion.moving and self.slowed:
                 warnings.append(f'trajectory {self.slowed}')
         if np.abs(missing).max(initial=0.0) > NOTABLE:
             lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
             values['missing torque'] = ', '.join(lacks)
             warnings.append('the target needs more torque than the muscles have')
+        if self.short:
+            warnings.append(f'out of reach: {self.short}')
+        if self._left_out:
+            values['isolated muscles'] = self._left_out
         if not self.safety.zeroed:
             warnings.append('length zeros are unknown: the arm only explores, gently')
         if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
@@ -456,10 +519,18 @@ class Controller:
         if self.safety.passing and self._fresh > RESUME:
             self.safety.cause, self.safety.passing, self._starts = '', False, True
         self._limit_by_heat(dt)
+        if self._resumes and (not self._may_resume or not self.reset(now)):
+            self._resumes = False
+            if self._may_resume and self._explored:
+                self.explore(True)
+            cause = self.present_cause(now)
         desired = None
         if not cause and not self.safety.cause:
             try:
-                desired = self._command(dt)
+                desired = self._slack(self._command(dt))
+            except RobotDescriptionError as error:  # too little is left to explore with
+                self.explore(False)
+                self.short = f'{error}, without {self._left_out or "none"}'
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
@@ -493,6 +564,13 @@ class Controller:
         # Where the messages' clock stands still for good, a stop must still let go.
         passed = since if self.pace.value < SLOWEST and self.safety.cause else passed
         return min(max(passed, 0.0), LONGEST_STEP), min(since, LONGEST_STEP)
+
+    def _slack(self, command: Command | None) -> Command | None:
+        """Return a command that gives isolated muscles all the length, or no tension."""
+        if command is None or self._robot.used.all():
+            return command
+        nothing = self.safety.longest if command.kind == LENGTH else 0.0
+        return Command(command.kind, np.where(self._robot.used, command.value, nothing))
 
     def _command(self, dt: float) -> Command | None:
         mae, muscles, estimate = self._mae, self.safety.now, self._estimate

@@ -62,18 +62,26 @@ class Hand:
         if distance > FAR or (whole and angle > TURNED):
             short = f'{1000.0 * distance:.0f} mm'
             short += f' and {angle:.2f} rad' * whole + ' beyond the joint limits or the arm'
-        if missing := self.missing(mae, theta):
-            told = f'the muscles lack {missing} there'
-            short = f'{short}; {told}' if short else told
-            low, high = 0.0, 1.0
-            for _ in range(HALVINGS if nearest else 0):
-                share = 0.5 * (low + high)
-                held = not self.missing(mae, start + share * (theta - start))
-                low, high = (share, high) if held else (low, share)
-            theta = start + low * (theta - start)
+        theta, lack = self.held(mae, start, theta)
+        short = '; '.join(filter(None, (short, lack)))
         if short and not nearest:
             raise MessageError('out of reach', short)
         return theta, short
+
+    def held(self, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
+        """Return the posture nearest to θ on the way from `start` [rad] (D,) that can be held.
+
+        And what θ itself lacks, or ''.
+        """
+        missing = self.missing(mae, theta)
+        if not missing:
+            return theta, ''
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            share = 0.5 * (low + high)
+            held = not self.missing(mae, start + share * (theta - start))
+            low, high = (share, high) if held else (low, share)
+        return start + low * (theta - start), f'the muscles lack {missing} there'
 
     def missing(self, mae: Mae, theta: Array) -> str:
         """Return which joint lacks how much torque to hold θ [rad] (D,), or ''."""

@@ -161,10 +161,14 @@ class StiffnessModel(NamedTuple):
         cubic = np.empty((4, robot.muscle_count))
         for low, high in np.unique(ranges, axis=1).T:
             own = (ranges[0] == low) & (ranges[1] == high)
-            cubic[:, own] = np.polyfit(np.linspace(low, high, LEVELS), -lengths[:, own], 3)
+            levels = np.linspace(low, max(high, low + 1.0), LEVELS)  # isolated: all 0
+            cubic[:, own] = np.polyfit(levels, -lengths[:, own], 3)
+        slope = mae.muscle_jacobian(theta, tension)
+        bend = robot_stiffness.muscle_hessian(jacobian, theta, STEP)
+        slope[list(robot.isolated)] = bend[list(robot.isolated)] = 0.0
         return cls(
-            jacobian=mae.muscle_jacobian(theta, tension),
-            hessian=robot_stiffness.muscle_hessian(jacobian, theta, STEP),
+            jacobian=slope,
+            hessian=bend,
             compliance=cubic[:3] * np.array([3.0, 2.0, 1.0])[:, None],
             module=robot.stiffness,
         )

@@ -200,6 +200,7 @@ class MotionControl:
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
             command = self._held(mae, muscles.tension, limit, dt)
+        command = np.where(self._robot.used, command, sent)
         if self._blend is None:
             rate = self.settings.rate_limit
             self._blend = Ramp(sent - command, np.zeros_like(command), BLENDING, rate)

@@ -243,6 +243,7 @@ class PostureControl:
         if self._corrects:
             self._jacobian = self._mae.muscle_jacobian(self.theta, self.solution.tension)
             goal = goal + self.feedback.shift(self._jacobian)
+        goal = np.where(self._robot.used, goal, self._command)
         self._ramp = Ramp(self._command, goal, RAMP_SHARE * duration, self.settings.rate_limit)
         self._remaining = max(duration, self._ramp.duration)
         self.feedback.moving()

@@ -11,6 +11,10 @@ tension.limit, and never winds it in. Readings are medians of the last three mes
 glitch of a sensor moves nothing. The limit of a muscle whose motor runs hot (`heat.py`) falls from
 tension.max to T_bias, no faster than the rate limit pays out.
 
+While a suspect is verified after an anomaly (`estimation/verification`), it is wound in a little
+once the others are paid out: slowly, until its tension or what MSC demands of it has risen by WIND,
+or the command has fallen by DEPTH, whatever its sensors say.
+
 A stop latches. The last command is held for `hold_time`; then lengths are paid out at the rate
 limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times that rate. A stop
 that may pass by itself (data that is late) latches when that paying out begins.
@@ -30,6 +34,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 LENGTH, TENSION = 'length', 'tension'
 
+PAYING_OUT = 1.5  # [s] of a stop before a suspect is wound in
+WIND, DEPTH, WIND_SPEED = 30.0, 0.015, 0.02  # [N], [m], [m/s]
 #: [m] by which a true muscle, or its sensor, may be longer than the model's
 LENGTH_MARGIN = 0.03
 
@@ -71,11 +77,14 @@ class SafetyFilter:
         self.now: Muscles | None = None
         postures = robot.random_postures(200, np.random.default_rng(0))
         self.zeroed = True  # else no limit of tension rests on how long muscles are at most
-        self._model = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
+        #: of every muscle [m], (M,): commanded that, it is slack in any posture
+        self.longest = robot.routes.relative_lengths(postures).max(axis=0) + LENGTH_MARGIN
+        self.suspect: int | None = None  # muscle to be wound in while the arm is stopped
+        self._wound_from: float | None = None  # its command before [m]
 
     @property
     def _longest(self) -> Array:
-        return self._model if self.zeroed else np.full_like(self._model, np.inf)
+        return self.longest if self.zeroed else np.full_like(self.longest, np.inf)
 
     def shift(self, less: Array) -> None:
         """Take lengths that are less [m] (M,) from now on: the same muscles, another zero."""
@@ -86,8 +95,9 @@ class SafetyFilter:
             self.command = Command(LENGTH, self.command.value - less)
 
     def muscles(self, muscles: Muscles) -> Muscles:
-        """Take new muscle_states; return the medians of the last three."""
-        self._readings.append(muscles)
+        """Take new muscle_states; return the medians of the last three, isolated ones without T."""
+        self._newest = muscles
+        self._readings.append(muscles._replace(tension=muscles.tension * self._robot.used))
         self.now = Muscles(*np.median(np.array(self._readings), axis=0))
         return self.now
 
@@ -95,6 +105,7 @@ class SafetyFilter:
         """Latch a stop, or one that may pass; the first cause is kept, if it latched."""
         if not self.cause:
             self._held = 0.0
+            self._wound_from = None
         if not self.cause or (self.passing and not passing):
             self.cause, self.passing = cause, passing
 
@@ -145,6 +156,10 @@ class SafetyFilter:
         if self._held <= self.settings.hold_time:
             return command
         self.passing = False
+        winding = self.suspect is not None and fresh
+        winding &= self._held > self.settings.hold_time + PAYING_OUT
+        if winding and command.kind == TENSION:
+            command = unchanging(self._robot, LENGTH, muscles)
         kind, value = command
         change = self.most_change(kind, dt)
         if kind == TENSION:
@@ -152,4 +167,17 @@ class SafetyFilter:
         # At the measured length MSC pulls with T_bias only; where that is not known, out to the
         # longest the muscle can be.
         end = muscles.length if fresh else np.maximum(muscles.length, self._longest)
-        return Command(kind, np.minimum(value + change, np.maximum(end, value)))
+        after = np.minimum(value + change, np.maximum(end, value))
+        if winding and self.suspect is not None:
+            after[self.suspect] = self._wound(self.suspect, float(value[self.suspect]), dt)
+        return Command(kind, after)
+
+    def _wound(self, muscle: int, value: float, dt: float) -> float:
+        """Return the next command [m] of the suspect, after `value`."""
+        if self._wound_from is None:
+            self._wound_from = value
+        length, tension = self._newest.length[muscle], self._newest.tension[muscle]
+        rise = tension - self._robot.description.tension.bias[muscle]
+        if max(rise, self._robot.stiffness[muscle] * (length - value)) > WIND:
+            return value
+        return max(value - WIND_SPEED * dt, self._wound_from - DEPTH)

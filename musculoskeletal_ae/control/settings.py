@@ -57,7 +57,9 @@ class Settings:
         0.25, 'fastest of the hand on its way to a single target_pose', 'm/s', 0.01, 2.0
     )
     unreachable: str = settable(
-        'refuse', 'what is done with a target_pose out of reach', legal=UNREACHABLE
+        'refuse',
+        'what is done with a target_pose out of reach, or a target out of that of the muscles left',
+        legal=UNREACHABLE,
     )
     max_age: float = settable(
         0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0

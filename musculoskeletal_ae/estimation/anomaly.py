@@ -52,6 +52,7 @@ class Verdict(NamedTuple):
     distance: float  # d, in healthy standard deviations; NaN without statistics
     suspect: int  # index of the most suspect muscle
     cause: str  # why this message completes a detection, or ''
+    sure: bool = False  # that it is the suspect: by physics, not by what the network restores
 
 
 class AnomalyDetector:
@@ -104,7 +105,7 @@ class AnomalyDetector:
 
         It came dt [s] after the message before.
         """
-        error = residuals(state, tension, length)
+        error = residuals(state, tension, length, self._robot.isolated)
         size, distance, share = float(anomaly(error)), float('nan'), error
         if self._statistics is not None:
             centred = error - self._statistics.mean
@@ -115,7 +116,7 @@ class AnomalyDetector:
         score = share[:muscles] ** 2 + share[muscles:] ** 2
         dead = self._dead(state.theta, tension, length, dt)
         if dead is not None and self.whitened:
-            return Verdict(size, distance, dead, 'no tension where the command demands it')
+            return Verdict(size, distance, dead, 'no tension where the command demands it', True)
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
@@ -163,12 +164,12 @@ class AnomalyDetector:
         if demand is None:
             # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
             lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
-            if not lost or (tension < SLACK * bias).all():
+            if not lost or (tension < SLACK * bias)[self._robot.used].all():
                 self._torn[:] = self._stood[:] = 0.0
                 self._winds_slack[:] = False
                 return None
             demand = np.full(len(tension), bias)
-        torn = (tension < SLACK * demand) & (demand >= bias)
+        torn = (tension < SLACK * demand) & (demand >= bias) & self._robot.used
         begins = torn & (self._torn == 0.0)
         # What an arm that moves makes shorter is no slack.
         beyond = length - self._robot.routes.relative_lengths(theta) if torn.any() else length

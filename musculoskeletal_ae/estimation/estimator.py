@@ -6,12 +6,18 @@
     θ, T, l ─→ what pushes the arm from outside (`touch`)
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
 
-What was detected first names the suspect for as long as the latch holds.
+What was detected first names the suspect for as long as the latch holds. With `on_anomaly:
+isolate` the suspect is isolated at once and verified (`verification`), also one whose length has
+jumped: if it is broken it stays isolated, else it is used again, and either way the anomaly is
+over. The robot in here is the
+estimator's own: its isolated muscles are those of which it knows.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +26,13 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
+from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
 from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.plausibility import SLACK
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -38,6 +47,11 @@ SILENCE = 1.0  # [s]
 MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
 JOINTS_AGE = 0.05  # [s] that joint angles belong to a message
 SHIFTED = 0.02  # [m] by which a guess of a zero may be off before it is told anew
+# A sensor that says exactly the same for so long, while the others say that the muscle moves by so
+# much, is dead or frozen, however little that disturbs the estimate.
+STILL_TIME, MOVED = 1.0, 0.006  # [s], [m]
+# So many suspects that turn out healthy within so many seconds, and the arm stays stopped.
+ACQUITTALS, WITHIN = 2, 60.0
 
 
 class Estimate(NamedTuple):
@@ -54,8 +68,16 @@ class Estimator:
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
         """Wait for a network; the preset says what decides that there is an anomaly."""
-        self._robot = robot
-        self.mae: Mae | None = None  # the network in use
+        self.robot = self._robot = robot = copy.copy(robot)
+        self.mae: Mae | None = None  # the network in use, without the isolated muscles
+        self._whole: Mae | None = None  # the same as it came
+        self._verification: Verification | None = None
+        self._acquitted: list[float] = []  # when [s]
+        self._command: Array | None = None  # l_target [m], (M,)
+        self._read: Array | None = None  # l and T of the last message, and for how long so far [s]
+        self._same: Array = np.zeros((2, robot.muscle_count))
+        self._moved: tuple[Mae, float, float] | None = None  # without it: its l at least, at most
+        self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self._external = ExternalTorque(robot)
         self._touch: Touch | None = None
@@ -71,16 +93,24 @@ class Estimator:
 
     def use(self, mae: Mae) -> None:
         """Take a network and the healthy statistics it brings."""
-        self.detector.use(mae)
-        self._external.use(mae)
-        self.mae = mae
+        less = mae.without(self._robot.isolated)
+        self.detector.use(less)
+        self._external.use(less)
+        self._whole, self.mae = mae, less
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Go on without these muscles, places in T and l, and with all others."""
+        self._robot.isolate(muscles)
+        if self._whole is not None:
+            self.use(self._whole)
+        self.detector.reset()
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
     ) -> None:
         """Note the target lengths [m] or tensions [N] (M,) sent to the modules."""
         self.detector.commanded(length, tension)
-        self._commanded_at = now
+        self._command, self._commanded_at = length, now
 
     def joints(self, theta: Array, now: float) -> None:
         """Take measured θ [rad] (D,): only zeroing uses it, where there is any."""
@@ -123,6 +153,7 @@ class Estimator:
         self._time, self._stepped_at = time, now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
+            self._command = None
         guess: Zeros | None = self.zeros
         if self._zeroing is not None:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
@@ -130,16 +161,97 @@ class Estimator:
             return None
         state = self.mae.estimate(tension, length - guess.offset)
         self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
+        if self._verification is not None:
+            self._verify(self._verification, state.theta, tension, length, dt, now)
         verdict = self._verdict = self.detector.step(state, tension, length, dt)
+        still = self._stands_still(self.mae, tension, length, dt)
+        if still is not None and not verdict.cause:
+            why = 'a sensor stands still while the arm moves'
+            verdict = verdict._replace(suspect=still, cause=why, sure=True)
         detected = bool(verdict.cause) and not self.cause
         if detected:
-            self._suspect = self._robot.muscles[verdict.suspect]
+            suspect = self._suspected(self.mae, verdict, tension, length)
+            self._suspect = self._robot.muscles[suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
+            self._begin_verification(suspect, now)
         before, self._touch = self._touch, None
         if self.zeros.known:
-            self._touch = touch = self._external.step(state.theta, tension, length, dt)
+            pulled = tension * self._robot.used
+            self._touch = touch = self._external.step(state.theta, pulled, length, dt)
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
+
+    def _suspected(self, mae: Mae, verdict: Verdict, tension: Array, length: Array) -> int:
+        """Return the muscle without which the rest is most likely."""
+        robot = self._robot
+        slack = tension[verdict.suspect] < SLACK * robot.tension.bias[verdict.suspect]
+        if verdict.sure or slack or not self.detector.calibrated:
+            return verdict.suspect
+        isolated, distance = robot.isolated, np.full(robot.muscle_count, np.inf)
+        for muscle in np.flatnonzero(robot.used).tolist():
+            less = mae.without((*isolated, muscle))
+            assert less.anomaly is not None
+            error = residuals(less.estimate(tension, length), tension, length, less.isolated)
+            centred = error - less.anomaly.mean
+            distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
+        return int(distance.argmin())
+
+    def _stands_still(self, mae: Mae, tension: Array, length: Array, dt: float) -> int | None:
+        """Return the muscle of a sensor that says the same though the others say that it moves."""
+        robot, read, before = self._robot, np.array([length, tension]), self._read
+        self._read = read
+        self._same = np.where(read == before, self._same + dt, 0.0)
+        # One without tension has another rule.
+        judged = robot.used & (tension > SLACK * robot.tension.bias)
+        since = judged * self._same.max(axis=0)
+        muscle = int(since.argmax())
+        if since[muscle] < STILL_TIME or not (self.detector.calibrated and self.detector.judges):
+            self._moved = None
+            return None
+        less, low, high = self._moved or (mae, np.inf, -np.inf)
+        isolated = tuple(sorted((*robot.isolated, muscle)))
+        if less.isolated != isolated:
+            less, low, high = mae.without(isolated), np.inf, -np.inf
+        theta = less.estimate(tension, length).theta
+        likely = float(less.lengths(theta, np.minimum(tension, robot.tension.limit))[muscle])
+        self._moved = less, min(low, likely), max(high, likely)
+        return muscle if self._moved[2] - self._moved[1] > MOVED else None
+
+    def jumped(self, muscle: int, now: float) -> None:
+        """Take that the length of a muscle, and of no other, jumped and stayed there."""
+        verifies = self.detector.settings.on_anomaly == 'isolate' and self.detector.judges
+        if verifies and not self.cause and self._robot.used[muscle]:
+            self._suspect = self._robot.muscles[muscle]
+            self.cause = f'{self._suspect}: its length jumped'
+            self._begin_verification(muscle, now)
+
+    def _begin_verification(self, suspect: int, now: float) -> None:
+        robot = self._robot
+        recent = [at for at in self._acquitted if now - at < WITHIN]
+        if self.detector.settings.on_anomaly == 'stop' or len(recent) >= ACQUITTALS:
+            return
+        constants = robot.tension.bias[suspect], robot.stiffness[suspect]
+        self._verification = Verification(suspect, *map(float, constants))
+        self.isolate((*robot.isolated, suspect))
+
+    def _verify(
+        self, suspect: Verification, theta: Array, tension: Array, length: Array, dt: float,
+        now: float,
+    ) -> None:  # fmt: skip
+        assert self.mae is not None
+        m = suspect.muscle
+        command = None if self._command is None else float(self._command[m])
+        pulls = np.clip(tension, 0.0, self._robot.description.tension.limit)
+        likely = self.mae.lengths(theta, pulls)
+        found = suspect.step(float(tension[m]), float(length[m]), command, float(likely[m]), dt)
+        if not found:
+            return
+        self.verified = f'{self._robot.muscles[m]}: {found}'
+        if found == HEALTHY:
+            self._acquitted.append(now)
+        else:
+            self._verification = None
+        self.reset()
 
     def _zero_on(
         self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
@@ -173,6 +285,9 @@ class Estimator:
     def reset(self) -> None:
         """Clear the anomaly."""
         self.cause = self._suspect = ''
+        suspect, self._verification = self._verification, None
+        if suspect is not None:  # whoever resets it says that it is sound
+            self.isolate(m for m in self._robot.isolated if m != suspect.muscle)
         self.detector.reset()
 
     def clock_jumped_back(self) -> None:
@@ -193,6 +308,11 @@ class Estimator:
             spread = np.sqrt(np.diag(self.mae.covariance))
             told = (f'{name} {s:.3f}' for name, s in zip(self._robot.joints, spread, strict=True))
             values['joint uncertainty'] = ', '.join(told) + ' rad'
+        isolated = ', '.join(self._robot.muscles[m] for m in self._robot.isolated)
+        if isolated:
+            values['isolated muscles'] = isolated
+        if self.verified:
+            values['last verified'] = self.verified
         if self._verdict is not None:
             values |= {
                 'A': f'{self._verdict.anomaly:.4f}',
@@ -213,10 +333,13 @@ class Estimator:
         far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
         values['posture'] = f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'
         if self.cause:
-            return Report('error', f'anomaly detected: {self.cause}', values)
+            doing = '; verifying it' if self._verification is not None else ''
+            return Report('error', f'anomaly detected: {self.cause}{doing}', values)
         if now - self._stepped_at > SILENCE:
             return Report('warn', 'no muscle_states', values)
         if self._zeroing is not None:
             return Report('warn', f'finding the length zeros: {self._zeroing.progress}', values)
         calibrated = '' if self.detector.calibrated else ', uncalibrated'
+        if isolated:
+            return Report('warn', f'estimating{calibrated} without {isolated}', values)
         return Report('ok', f'estimating{calibrated}', values)

@@ -76,6 +76,7 @@ class Gate:
         self._messages: deque[tuple[float, Array, Array]] = deque()
         self._used: list[tuple[float, Mae]] = []  # since when which network was in use
         self._anomaly = False
+        self.isolated: tuple[int, ...] = ()  # muscles whose messages say nothing
 
     @property
     def mae(self) -> Mae | None:
@@ -146,12 +147,16 @@ class Gate:
             return {}
         _, tension, length = map(np.array, zip(*self._messages))
         restored = mae.estimate(tension, length)
+        used = np.delete(np.arange(self._robot.muscle_count), self.isolated)
         parts = (
             restored.tension - tension,
             restored.length - length,
             mae.lengths(restored.theta, tension) - length,
         )
-        return {name: np.median(np.abs(part), axis=0) for name, part in zip(FLOOR, parts)}
+        left = {name: np.zeros(self._robot.muscle_count) for name in FLOOR}
+        for row, part in zip(left.values(), parts):
+            row[used] = np.median(np.abs(part[:, used]), axis=0)
+        return left
 
     def detector(self, mae: Mae) -> tuple[float, float]:
         """Return d over its threshold: of the messages, and of the same with a muscle cut.
@@ -165,15 +170,18 @@ class Gate:
         _, tension, length = map(np.array, zip(*self._messages))
 
         def distance(tension: Array) -> float:
-            off = residuals(mae.estimate(tension, length), tension, length) - statistics.mean
+            state = mae.estimate(tension, length)
+            off = residuals(state, tension, length, mae.isolated) - statistics.mean
             square = np.einsum('ni,in->n', off, np.linalg.solve(statistics.covariance, off.T))
             return float(np.median(np.sqrt(square))) / threshold
 
         uncut = 1.0 - np.eye(self._robot.muscle_count)
-        return distance(tension), max(distance(tension * row) for row in uncut)
+        used = np.delete(uncut, self.isolated, axis=0)
+        return distance(tension), max(distance(tension * row) for row in used)
 
     def _faults(self, mae: Mae) -> Iterator[str]:
         joints, muscles = self._robot.joints, self._robot.muscles
+        mae = mae.without(self.isolated)
         for name, share in self.posture_errors(mae).items():
             if not share.max() <= LIMITS[name]:
                 who = (joints if name[0] == 'θ' else muscles)[int(share.argmax())]
@@ -181,7 +189,9 @@ class Gate:
                 told = f'{share.max():.2g} unexplained {of}'
                 yield f'{name}, {who}: {told}, limit {LIMITS[name]:g}'
         left = self.message_errors(mae)
-        before = {} if self.mae is None or not left else self.message_errors(self.mae)
+        before: dict[str, Array] = {}
+        if self.mae is not None and left:
+            before = self.message_errors(self.mae.without(self.isolated))
         for name, error in left.items():
             limit = np.full(len(error), FLOOR[name])
             if name in before:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import settable
 
+ON_ANOMALY = ('stop', 'isolate')
+
 
 @dataclass(frozen=True)
 class Detection:
@@ -21,3 +23,9 @@ class Detection:
     )
     slack_length: float = settable(0.06, 'longest slack that a module may wind in', 'm', 0.0, 1.0)
     slack_speed: float = settable(0.005, 'a module that winds in slower stands', 'm/s', 1e-4, 1.0)
+    on_anomaly: str = settable(
+        'stop',
+        'the arm stops until estimator/reset; or the suspect is wound in a little, isolated if it '
+        'is broken, and the arm goes on',
+        legal=ON_ANOMALY,
+    )

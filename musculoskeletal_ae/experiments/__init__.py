@@ -10,6 +10,7 @@ NAMES = (
     'loss_change',
     'body_change',
     'motion',
+    'resilience',
     'robustness',
     'sensors',
 )

@@ -14,8 +14,9 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.control.posture import RAMP_SHARE, Step
-from musculoskeletal_ae.control.safety import LENGTH, Muscles
+from musculoskeletal_ae.control.safety import LENGTH, Command, Muscles
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
@@ -72,8 +73,9 @@ class ClosedLoop:
         arm, core, read, now = self.arm, self.core, self._read, self._now
         with suppress(MessageError):  # which nodes count, and control waits for better ones
             core.muscles(Muscles(read.length, read.tension, read.temperature), now)
-            core.estimated(self.mae.estimate(read.tension, read.length).theta, now)
+            core.estimated(self.estimate(read, now), now)
         command = core.step(now)
+        self.commanded(command, now)
         if command is not None:
             follow = arm.command_length if command.kind == LENGTH else arm.command_tension
             follow(command.value)
@@ -81,6 +83,13 @@ class ClosedLoop:
         self._read, self._now = arm.sense(), now + SAMPLE_TIME
         told, sent = self._read, read.length if command is None else command.value
         return arm.theta, told.theta, told.length, told.tension, sent
+
+    def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (of others)
+        """Return θ [rad] (D,) from what was read at `now` [s]."""
+        return self.mae.estimate(read.tension, read.length).theta
+
+    def commanded(self, command: Command | None, now: float) -> None:
+        """Take what is commanded at `now` [s]."""
 
     def explore(self) -> tuple[Array, ...]:
         """Make a step of exploring; what stopped the arm is reset once its cause is gone."""

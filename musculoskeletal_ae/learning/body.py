@@ -243,9 +243,10 @@ def fit_body(
 
     Angles that were not read are looked for from `guess` [rad] (N, D), or the middle of the range.
 
-    A muscle with samples that say nothing about it any more was changed: what they said is where
-    its new parameters are looked for. In the place of the geometric model come the parameters
-    `prior_mean` where some were learned before, without the samples that they came from.
+    A muscle with samples that say nothing about it any more was changed, unless it was isolated
+    when they came: what they said is where its new parameters are looked for. In the place of the
+    geometric model come the parameters `prior_mean` where some were learned before, without the
+    samples that they came from.
     """
     robot = body.robot
     if guess is None:
@@ -256,9 +257,10 @@ def fit_body(
         known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
         if prior_mean is not None:
             mean = prior_mean[m]
-        if (~known).sum() >= LEAST_ANCHOR:
-            before = replace(seen, theta=start)
-            _fit_muscle(body, body.poses(start), before, ~known, mean, spread, LEAST_NOISE, m)
+        before = ~known & (seen.tension[:, m] > 0.0)  # 0 N: it was isolated then
+        if before.sum() >= LEAST_ANCHOR:
+            there = replace(seen, theta=start)
+            _fit_muscle(body, body.poses(start), there, before, mean, spread, LEAST_NOISE, m)
             mean, spread = body.parameters[m], REOPENED.spread(layout)
         means.append(mean)
         spreads.append(spread)

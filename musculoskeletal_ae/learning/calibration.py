@@ -127,7 +127,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
         return None
     tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
     state = mae.estimate(tension, length)
-    error = residuals(state, tension, length)
+    error = residuals(state, tension, length, mae.isolated)
     sound = ~_glitches(error)
     known = min(samples, healthy.rests)
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES

@@ -7,6 +7,9 @@
                                                                  │
                                             disk, subscribers ◄──┘
 
+What isolated muscles read is put away at the door: a sample says nothing about them, neither the
+body nor the detector learns of them, and the network that is published knows that they are.
+
 Time is the caller's: the ROS clock, recorded or simulated time. All rules on time are rules on
 that, so that a recording steps exactly what runs on a robot, but that training takes no time there.
 """
@@ -20,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.estimation.touch import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
@@ -93,7 +96,8 @@ class Learner:
         # Where they do not, the network says that its detector is not calibrated.
         self._statistics_hold = True
         self._forgot = False  # a muscle, since the update began
-        self._gate = Gate(robot)
+        self.gate = Gate(robot)
+        self._spoiled = np.zeros(robot.muscle_count, dtype=bool)  # healthy messages lack these
         self._gate_time = 0.0  # [s] of the messages
         self.refused = 0  # updates that the gate did not let through
         self.last_refused = ''
@@ -142,11 +146,13 @@ class Learner:
         _, tension, length, dt, theta = paired
         if not 0.0 <= time - self._tilted < TILT_AGE:
             self._rests.gravity = NOTHING
+        tension, length = tension * self._used, length * self._used
         self._gate_time += dt
-        self._gate.message(tension, length, self._gate_time)
+        self.gate.message(tension, length, self._gate_time)
         if self._mae is not None and not self._rests.anomaly:
             self._torque.step(tension, length, dt)
         for rest in self._rests.step(tension, length, dt, theta):
+            self._spoiled |= ~self._used
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
                 self.accept(rest)
@@ -155,7 +161,7 @@ class Learner:
 
     def accept(self, sample: Sample) -> None:
         """Keep a new sample, on disk too, and learn from it soon."""
-        self.samples.add(sample)
+        self.samples.add(sample, self._used.copy())
         self._keep()
         self._news = True
 
@@ -165,14 +171,44 @@ class Learner:
         The last network that explained the arm is published again, if that is another one.
         """
         self._rests.set_anomaly(detected)
-        before = self._gate.anomaly(detected, self._gate_time)
+        before = self.gate.anomaly(detected, self._gate_time)
         if before is not None:
             self._use(self._numbered(before))
+        self._tell_isolated()
+
+    @property
+    def isolated(self) -> tuple[int, ...]:
+        """The isolated muscles, places in T and l."""
+        return self.gate.isolated
+
+    @property
+    def _used(self) -> Bools:
+        return ~np.isin(np.arange(self.robot.muscle_count), self.isolated)
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Learn nothing of these muscles, and of all others as before; samples so far stay."""
+        muscles = tuple(sorted(muscles))
+        if muscles == self.isolated:
+            return
+        self.gate.isolated = muscles
+        self.gate.forget()
+        self._rests.reset()
+        if (self._spoiled & self._used).any():
+            self._healthy.clear()
+            self._spoiled[:] = False
+        self._news = True
+        self._tell_isolated()
+
+    def _tell_isolated(self) -> None:
+        """Publish a network that knows, but not while a suspect is verified."""
+        mae = self._mae
+        if mae is not None and mae.isolated != self.isolated and not self._rests.anomaly:
+            self._use(self._numbered(mae))
 
     def zeros(self, known: bool) -> None:
         """Take lengths from other zeros; nothing is learned of them while those are not known."""
         self.reset()
-        self._gate.forget()
+        self.gate.forget()
         self._zeroed = known
 
     def enable(self, enabled: bool) -> None:
@@ -201,7 +237,8 @@ class Learner:
         ):
             self._news, self._begun, self._forgot = self.updates + 1 < self._owed, now, False
             seen, healthy = self.samples.observations(), self._healthy.healthy()
-            self.training.submit(Job(seen, healthy, self._statistics_hold, self._steps))
+            job = Job(seen, healthy, self._statistics_hold, self._steps, self.isolated)
+            self.training.submit(job)
         update = self.training.poll()
         if update is not None:
             self._take(update)
@@ -225,7 +262,7 @@ class Learner:
 
     def _passes(self, mae: Mae) -> bool:
         try:
-            self._gate.check(mae)
+            self.gate.check(mae)
         except GateError as error:
             self.refused, self.last_refused = self.refused + 1, str(error)
             return False
@@ -236,9 +273,9 @@ class Learner:
         return replace(mae, version=1 + max(mae.version, before))
 
     def _use(self, mae: Mae) -> None:
-        self._mae = mae = self._torque.use(mae)
+        self._mae = mae = self._torque.use(mae.without(self.isolated))
         self.checkpoint = checkpoint.to_bytes(mae)
-        self._gate.take(mae, self._gate_time)
+        self.gate.take(mae, self._gate_time)
         # What is published is on disk before it leaves.
         self._keep()
         self._to_publish = True
@@ -269,10 +306,11 @@ class Learner:
         Raises:
             GateError: If it does not explain the arm.
         """
-        self._gate.check(mae)
+        self.gate.check(mae)
         self._go_on_from(self._numbered(mae))
 
     def _go_on_from(self, mae: Mae) -> None:
+        self.gate.isolated = mae.isolated
         self._statistics_hold, self._given = True, -math.inf
         self.training.begin(mae)
         self._use(mae)
@@ -285,7 +323,7 @@ class Learner:
             GateError: If the network does not explain the arm; nothing is changed then.
         """
         if mae is not None:
-            self._gate.check(mae)
+            self.gate.check(mae)
         if self._state is not None and (self.samples or self.checkpoint):
             self._state.back_up(self.samples, self.checkpoint)
         successor = None if mae is None else self._numbered(mae)
@@ -361,6 +399,8 @@ class Learner:
             'healthy time': f'{self._healthy.time:.0f} s',
             **self.training.values(),
         }
+        if self.isolated:
+            values['isolated muscles'] = ', '.join(self.robot.muscles[m] for m in self.isolated)
         if self.refused:
             values |= {'refused networks': str(self.refused), 'last refused': self.last_refused}
         if self._state is not None:

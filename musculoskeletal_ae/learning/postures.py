@@ -90,7 +90,8 @@ class _GroupFit:
         self._known = seen.known[:, muscles].astype(float)
         # The torque of a muscle that was changed since is not that of the one there is.
         crossed = body.robot.routes.crossed[np.ix_(muscles, joints)]
-        self._balanced = ~(~seen.known[:, muscles] @ crossed)
+        changed = ~seen.known[:, muscles] & (seen.tension[:, muscles] > 0.0)  # 0 N: isolated
+        self._balanced = ~(changed @ crossed)
         self._read = np.isfinite(seen.theta[:, joints])
         self._own = self._read & (seen.spread[:, joints] == 0.0)  # read by a joint sensor
         spread_y = np.where(self._own, SENSOR, seen.spread[:, joints])

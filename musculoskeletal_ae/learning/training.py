@@ -45,6 +45,7 @@ class Job(NamedTuple):
     healthy: Healthy  # what was seen of the healthy arm
     statistics_hold: bool  # the statistics so far are of the arm as it is: no muscle has changed
     steps: int  # of training
+    isolated: tuple[int, ...] = ()  # muscles that the messages say nothing about
 
 
 class Update(NamedTuple):

@@ -59,7 +59,7 @@ class Updater(ABC):
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
-        estimate = self._mae.estimate(newest.tension, newest.length).theta
+        estimate = self._mae.without(job.isolated).estimate(newest.tension, newest.length).theta
         seen = np.isfinite(newest.theta)
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
@@ -79,7 +79,9 @@ class Updater(ABC):
             f'{samples} samples at rest, preset {preset}, {steps} steps'
         )
         mae = to_mae(network, origin.joints, origin.muscles, origin.preset, history)
-        before = self._mae if job.statistics_hold else uncalibrated(self._mae)
+        mae = mae.without(job.isolated)
+        before = self._mae.without(job.isolated)
+        before = before if job.statistics_hold else uncalibrated(before)
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if self.body is not None:
             friction = np.array([self.body.friction(m) for m in range(self._robot.muscle_count)])

@@ -73,6 +73,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None = None  # none: no statistics
     uncertain: bool = False  # whether it tells the covariance of its estimates
+    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()  # places of muscles
 
     def __post_init__(self) -> None:
         """Check what types cannot say."""
@@ -89,6 +90,10 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for names, places in zip((self.joints, self.muscles), zip(*self.whole), strict=True):
             if sorted(chain(*places)) != [*range(len(names))] or not all(places):
                 raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
+        if len(set(self.isolated)) < len(self.isolated) or max(self.isolated, default=0) >= len(
+            self.muscles
+        ):
+            raise ValueError(f'isolated {self.isolated}; legal: different places of muscles')
         # Encoder and decoder have the same hidden layers, so the latent one stands in the middle.
         for (joints, muscles), sizes in zip(self.whole, self.sizes_by_group(), strict=True):
             d, m = len(joints), len(muscles)
@@ -150,6 +155,8 @@ def to_bytes(mae: Mae) -> bytes:
     }
     if len(mae.groups) > 1:
         entries['groups'] = mae.groups
+    if mae.isolated:
+        entries['isolated'] = mae.isolated
     if (touch := mae.touch) is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
         entries['touch_time'] = touch.time
@@ -291,6 +298,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         touch=touch,
         covariance=tensors.get('covariance'),
         groups=meta.groups,
+        isolated=meta.isolated,
         **{name: getattr(meta, name) for name in SHARED},
     )
 

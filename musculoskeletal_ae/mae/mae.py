@@ -8,12 +8,21 @@ standardisation and the constant mask inputs are folded into the first and last 
 object is made, so one estimate is six small matrix products and nothing else. They are computed in
 single precision: a large body's weights then fit into a core's cache, and 1e-6 of a network's
 spread is far below its error. Arrays of double precision go in and come out.
+
+Isolated muscles say nothing: what their sensors read has no influence. Their place in ② is taken by
+what the others make likely, found in two steps:
+
+    θ  = argmin ‖l − ①(θ, T)‖² + (σ/s)² ‖θ − θ̄‖²      l of the others; θ̄, s: mean and spread of θ
+    l' = ①(θ, T) of the isolated,  θ = ②(T, l')        PASSES times
+
+(the network's own inverse finds what the lengths alone determine, and then ② weighs them as it has
+learned to).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -27,6 +36,10 @@ from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
+
+# Without isolated muscles:
+NEWTON_STEPS, PASSES = 5, 2
+LENGTH_SPREAD = 0.003  # σ [m]
 
 
 class BlockDiagonal:
@@ -187,6 +200,7 @@ class Mae:
     touch: TouchStatistics | None = None  # friction and healthy torques, once some are learned
     covariance: Array | None = None  # of θ_est − θ [rad²] (D, D), once a body is learned
     groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
+    isolated: tuple[int, ...] = ()  # muscles that say nothing, places in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
     _leave_length: Stack = field(init=False, repr=False)
@@ -291,8 +305,48 @@ class Mae:
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
 
     def estimate(self, tension: Array, length: Array) -> State:
-        """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation")."""
-        return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
+        """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation").
+
+        Isolated muscles have no part in it: theirs is what the others make likely.
+        """
+        if not self.isolated:
+            return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
+        tension, length, lost = tension.copy(), length.copy(), list(self.isolated)
+        joints, muscles = len(self.joints), len(self.muscles)
+        scale = scale_vector(joints, muscles)
+        mean, small = self.mean / scale, np.square(LENGTH_SPREAD / self.std[:joints])
+        tension[..., lost] = mean[joints:-muscles][lost]
+        theta = np.broadcast_to(mean[:joints], (*length.shape[:-1], joints))
+        known = np.ones(muscles)
+        known[lost] = 0.0
+        for _ in range(NEWTON_STEPS):
+            left = np.where(known, length - self.lengths(theta, tension), 0.0)
+            jacobian = self.muscle_jacobian(theta, tension) * known[:, None]
+            across = jacobian.swapaxes(-1, -2)
+            push = (across @ left[..., None])[..., 0] + small * (mean[:joints] - theta)
+            turn = np.linalg.solve(across @ jacobian + np.diag(small), push[..., None])[..., 0]
+            theta = theta + turn
+        for _ in range(PASSES):
+            length[..., lost] = self.lengths(theta, tension)[..., lost]
+            state = self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
+            theta = state.theta
+        return state
+
+    def without(self, isolated: Iterable[int]) -> Mae:
+        """Return the same network with these muscles isolated, and no others.
+
+        Its healthy statistics are those of the others, or, where they were taken without a muscle
+        that is not isolated any more, not calibrated.
+        """
+        isolated = tuple(sorted(isolated))
+        if isolated == self.isolated:
+            return self
+        anomaly = self.anomaly
+        if anomaly is not None and set(self.isolated) - set(isolated):
+            anomaly = replace(anomaly, calibrated=False)
+        elif anomaly is not None:
+            anomaly = anomaly.without(isolated)
+        return replace(self, isolated=isolated, anomaly=anomaly)
 
     def lengths(self, theta: Array, tension: Array) -> Array:
         """Return l [m] of shape (..., M) at (θ, T): decode(encode ①)."""

@@ -10,8 +10,8 @@ is `estimation/anomaly.py`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,11 +24,19 @@ FLOOR = 1e-4
 LEAST_MOTION = 60.0  # [s]
 
 
-def residuals(restored: State, tension: Array, length: Array) -> Array:
-    """Return e (..., 2M) of states restored from measured T [N] (..., M) and l [m] (..., M)."""
-    tension_error = TENSION_SCALE * (restored.tension - tension)
-    length_error = LENGTH_SCALE * (restored.length - length)
-    return np.concatenate([tension_error, length_error], axis=-1)
+def residuals(
+    restored: State, tension: Array, length: Array, isolated: Sequence[int] = ()
+) -> Array:
+    """Return e (..., 2M) of states restored from measured T [N] (..., M) and l [m] (..., M).
+
+    That of isolated muscles is 0.
+    """
+    error = np.stack(
+        [TENSION_SCALE * (restored.tension - tension), LENGTH_SCALE * (restored.length - length)],
+        axis=-2,
+    )
+    error[..., list(isolated)] = 0.0
+    return error.reshape(*error.shape[:-2], -1)
 
 
 def anomaly(error: Array) -> Array:
@@ -58,6 +66,15 @@ class AnomalyStatistics:
         covariance = centred.T @ centred / max(len(error) - 1, 1)
         covariance = 0.5 * (covariance + covariance.T) + FLOOR**2 * np.eye(error.shape[1])
         return cls(mean, covariance, calibrated, len(error))
+
+    def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
+        """Return the statistics of the same residuals, but those of some muscles 0."""
+        count = len(self.mean) // 2
+        lost = [place + m for place in (0, count) for m in muscles]
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[lost] = covariance[lost] = covariance[:, lost] = 0.0
+        covariance[lost, lost] = FLOOR**2
+        return replace(self, mean=mean, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)

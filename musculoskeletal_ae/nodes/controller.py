@@ -2,8 +2,10 @@
 """The node `controller`: target posture → muscle commands, with a latched safe stop.
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
-muscle_states, anomaly_detected → muscle_length_command, or muscle_tension_command with method
-`tension`; controller_state. Action follow_joint_trajectory, where control_msgs is installed.
+target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
+muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
+with method `tension`; controller_state. Action follow_joint_trajectory, where control_msgs is
+installed.
 """
 
 from __future__ import annotations
@@ -79,6 +81,7 @@ class Controller(Shell):
                 self, kind, self.core, self._trajectory, refuse
             )
         self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
+        self.follow_isolated(self.core.isolate)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
@@ -130,6 +133,8 @@ class Controller(Shell):
         warn = self.get_logger().warning
         if cause := self.core.safety.cause:
             warn(f'stopped ({cause}): the target waits for controller/reset')
+        if short := self.core.short:
+            warn(f'out of reach: {short}')
         if clamped := ', '.join(self.core.clamped):
             warn(f'target clamped to the joint limits: {clamped}')
 
@@ -146,7 +151,7 @@ class Controller(Shell):
         before = self.core.short
         self.core.pose(pose, not only, time.monotonic())
         if self.core.short not in ('', before):
-            self.get_logger().warning(f'out of reach by {self.core.short}: nearest approached')
+            self.get_logger().warning(f'out of reach: {self.core.short}')
         self._tell_slowed()
 
     def _twist(self, message: TwistStamped) -> None:

@@ -2,15 +2,15 @@
 """The node `estimator`: joint angles from muscle length and tension; is the body healthy.
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
-anomaly, anomaly_detected,
-estimated_external_wrench, muscle_length_zeros (joint_states help to find those), estimated/markers;
-on request muscle_joint_states and /tf;
+anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros
+(joint_states help to find those), estimated/markers; on request muscle_joint_states and /tf;
 marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3, WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray
+from std_msgs.msg import Bool, Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.zeroing import Zeros
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Frames, Markers
 from musculoskeletal_ae.nodes.messages import (
@@ -48,7 +49,7 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        self.plausibility = Plausibility(self.robot)
+        self.plausibility = Plausibility(self.core.robot)
         self.joints = self.create_publisher(JointState, 'estimated_joint_states', RELIABLE)
         self.muscles = self.create_publisher(Float64MultiArray, 'estimated_muscle_states', RELIABLE)
         topic = 'estimated_joint_covariance'
@@ -57,6 +58,11 @@ class Estimator(Shell):
         self.wrench = self.create_publisher(WrenchStamped, 'estimated_external_wrench', RELIABLE)
         self.detected = self.create_publisher(Bool, 'anomaly_detected', LATCHED)
         self.detected.publish(Bool(data=False))
+        self.latched = False
+        self.isolated = self.create_publisher(String, 'isolated_muscles', LATCHED)
+        self.told_isolated: tuple[int, ...] | None = None
+        self.chosen = False  # who is isolated; else what the network in use says counts
+        self.muscles_to_isolate: tuple[int, ...] = ()
         self.seen = self.create_publisher(JointState, 'vision_joint_states', RELIABLE)
         self.needed.append('muscle_states')
         self.posture: tuple[float, ...] = ()
@@ -65,7 +71,10 @@ class Estimator(Shell):
         self.zeros = self.core.zeros
         if self.unzeroed:  # nobody moves on what sensors say before the network is there
             self.core.zeros = Zeros.unknown(self.robot.muscle_count)
+        self.follow_parameter('isolate_muscles', self._choose_muscles)
         self.follow_checkpoints(self._use)
+        if self.parameter('isolate_muscles'):
+            self._isolate(self.muscles_to_isolate)
         for name in parameters_of(Detection):
             self.follow_parameter(name, partial(self._configure, name))
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
@@ -85,6 +94,8 @@ class Estimator(Shell):
         self.frames = None if self.tf_source == 'none' else Frames(self)
         serve(self, Trigger, 'estimator/reset', self._reset)
         serve(self, Trigger, 'estimator/zero', self._zero)
+        serve(self, Trigger, 'estimator/isolate', self._isolate_asked)
+        serve(self, Trigger, 'estimator/restore', self._restore_asked)
 
     def _measured(self, theta: Array) -> None:
         self.core.joints(theta, time.monotonic())
@@ -93,6 +104,11 @@ class Estimator(Shell):
 
     def _use(self, mae: Mae) -> None:
         self.core.use(mae)
+        if mae.isolated != self.core.robot.isolated:
+            if not self.chosen:
+                self.core.isolate(mae.isolated)
+            self.told_isolated = None  # a learner that starts anew is to hear it
+        self._tell_isolated()
         if self.unzeroed:
             self.unzeroed = False
             self.core.zero(self.posture)
@@ -113,10 +129,49 @@ class Estimator(Shell):
         what = 'while the arm stands in zero_posture' if self.posture else 'while it moves gently'
         return f'finding the zeros of the lengths {what}; /diagnostics says how far it is'
 
+    def _choose_muscles(self, names: tuple[str, ...]) -> None:
+        self.muscles_to_isolate = tuple(self.robot.muscle_indices(names))
+
+    def _isolate(self, muscles: Iterable[int]) -> str:
+        self.chosen = True
+        self.core.isolate(set(muscles))
+        self._tell_isolated()
+        return f'isolated: {self._isolated_names() or "none"}'
+
+    def _isolate_asked(self, _: Trigger.Request) -> str:
+        if not self.muscles_to_isolate:
+            raise MusculoskeletalError('name muscles in the parameter isolate_muscles first')
+        answer = self._isolate((*self.core.robot.isolated, *self.muscles_to_isolate))
+        self._reset(_)
+        return answer
+
+    def _restore_asked(self, _: Trigger.Request) -> str:
+        back = self.muscles_to_isolate or self.core.robot.isolated  # none named: all
+        return self._isolate(m for m in self.core.robot.isolated if m not in back)
+
+    def _isolated_names(self) -> str:
+        return ', '.join(self.robot.muscles[m] for m in self.core.robot.isolated)
+
+    def _tell_isolated(self) -> None:
+        if self.core.robot.isolated != self.told_isolated:
+            self.told_isolated = self.gate.isolated = self.core.robot.isolated
+            self.isolated.publish(String(data=self._isolated_names()))
+
+    def _tell_anomaly(self) -> None:
+        """Say what has changed: an anomaly, or which muscles are isolated for it."""
+        detected, before = bool(self.core.cause), self.latched
+        if detected != before:
+            self.latched, self.chosen = detected, True
+            told = f'anomaly detected: {self.core.cause}' if detected else self.core.verified
+            self.get_logger().warning(told)
+            self.detected.publish(Bool(data=detected))
+            self.take_anomaly(detected)
+        self._tell_isolated()
+
     def _tell_zeros(self) -> None:
         if self.core.zeros is not self.zeros:
             self.zeros = self.core.zeros
-            self.plausibility = Plausibility(self.robot)
+            self.plausibility = Plausibility(self.core.robot)
             self.gate.forget()
             rows = np.stack(self.zeros)
             self.told.publish(array_message(rows, 'quantity', 'muscle'))
@@ -131,6 +186,9 @@ class Estimator(Shell):
         clock, now = self.get_clock().now(), time.monotonic()
         from_zero = length - self.zeros.offset if self.zeros.known else None
         self.plausibility.check_muscles(tension, from_zero, temperature, now)
+        if (jumped := self.plausibility.jumped) is not None:
+            self.plausibility.jumped = None
+            self.core.jumped(jumped, now)
         estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
         self._tell_zeros()
         if self.mirror is not None and from_zero is not None:
@@ -156,10 +214,7 @@ class Estimator(Shell):
             wrench.header.stamp, wrench.header.frame_id = clock.to_msg(), self.root_frame
             wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force.tolist())))
             self.wrench.publish(wrench)
-        if estimate.detected:
-            self.get_logger().warning(f'anomaly detected: {self.core.cause}')
-            self.detected.publish(Bool(data=True))
-            self.take_anomaly(True)
+        self._tell_anomaly()
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.root_frame))
@@ -168,6 +223,8 @@ class Estimator(Shell):
     def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
         self.core.reset()
+        self.latched = False
         self.take_anomaly(False)
         self.detected.publish(Bool(data=False))
+        self._tell_isolated()
         return f'cleared: {cause}' if cause else 'nothing was detected'

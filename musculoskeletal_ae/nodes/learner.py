@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: learns the body online and hands the network to the other nodes.
 
-joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_detected →
+joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_detected,
+isolated_muscles →
 mae_checkpoint.
 """
 
@@ -65,6 +66,9 @@ class Learner(Shell):
         # length, tension, temperature
         self.follow_muscle_states(lambda states: core.muscles(self._now(), *states[1::-1]))
         self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        self.told = False
+        self.gate = self.core.gate
+        self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
         serve(self, Trigger, 'learner/relearn', self._relearn)
@@ -104,6 +108,12 @@ class Learner(Shell):
     def _take_imu(self, message: Imu) -> None:
         prefix = self.parameter('frame_prefix')
         self.core.imu(self._now(), *read_imu(message, self.links, prefix))
+
+    def _isolate(self, muscles: tuple[int, ...]) -> None:
+        # An estimator that has just started knows of none before it has our network.
+        if muscles or self.told or not self.core.isolated:
+            self.core.isolate(muscles)
+        self.told = True
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)

@@ -62,6 +62,12 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             False, 'winches that forget their zeros: find them at the start'
         ),
         **parameters_of(Detection),
+        'isolate_muscles': Parameter(
+            ('',),
+            'muscles to do without: from the start, or when estimator/isolate is called, until '
+            'estimator/restore',
+            settable=True,
+        ),
         'mirror_muscles': Parameter(
             False, 'publish muscle_joint_states, so that plots know the names of the muscles'
         ),

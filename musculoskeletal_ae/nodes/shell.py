@@ -24,7 +24,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
@@ -290,6 +290,17 @@ class Shell(Node):
             changed(self.zeros.known, less)
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
+
+    def follow_isolated(self, isolate: Callable[[tuple[int, ...]], object]) -> None:
+        """Tell which muscles the estimator has isolated, places in T and l, when that changes."""
+
+        def take(message: String) -> None:
+            names = filter(None, map(str.strip, message.data.split(',')))
+            muscles = tuple(sorted({*self.robot.muscle_indices(names)}))
+            self.gate.isolated = muscles
+            isolate(muscles)
+
+        self.listen(String, 'isolated_muscles', take, LATCHED)
 
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False

@@ -49,6 +49,7 @@ class Sim(Arm):
         if not as_robot:
             self.follow_muscle_states(self._note)
         self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
+        self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -56,10 +57,15 @@ class Sim(Arm):
     def _use_checkpoint(self, mae: Mae) -> None:
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
+            arm.isolate(self.gate.isolated)
             arm.settle()
             self.arm = arm
         else:
             self.arm.use(mae)
+
+    def _isolate(self, muscles: tuple[int, ...]) -> None:
+        if self.arm is not None:
+            self.arm.isolate(muscles)
 
     def _command(self, length: Array) -> None:
         self.command = length - self.zeros.offset

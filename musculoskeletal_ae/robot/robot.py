@@ -8,9 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import RobotDescription, load_description
+from musculoskeletal_ae.robot.description import (
+    RobotDescription,
+    TensionRange,
+    load_description,
+)
 from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
@@ -26,6 +30,8 @@ class Robot:
         self.joint_count, self.muscle_count = len(self.joints), len(self.muscles)
         self.series_elastic = description.series_elastic
         self.tension = description.tension
+        self.isolated: tuple[int, ...] = ()  # muscles that are not used, places in T and l
+        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # all others, (M,)
         self.stiffness = description.stiffness
         self.root_link = description.root_link
         self.kinematics = Kinematics(
@@ -52,6 +58,16 @@ class Robot:
             if name not in self.muscles:
                 raise MusculoskeletalError(f'unknown muscle {name!r}; legal: {legal}')
         return [self.muscles.index(name) for name in names]
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Use all muscles but these, which pull nothing: the tensions that they may have are 0.
+
+        Everything that holds this object is told; who shares it with others isolates in a copy.
+        """
+        self.isolated = tuple(sorted(muscles))
+        used = self.used = ~np.isin(np.arange(self.muscle_count), self.isolated)
+        whole = self.description.tension
+        self.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""

@@ -10,8 +10,9 @@ equations of preset `default`, `paper` the printed descent.
 
 from __future__ import annotations
 
+import copy
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
@@ -48,7 +49,7 @@ class Simulation:
 
     def __init__(self, robot: Robot, mae: Mae, preset: str = 'default', arms: int = 1) -> None:
         """Put arms at θ = 0 (or the nearest limit) with T_bias and no command."""
-        self.robot = robot
+        self.robot = copy.copy(robot)
         self._kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
         self.wrench = np.zeros((arms, 6))
         self.fixed = np.full((arms, robot.joint_count), np.nan)
@@ -58,6 +59,11 @@ class Simulation:
     def use(self, mae: Mae) -> None:
         """Take a new network; the arms move on to its equilibrium from where they are."""
         self.mae, self._body = mae, self._kind(self.robot, mae)
+
+    def isolate(self, muscles: Iterable[int]) -> None:
+        """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
+        self.robot.isolate(muscles)
+        self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
         """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten."""

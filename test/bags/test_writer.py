@@ -16,7 +16,10 @@ from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
 
-LATCHED = ('robot_description', 'anomaly_detected', 'mae_checkpoint', 'muscle_length_zeros')
+LATCHED = (
+    'robot_description', 'anomaly_detected', 'isolated_muscles', 'mae_checkpoint',
+    'muscle_length_zeros',
+)  # fmt: skip
 
 
 @pytest.mark.parametrize('type_name', sorted({topic.type for topic in TOPICS.values()}))

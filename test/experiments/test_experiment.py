@@ -30,6 +30,8 @@ KEYS = {
     'body_change': '',
     'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m '
     'wrench_error false_contacts',
+    'resilience': 'healthy_rad one_isolated_rad two_isolated_rad proposed_one_isolated_rad '
+    'right_isolations_share wrong_isolations dead_sensor_rad',
     'robustness': 'kin foreign ablation_rad',
     'sensors': 'all_rad elbow_only_rad none_rad marker_tenth_rad imu_rad before_rad '
     'ellipsoid_share',

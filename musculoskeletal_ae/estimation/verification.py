@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is a suspect muscle broken: what it does while the controller winds it in a little.
+
+The arm has stopped, and the estimate is made without the suspect already. Once its command falls
+again (`control/safety.Winding`), what it reads, T and l, is compared with what muscle stiffness
+control demands of it, T_ref = T_bias + K (l − l_target), and with the length l' that the other
+muscles make likely:
+
+    l does not change at all              its sensor is frozen, or dead
+    T near zero; l follows, or l' − l > FAR    ruptured: the winch winds in what is left of the wire
+    T does not change at all, or is zero  its sensor is stuck, or dead
+    |l − l'| > FAR                        the length sensor has jumped
+    T follows T_ref                       healthy
+    else                                  jammed: the winch does not do as it is told
+
+A sound sensor is never quite still. A suspect that nobody winds stays isolated.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from musculoskeletal_ae.plausibility import SLACK
+
+HEALTHY = 'healthy'
+BEGUN, JUDGED = 0.001, 0.8  # [m] that the command has fallen, [s] of that
+PATIENCE = 8.0  # [s] without an answer
+FAR, FOLLOWED = 0.025, 0.005  # [m]
+CLOSE, SHARE = 8.0, 0.35  # [N]; of what is demanded beyond T_bias: T is as demanded
+STILL = 1e-6  # [m], [N] of a sensor that says always the same
+
+
+class Verification:
+    """Watches one muscle, from the message on that made it a suspect."""
+
+    def __init__(self, muscle: int, bias: float, stiffness: float) -> None:
+        """The muscle's place, its T_bias [N] and K [N/m]."""
+        self.muscle, self._bias, self._stiffness = muscle, bias, stiffness
+        self._time, self._highest = 0.0, -math.inf
+        self._rows: list[tuple[float, float, float, float]] = []
+        self._watched = 0.0
+
+    def step(
+        self, tension: float, length: float, command: float | None, likely: float, dt: float
+    ) -> str:
+        """Take T [N], l, l_target and l' [m], dt [s] after those before; return what it is, or ''.
+
+        l_target is None where none is known.
+        """
+        self._time += dt
+        if command is not None:
+            self._highest = max(self._highest, command)
+            if command < self._highest - BEGUN:
+                self._watched += dt
+                demand = self._bias + max(0.0, self._stiffness * (length - command))
+                self._rows.append((tension, length, demand, length - likely))
+        if self._watched >= JUDGED:
+            return self._judged()
+        return 'nobody wound it in' if self._time > PATIENCE else ''
+
+    def _judged(self) -> str:
+        tension, length, demand, off = np.array(self._rows).T
+        late = slice(len(tension) // 2, None)
+        pull, wanted, beside = (float(np.median(part[late])) for part in (tension, demand, off))
+        gone, follows = pull < SLACK * self._bias, length[0] - length[-1] > FOLLOWED
+        if np.ptp(length) < STILL:
+            return 'its length sensor stands still'
+        if gone and (beside < -FAR or follows):
+            return 'ruptured'
+        if gone or np.ptp(tension) < STILL:
+            return 'its tension sensor stands still'
+        if abs(beside) > FAR:
+            return f'its length sensor is off by {1e3 * beside:.0f} mm'
+        if abs(pull - wanted) < CLOSE + SHARE * (wanted - self._bias):
+            return HEALTHY
+        return 'jammed'

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Control without some muscles, and the winding in of a suspect."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from control_bench import OTHER, REST, ROBOT, Bench, values
+from exact_mae import ExactMae, rest_readings
+
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.safety import DEPTH, LENGTH, PAYING_OUT, TENSION, WIND, Muscles
+from musculoskeletal_ae.control.settings import METHODS
+from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.robot.tension import TensionProgramme
+from musculoskeletal_ae.simulation.simulation import Simulation
+
+LOST = 0
+USED = np.arange(ROBOT.muscle_count) != LOST
+
+
+def held(theta, torque=0.0):
+    """Return whether the others hold a posture."""
+    limits, weight = ROBOT.tension, ROBOT.kinematics.holding_torque(theta) + torque
+    slope = ExactMae(ROBOT).muscle_jacobian(theta, limits.bias)
+    try:
+        TensionProgramme(slope, weight, USED * limits.bias, USED * limits.limit).nearest(0.0)
+    except InfeasibleError:
+        return False
+    return True
+
+
+POSTURES = ROBOT.random_postures(300, np.random.default_rng(0))
+THERE = next(theta for theta in POSTURES if held(theta) and np.abs(theta - REST).max() > 0.4)
+NOT_THERE = next(theta for theta in POSTURES if not held(theta))
+
+
+@pytest.mark.parametrize('duration', [0.0, 1.0])
+@pytest.mark.parametrize('method', METHODS)
+def test_no_method_wants_tension_of_an_isolated_muscle(method, duration):
+    bench = Bench(method=method, first_duration=1.0, second_duration=0.5, target_duration=duration)
+    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # its sensor says so, too
+    bench.core.isolate([LOST])
+    if method != 'float':
+        bench.theta = THERE
+        bench.step()
+        bench.target(THERE)
+    sent = bench.step(600)
+    core, last = bench.core, sent[-1]
+    assert core.safety.cause == ''
+    if last.kind == TENSION:
+        assert last.value[LOST] == 0.0
+        assert (last.value[USED] >= 30.0).all()
+    else:
+        assert last.value[LOST] == core.safety.longest[LOST]
+        planned = core.motion._tension if core.follows else core.posture.solution.tension
+        assert planned[LOST] <= 1e-7
+    assert np.abs(np.diff(values(sent)[:, USED], axis=0)).max() <= (
+        0.1 * 0.01 * (1.0 if last.kind == LENGTH else 1e4) + 1e-9
+    )
+    assert ROBOT.isolated == ()
+
+
+def test_what_its_sensors_read_moves_nothing():
+    sent = []
+    for tension, longer in ((0.0, 0.0), (450.0, 0.5)):
+        bench = Bench()
+        bench.core.isolate([LOST])
+        length, pull = rest_readings(ROBOT, REST)
+        pull = np.where(USED, pull, tension)
+        bench.tension = pull
+        bench.target(THERE)
+        for _ in range(100):
+            bench.now += 0.01
+            read = Muscles(length + longer * ~USED, pull, np.full(6, 30.0))
+            bench.core.muscles(read, bench.now)
+            bench.core.estimated(REST, bench.now)
+            bench.core.step(bench.now)
+        assert bench.core.safety.cause == ''
+        sent.append(bench.core.safety.command.value)
+    np.testing.assert_array_equal(sent[0][USED], sent[1][USED])
+
+
+def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
+    bench = Bench(target_duration=1.0)
+    bench.core.isolate([LOST])
+    bench.theta = THERE
+    bench.step()
+    name = ROBOT.muscles[LOST]
+    with pytest.raises(MessageError, match=f'lack .* N·m at .* without {name}; nearest'):
+        bench.target(NOT_THERE)
+    assert bench.core.posture.theta is None
+    bench.configure(unreachable='nearest')
+    bench.target(NOT_THERE)
+    goal = bench.core.posture.theta
+    assert not bench.core._hand.missing(bench.mae, goal)
+    way, whole = goal - THERE, NOT_THERE - THERE
+    np.testing.assert_allclose(way, whole * (way @ whole) / (whole @ whole), atol=1e-9)
+    bench.step()
+    assert 'nearest approached' in bench.report().message
+    bench.core.isolate([])
+    bench.target(NOT_THERE)
+    np.testing.assert_array_equal(bench.core.posture.theta, NOT_THERE)
+
+
+class Verified(Bench):
+    """A stopped arm whose suspect is wound in; only its own module does anything."""
+
+    def __init__(self, **chosen):
+        super().__init__(**chosen)
+        self.target(REST)
+        self.step(50)
+        self.core.isolate([LOST])
+        self.core.anomaly(True)
+
+    def wound(self, count):
+        return values(self.step(count))[:, LOST]
+
+
+def test_a_suspect_is_wound_in_gently_while_the_arm_is_stopped_and_then_it_goes_on():
+    bench = Verified()
+    before = bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) - 2)
+    assert (np.diff(before) >= 0.0).all()  # paid out
+    after = bench.wound(100)
+    assert np.diff(after).min() >= -0.02 * 0.01 - 1e-12
+    fell = before[-1] - after[-1]
+    length = rest_readings(ROBOT, REST)[0][LOST]
+    assert 1e4 * (length - after[-1]) >= WIND
+    assert 0.0 < fell <= DEPTH
+    assert np.abs(np.diff(after[-20:])).max() == 0.0
+    assert bench.core.safety.cause == 'anomaly_detected'
+    bench.core.anomaly(False)
+    bench.step(2)
+    assert bench.core.safety.cause == ''
+    assert bench.step(400)[-1].value[LOST] == bench.core.safety.longest[LOST]
+
+
+def test_a_blind_suspect_is_wound_in_by_no_more_than_a_little():
+    bench = Verified()
+    bench.step(200)
+    highest = bench.core.safety.command.value[LOST]
+    length, tension = rest_readings(ROBOT, REST)
+    for _ in range(300):
+        bench.now += 0.01
+        read = Muscles(length - 0.1 * ~USED, tension * USED, np.full(6, 30.0))
+        bench.core.muscles(read, bench.now)
+        bench.core.estimated(REST, bench.now)
+        bench.core.step(bench.now)
+    assert highest - bench.core.safety.command.value[LOST] <= DEPTH + 1e-9
+
+
+@pytest.mark.parametrize('first', [True, False])
+def test_a_stop_that_was_asked_for_stays(first):
+    bench = Bench()
+    bench.target(REST)
+    bench.step(5)
+    events = [lambda: bench.core.stop('controller/stop was called'),
+              lambda: (bench.core.isolate([LOST]), bench.core.anomaly(True))]  # fmt: skip
+    for event in events if first else events[::-1]:
+        event()
+        bench.step(5)
+    bench.core.anomaly(False)
+    bench.step(10)
+    assert bench.core.safety.cause
+    assert bench.core.reset(bench.now) == ''
+
+
+def test_without_a_suspect_an_anomaly_that_is_over_moves_nothing():
+    bench = Bench()
+    bench.target(REST)
+    bench.core.isolate([LOST])  # long before
+    bench.step(150)
+    bench.core.anomaly(True)
+    lengths = bench.step(300)[-1].value
+    assert (lengths <= np.where(USED, bench.core.safety.longest, np.inf)).all()
+    bench.core.anomaly(False)
+    bench.step(10)
+    assert bench.core.safety.cause == 'anomaly_detected'
+
+
+def test_exploring_goes_on_after_the_suspect_was_verified():
+    bench = Bench()
+    bench.core.explore(True)
+    bench.step(20)
+    bench.core.anomaly(True)  # whichever comes first
+    bench.core.isolate([0])
+    bench.step(300)
+    bench.core.isolate([])  # it was healthy
+    bench.core.anomaly(False)
+    bench.step(5)
+    assert bench.core.posture.exploring
+
+
+def test_nothing_is_shared_with_whoever_else_has_the_robot():
+    one, two = Controller(ROBOT), Controller(ROBOT)
+    one.isolate([1])
+    assert two._robot.tension.bias[1] == 30.0
+    one.isolate([])
+    np.testing.assert_array_equal(one._robot.tension.limit, ROBOT.tension.limit)
+
+
+@pytest.mark.parametrize('preset', ['default', 'paper'])
+def test_a_simulated_arm_has_no_tension_there(trained, preset):
+    arm = Simulation(ROBOT, trained[preset], preset)
+    arm.isolate([LOST])
+    arm.command = trained[preset].lengths(OTHER[None], np.full((1, 6), 60.0)) - 0.01
+    for _ in range(20):
+        state = arm.step(0.01)
+    assert state.tension[0, LOST] == 0.0
+    assert (state.tension[0, USED] >= 30.0).all()
+    arm.isolate([])
+    assert arm.step(0.01).tension[0, LOST] >= 30.0

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A suspect is isolated at once, and what it does when it is wound in decides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.verification import HEALTHY, PATIENCE, Verification
+
+BIAS, STIFFNESS, DT = 30.0, 1e4, 0.01
+NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
+
+
+def verdict(tension, length, likely=0.0):
+    """Wind in by 3 mm after a while; T and l are functions of T_ref and of the row's number."""
+    watched = Verification(0, BIAS, STIFFNESS)
+    for n, (shake, stir) in enumerate(NOISE):
+        command = -min(max(0.0, (n - 150) * 0.0002), 0.003)
+        demand = BIAS + max(0.0, -STIFFNESS * command)
+        pull, wound = tension(demand, shake), length(n, stir)
+        if found := watched.step(pull, wound, command, likely, DT):
+            return found
+    raise AssertionError('no answer')
+
+
+def follows(demand, shake):
+    return demand + shake
+
+
+def still(_, stir):
+    return stir
+
+
+@pytest.mark.parametrize(
+    ('tension', 'length', 'likely', 'found'),
+    [
+        (follows, still, 0.004, HEALTHY),
+        (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, 'ruptured'),
+        (lambda _, __: 0.0, lambda n, stir: stir - 0.0002 * n, -0.05, 'ruptured'),
+        (lambda _, __: 0.0, still, 0.0, 'its tension sensor stands still'),
+        (lambda _, __: 71.0, still, 0.0, 'its tension sensor stands still'),
+        (follows, lambda _, __: 0.0, 0.03, 'its length sensor stands still'),
+        (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0, 'its length sensor is'),
+        (lambda _, shake: BIAS - 12.0 + shake, still, 0.0, 'jammed'),
+    ],
+)  # fmt: skip
+def test_what_a_suspect_does_tells_what_it_is(tension, length, likely, found):
+    assert verdict(tension, length, likely).startswith(found)
+
+
+def test_whom_nobody_winds_in_stays_isolated():
+    watched = Verification(0, BIAS, STIFFNESS)
+    answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]
+    assert 'nobody' in answers[-1]
+    assert not any(answers[: round(PATIENCE / DT) - 5])
+
+
+class Loop:
+    """An estimator that isolates; the commands are the test's."""
+
+    def __init__(self, robot, mae, healthy):
+        self.core, self.now, self.command = Estimator(robot), 100.0, healthy.length.copy()
+        self.core.use(mae)
+        self.core.detector.settings = Detection(on_anomaly='isolate')
+        self.rng = np.random.default_rng(0)
+
+    def step(self, message, times=1):
+        for _ in range(times):
+            self.now += DT
+            self.core.commanded(self.now, length=self.command)
+            shake, stir = self.rng.normal(0.0, 1.0, (2, 6))
+            tension = np.where(message.tension > 0.0, message.tension + shake, 0.0)
+            self.core.step(tension, message.length + 1e-4 * stir, self.now, self.now)
+
+
+@pytest.fixture
+def loop(robot, calibrated, healthy):
+    wide = replace(calibrated.anomaly, thresholds={'distance': 60.0})
+    return Loop(robot, replace(calibrated, anomaly=wide), healthy)
+
+
+@pytest.fixture
+def cut(slack):
+    """Return a message in which muscle 2 is cut: its winch has wound in what is left."""
+    return slack._replace(length=slack.length - 0.2 * (np.arange(6) == 2))
+
+
+def test_a_cut_muscle_is_isolated_at_once_and_stays_so(loop, robot, healthy, cut):
+    loop.step(healthy, 30)
+    loop.step(cut, 20)
+    assert loop.core.cause.startswith(robot.muscles[2])
+    assert loop.core.robot.isolated == loop.core.mae.isolated == (2,)
+    assert robot.isolated == ()  # others share it
+    assert 'verifying' in loop.core.report(loop.now).message
+    loop.command[2] -= 0.003
+    loop.step(cut, 100)
+    assert loop.core.cause == ''
+    assert loop.core.verified == f'{robot.muscles[2]}: ruptured'
+    assert loop.core.robot.isolated == (2,)
+    before = loop.core.mae.estimate(*cut).theta
+    loop.step(cut, 300)  # nothing is wrong any more
+    assert loop.core.cause == ''
+    np.testing.assert_array_equal(loop.core.mae.estimate(*healthy._replace(length=cut.length)).theta,
+                                  before)  # fmt: skip
+    report = loop.core.report(loop.now)
+    assert report.level == 'warn'
+    assert report.values['isolated muscles'] == robot.muscles[2]
+    loop.core.isolate(())
+    loop.step(healthy, 10)
+    assert loop.core.mae.isolated == ()
+
+
+def test_a_healthy_suspect_is_used_again_but_not_acquitted_for_ever(loop, healthy, wound):
+    for count in range(3):
+        loop.step(healthy, 30)
+        loop.step(wound, 8)
+        assert loop.core.cause
+        if count == 2:
+            break
+        assert len(loop.core.robot.isolated) == 1
+        (suspect,) = loop.core.robot.isolated
+        loop.command = healthy.length - (healthy.tension - 30.0) / 1e4
+        loop.step(healthy, 10)
+        loop.command = loop.command - 0.0015 * (np.arange(6) == suspect)
+        loop.step(healthy, 100)
+        assert loop.core.verified.endswith(HEALTHY)
+        assert loop.core.robot.isolated == ()
+        assert loop.core.cause == ''
+    assert loop.core.robot.isolated == ()  # latched as with on_anomaly: stop
+    loop.step(healthy, 1000)
+    assert loop.core.cause
+
+
+def test_stop_is_the_default_and_isolates_nobody(robot, calibrated, healthy, cut):
+    loop = Loop(robot, calibrated, healthy)
+    loop.core.detector.settings = Detection()
+    loop.step(cut, 1000)
+    assert loop.core.cause
+    assert loop.core.robot.isolated == ()
+
+
+def test_a_reset_while_it_is_verified_takes_the_suspect_back(loop, healthy, cut):
+    loop.step(healthy, 30)
+    loop.step(cut, 20)
+    loop.core.reset()
+    assert loop.core.robot.isolated == ()
+    assert loop.core.cause == ''
+
+
+def test_a_sensor_that_stands_still_while_the_arm_moves_is_named(robot, calibrated, healthy):
+    rng, frozen = np.random.default_rng(0), 3
+    quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
+    core = Estimator(robot)
+    core.use(replace(calibrated, anomaly=quiet))
+    for broken, share in ((False, 0.0), (True, 1.0)):
+        core.reset()
+        for n in range(400):
+            theta = 0.5 * (robot.lower + robot.upper) + 0.5 * np.sin(0.01 * n)
+            noise = 1e-4 * rng.standard_normal(6)
+            length = robot.muscle_lengths(theta, healthy.tension) + noise
+            length[frozen] -= share * (length[frozen] - healthy.length[frozen])
+            tension = healthy.tension + rng.standard_normal(6)
+            core.step(tension, length, n * DT, n * DT)
+        assert bool(core.cause) == broken
+    assert core.cause == f'{robot.muscles[frozen]}: a sensor stands still while the arm moves'

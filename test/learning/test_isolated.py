@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning without some muscles: nothing is learned of them, and all else goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from learning.conftest import job
+from learning.test_learner import Prepared
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.mae import checkpoint
+
+LOST = 2
+
+
+def test_what_an_isolated_muscle_reads_teaches_its_body_nothing(learned):
+    _, updater, store, stage = learned
+    before = updater.body.parameters[LOST].copy()
+    known = np.arange(6) != LOST
+    for _ in range(15):
+        theta, tension, length, direction = stage.sample()
+        store.add(Sample(theta, tension * known, length * known, direction), known.copy())
+    update = updater.update(job(store)._replace(isolated=(LOST,)))
+    moved = np.abs(updater.body.parameters[LOST] - before).max()
+    assert moved < 1e-3  # of Gauss–Newton on the samples of before
+    assert update.mae.isolated == (LOST,)
+    assert update.changed == ()
+    assert np.isfinite(update.loss)
+
+
+def test_the_learner_keeps_the_list_over_a_restart_and_its_samples_go_on(
+    arm26, initial, stage, tmp_path
+):
+    learner = Learner(arm26, initial, training=Prepared, directory=tmp_path)
+    for _ in range(3):
+        learner.accept(stage.sample())
+    learner.isolate((LOST,))
+    learner.accept(stage.sample())
+    assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
+    assert learner.training.jobs == []
+    data = learner.poll(0.0)
+    assert checkpoint.from_bytes(data, arm26).isolated == (LOST,)
+    assert learner.training.jobs[-1].isolated == (LOST,)
+    learner.close()
+    again = Learner(arm26, training=Prepared, directory=tmp_path)
+    assert again.isolated == again.mae.isolated == (LOST,)
+    assert len(again.samples) == 4
+    again.isolate(())
+    assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
+    again.close()
+
+
+def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
+    learner = Learner(arm26, initial, training=Prepared)
+    learner.anomaly(True)
+    version = learner.mae.version
+    learner.isolate((LOST,))
+    learner.isolate(())  # it was healthy
+    learner.anomaly(False)
+    assert learner.mae.version == version
+    learner.anomaly(True)
+    learner.isolate((LOST,))
+    learner.anomaly(False)
+    assert learner.mae.isolated == (LOST,)

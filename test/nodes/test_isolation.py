@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A muscle is cut, verified and isolated, and the arm moves on, over DDS."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from controlled_arm import ControlledArm
+from std_msgs.msg import Bool, String, UInt8MultiArray
+from std_srvs.srv import Trigger
+
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
+
+HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
+
+
+@pytest.fixture
+def arm(graph, arm26, trained_file):
+    graph.listen(String, 'isolated_muscles', LATCHED)
+    graph.listen(Bool, 'anomaly_detected', LATCHED)
+    arm = ControlledArm(graph, arm26, trained_file)
+    arm.target(HERE)
+    arm.goes_to(HERE)
+    return arm
+
+
+def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
+    graph, name = arm.graph, arm.robot.muscles[3]
+    assert graph.received['isolated_muscles'][-1].data == ''
+    assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
+    graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
+    graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
+    assert arm.estimator.core.verified == f'{name}: ruptured'
+    assert graph.received['isolated_muscles'][-1].data == name
+    graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
+    assert arm.controller.core._robot.isolated == (3,)
+    arm.target(THERE)
+    arm.goes_to(THERE)
+    assert arm.estimator.core.cause == ''
+    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    answer = graph.call(Trigger, 'estimator/restore')
+    assert (answer.success, answer.message) == (True, 'isolated: none')
+    graph.wait(lambda: arm.controller.core._robot.isolated == (), 'its use')
+
+
+def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, trained):
+    graph, names = arm.graph, list(arm.robot.muscles[1:3])
+    assert not graph.call(Trigger, 'estimator/isolate').success  # none is named
+    done, reason = graph.set_parameter('estimator', 'isolate_muscles', ['tail'])
+    assert not done
+    assert 'legal: ' in reason
+    assert graph.set_parameter('estimator', 'isolate_muscles', names)[0]
+    assert graph.call(Trigger, 'estimator/isolate').message == f'isolated: {", ".join(names)}'
+    graph.wait(lambda: arm.controller.core._robot.isolated == (1, 2), 'the controller')
+    stranger = graph.publisher(String, 'isolated_muscles', LATCHED)
+    stranger.publish(String(data='tail'))
+    graph.wait(lambda: sum(n for what, n in arm.controller.rejected.items() if 'isolated' in what),
+               'the rejection')  # fmt: skip
+    assert arm.controller.core._robot.isolated == (1, 2)
+    # A learner's network that knows of none is told again who they are.
+    count = len(graph.received['isolated_muscles'])
+    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    network.publish(bytes_message(checkpoint.to_bytes(trained['default'])))
+    graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
+    assert arm.estimator.core.robot.isolated == (1, 2)
+
+
+def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
+    graph, arm26, trained
+):
+    known = replace(trained['default'].without((4,)), version=5)
+    told = graph.listen(String, 'isolated_muscles', LATCHED)
+    estimator = graph.host(Estimator, robot='arm26')
+    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    network.publish(bytes_message(checkpoint.to_bytes(known)))
+    graph.wait(lambda: told, 'the list')
+    assert told[-1].data == arm26.muscles[4]
+    assert estimator.core.mae.isolated == (4,)
