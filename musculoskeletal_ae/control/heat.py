@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How hot the windings are, and what each muscle may pull for how long.
 
-A motor that warms its housing, which the surroundings cool (LINEAGE, arXiv 2407.08055):
+A motor that warms its housing, which the surroundings cool (arXiv 2407.08055):
 
     C₁ ċ₁ = k T² − (c₁ − c₂)/R₁,   C₂ ċ₂ = (c₁ − c₂)/R₁ − (c₂ − c_a)/R₂
 

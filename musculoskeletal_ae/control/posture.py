@@ -72,7 +72,7 @@ class RestFeedback:
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
     Friction and errors of the body image leave the arm beside its target; the estimate sees most of
-    that (LINEAGE, hysteresis feedback). They also leave muscles that pull against each other: a
+    that (arXiv 2405.11808). They also leave muscles that pull against each other: a
     tension commanded as a length is off by K_stiff times what l is off. T* exerts the torque of T,
     so that the relief of one moves no joint. `correction` is c [rad] (D,), `relief` r [m] (M,).
     """

@@ -19,7 +19,7 @@ def test_what_an_isolated_muscle_reads_teaches_its_body_nothing(learned):
     before = updater.body.parameters[LOST].copy()
     known = np.arange(6) != LOST
     for _ in range(15):
-        theta, tension, length, direction = stage.sample()
+        theta, tension, length, direction, *_ = stage.sample()
         store.add(Sample(theta, tension * known, length * known, direction), known.copy())
     update = updater.update(job(store)._replace(isolated=(LOST,)))
     moved = np.abs(updater.body.parameters[LOST] - before).max()
