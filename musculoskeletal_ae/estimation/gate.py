@@ -52,7 +52,7 @@ LIMITS = {
     'θ by ③': 0.7,
     'T by ③': 13.0,
     'l by ③': 0.6,
-    'G by ①': 1.4,
+    'G by ①': 1.6,
 }
 #: lengths [m] and moment arms [m] that spread less are not to be explained better than larger ones
 LEAST_SPREAD, LEAST_ARM = 0.04, 0.01
