@@ -46,7 +46,7 @@ LIMITS = {
     'θ by ①': 0.6,
     'T by ①': 1.35,  # two muscles exchanged show √2
     'l by ①': 1.7,
-    'θ by ②': 0.8,
+    'θ by ②': 1.3,  # of a joint that the muscles do not tell, 1
     'T by ②': 1.35,
     'l by ②': 0.6,
     'θ by ③': 0.7,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from pathlib import Path
 
 import pytest
@@ -18,11 +19,17 @@ MINUTES = 0.5
 
 
 @pytest.fixture(scope='session')
-def quick(tmp_path_factory) -> Path:
-    """The folder of `experiment all --quick` on the small arm, from two processes."""
-    folder = tmp_path_factory.mktemp('experiments')
-    options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2 --out {folder}'
-    assert experiment.main(options.split()) == 0
+def quick(tmp_path_factory, worker_id) -> Path:
+    """The folder of `experiment all --quick` on the small arm, from two processes; once a run."""
+    folder = tmp_path_factory.getbasetemp()
+    shared = folder if worker_id == 'master' else folder.parent
+    folder, done = shared / 'experiments', shared / 'experiments_done'
+    with (shared / 'experiments_lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2 --out {folder}'
+            assert experiment.main(options.split()) == 0
+            done.touch()
     return folder
 
 
