@@ -296,7 +296,7 @@ class Controller:
 
     @property
     def _left_out(self) -> str:
-        return ', '.join(self._robot.muscles[m] for m in self._robot.isolated)
+        return self._robot.names(self._robot.isolated)
 
     def _refuse_floating(self) -> None:
         if self.settings.method == 'float':

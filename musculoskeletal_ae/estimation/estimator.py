@@ -9,8 +9,7 @@
 What was detected first names the suspect for as long as the latch holds. With `on_anomaly:
 isolate` the suspect is isolated at once and verified (`verification`), also one whose length has
 jumped: if it is broken it stays isolated, else it is used again, and either way the anomaly is
-over. The robot in here is the
-estimator's own: its isolated muscles are those of which it knows.
+over. The robot in here is the estimator's own: its isolated muscles are those of which it knows.
 """
 
 from __future__ import annotations
@@ -308,8 +307,7 @@ class Estimator:
             spread = np.sqrt(np.diag(self.mae.covariance))
             told = (f'{name} {s:.3f}' for name, s in zip(self._robot.joints, spread, strict=True))
             values['joint uncertainty'] = ', '.join(told) + ' rad'
-        isolated = ', '.join(self._robot.muscles[m] for m in self._robot.isolated)
-        if isolated:
+        if isolated := self._robot.names(self._robot.isolated):
             values['isolated muscles'] = isolated
         if self.verified:
             values['last verified'] = self.verified

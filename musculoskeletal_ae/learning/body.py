@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.learning.postures import FREEDOM, fit_jointly
+from musculoskeletal_ae.learning.postures import FIRST_NOISE, fit_jointly, student
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -184,7 +184,6 @@ class CorrectedBody:
 
 ROUNDS = 6  # of Gauss–Newton per fit
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a Gauss–Newton step, tried until one lowers the cost
-FIRST_NOISE = 0.002  # [m], before anything is known
 LEAST_NOISE = 0.0003  # [m] of a length at rest, beyond what all the rest explains
 #: samples from before a muscle changed that are enough to start from what they said
 LEAST_ANCHOR = 8
@@ -321,7 +320,7 @@ def _noise_and_weight(
     residual: Array, known: Array, noise: float, freedom: float, least: float
 ) -> tuple[float, Array]:
     """One step of the EM algorithm for the scale and weights of a Student distribution."""
-    weight = known * (FREEDOM + 1.0) / (FREEDOM + (residual / noise) ** 2)
+    weight = known * student(residual / noise)
     variance = (weight @ residual**2 + 4.0 * least**2) / (freedom + 4.0)
     return max(least, float(np.sqrt(variance))), weight
 

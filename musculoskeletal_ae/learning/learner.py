@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 #: between the beginnings of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
 #: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
-SENSOR, MARKER, NONE = JOINT_SOURCES = 'sensor', 'marker', 'none'
+SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 SPREAD = 0.02  # of θ as a camera sees it [rad]
 TILT_AGE = 0.5  # [s] that what an IMU says holds
 LEAST_BLIND = 20  # samples to begin with where no θ is known
@@ -146,13 +146,14 @@ class Learner:
         _, tension, length, dt, theta = paired
         if not 0.0 <= time - self._tilted < TILT_AGE:
             self._rests.gravity = NOTHING
-        tension, length = tension * self._used, length * self._used
+        used = self._used
+        tension, length = tension * used, length * used
         self._gate_time += dt
         self.gate.message(tension, length, self._gate_time)
         if self._mae is not None and not self._rests.anomaly:
             self._torque.step(tension, length, dt)
         for rest in self._rests.step(tension, length, dt, theta):
-            self._spoiled |= ~self._used
+            self._spoiled |= ~used
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
                 self.accept(rest)
@@ -400,7 +401,7 @@ class Learner:
             **self.training.values(),
         }
         if self.isolated:
-            values['isolated muscles'] = ', '.join(self.robot.muscles[m] for m in self.isolated)
+            values['isolated muscles'] = self.robot.names(self.isolated)
         if self.refused:
             values |= {'refused networks': str(self.refused), 'last refused': self.last_refused}
         if self._state is not None:
@@ -419,7 +420,7 @@ class Learner:
                 worst = int(update.noise.argmax())
                 values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({muscles[worst]})'
             if update.contradicted:
-                names = ', '.join(muscles[m] for m in update.contradicted)
+                names = self.robot.names(update.contradicted)
                 what = 'newest samples contradict several muscles'
                 values[what] = f'{names}; look at the joint sensors'
         return values | {f'not learned: {why}': str(n) for why, n in self.rejected.items()}

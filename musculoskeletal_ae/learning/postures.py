@@ -162,7 +162,7 @@ class _GroupFit:
         """Take noise, robust weights and stops at a point; `determined`: unknowns per muscle."""
         known = self._known
         for _ in range(3):
-            weight = known * _student(rows.length / self.noise)
+            weight = known * student(rows.length / self.noise)
             freedom = np.maximum(1.0, known.sum(axis=0) - determined)
             square = (weight * rows.length**2).sum(axis=0) + 4.0 * self._least**2
             self.noise = np.maximum(self._least, np.sqrt(square / (freedom + 4.0)))
@@ -178,12 +178,12 @@ class _GroupFit:
         at = np.where(above, self._upper, np.where(below, self._lower, own))
         free = ~(above | below)
         wide = np.maximum(sigma, TORQUE * rows.load)
-        self._by_torque = self._balanced * free * _student(rows.torque / wide) / wide**2
+        self._by_torque = self._balanced * free * student(rows.torque / wide) / wide**2
         self._target = np.clip(at, self._lower, self._upper)
         outside = above | below | (self._target != own)
         self._by_stop = outside / STOP**2 / self._repeated
         y = self._angle_precision
-        self._by_angle = y * _student(rows.angle * np.sqrt(y))
+        self._by_angle = y * student(rows.angle * np.sqrt(y))
         self._by_gravity = self._tilted / GRAVITY**2
 
     def cost(self, rows: _Rows, theta: Array, zero: Array) -> float:
@@ -300,7 +300,8 @@ class _GroupFit:
             self.noise[i] = np.hypot(self.noise[i], np.sqrt(unknown.mean()))
 
 
-def _student(score: Array) -> Array:
+def student(score: Array) -> Array:
+    """Return weights ω of residuals, which come in units of their spread."""
     return (FREEDOM + 1.0) / (FREEDOM + score**2)
 
 

@@ -2,7 +2,6 @@
 """The node `controller`: target posture → muscle commands, with a latched safe stop.
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
-target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
 muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
 with method `tension`; controller_state. Action follow_joint_trajectory, where control_msgs is
 installed.

@@ -150,7 +150,7 @@ class Estimator(Shell):
         return self._isolate(m for m in self.core.robot.isolated if m not in back)
 
     def _isolated_names(self) -> str:
-        return ', '.join(self.robot.muscles[m] for m in self.core.robot.isolated)
+        return self.robot.names(self.core.robot.isolated)
 
     def _tell_isolated(self) -> None:
         if self.core.robot.isolated != self.told_isolated:

@@ -59,6 +59,10 @@ class Robot:
                 raise MusculoskeletalError(f'unknown muscle {name!r}; legal: {legal}')
         return [self.muscles.index(name) for name in names]
 
+    def names(self, muscles: Iterable[int]) -> str:
+        """Return the names of muscles, places in T and l, for people to read."""
+        return ', '.join(self.muscles[m] for m in muscles)
+
     def isolate(self, muscles: Iterable[int]) -> None:
         """Use all muscles but these, which pull nothing: the tensions that they may have are 0.
 
