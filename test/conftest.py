@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,23 @@ settings.register_profile('no deadline', deadline=None)
 settings.load_profile('no deadline')
 
 
+@contextmanager
+def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
+    folder = factory.getbasetemp()
+    folder = folder.parent if worker else folder  # what pytest-xdist's processes have in common
+    with (folder / f'{what}.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield folder
+
+
 @pytest.fixture(scope='session')
-def trained_files(tmp_path_factory) -> dict[str, Path]:
+def alone(tmp_path_factory) -> Callable[[str], AbstractContextManager[Path]]:
+    """Return what enters a folder of the whole run, one process at a time, to make something."""
+    return partial(_alone, tmp_path_factory)
+
+
+@pytest.fixture(scope='session')
+def trained_files(alone) -> dict[str, Path]:
     """Return files of briefly trained networks of arm26, by preset, trained once a run."""
     # Torch is loaded for tests that want a network only.
     from musculoskeletal_ae.mae import checkpoint
@@ -29,11 +47,8 @@ def trained_files(tmp_path_factory) -> dict[str, Path]:
     from musculoskeletal_ae.presets import PRESETS
     from musculoskeletal_ae.robot.robot import Robot
 
-    folder = tmp_path_factory.getbasetemp()
-    folder = folder.parent if worker else folder  # what pytest-xdist's processes have in common
-    files = {preset: folder / f'arm26_{preset}.safetensors' for preset in PRESETS}
-    with (folder / 'lock').open('w') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with alone('networks') as folder:
+        files = {preset: folder / f'arm26_{preset}.safetensors' for preset in PRESETS}
         for preset, file in files.items():
             if not file.exists():
                 mae = initial_mae(Robot.load('arm26'), preset, seed=3, steps=600).mae

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import fcntl
 from pathlib import Path
 
 import pytest
@@ -19,13 +18,10 @@ MINUTES = 0.5
 
 
 @pytest.fixture(scope='session')
-def quick(tmp_path_factory, worker_id) -> Path:
+def quick(alone) -> Path:
     """The folder of `experiment all --quick` on the small arm, from two processes; once a run."""
-    folder = tmp_path_factory.getbasetemp()
-    shared = folder if worker_id == 'master' else folder.parent
-    folder, done = shared / 'experiments', shared / 'experiments_done'
-    with (shared / 'experiments_lock').open('w') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with alone('experiments') as common:
+        folder, done = common / 'experiments', common / 'experiments_done'
         if not done.exists():
             options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2 --out {folder}'
             assert experiment.main(options.split()) == 0
