@@ -17,6 +17,7 @@ released each minute and a push of 10 to 30 N for a second every ten: isolations
 
 from __future__ import annotations
 
+import copy
 from itertools import combinations
 from typing import Any
 
@@ -38,7 +39,7 @@ from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Row
 from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
-from musculoskeletal_ae.robot.tension import TensionProgramme
+from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # messages of the held-out motion
 TARGETS = 2
@@ -125,18 +126,15 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
 
     And, of some of those, the distance at which `proposed` ends [rad], None where it refuses.
     """
-    robot, limits, held = loop.arm.robot, loop.arm.robot.tension, []
-    without = np.where(np.arange(robot.muscle_count) == muscle, 0.0, 1.0)
+    robot, held, count = loop.arm.robot, [], 0
+    without = copy.copy(robot)
+    without.isolate([muscle])
     postures = robot.random_postures(TRIES, rng)
-    count = 0
     for theta, slope in zip(postures, loop.arm.individual.muscle_jacobian(postures)):
-        torque = robot.kinematics.holding_torque(theta)
         try:
-            TensionProgramme(slope, torque, limits.bias, limits.limit).nearest(0.0)
+            holding_tension(robot, theta, jacobian=slope)
             count += 1
-            TensionProgramme(slope, torque, without * limits.bias, without * limits.limit).nearest(
-                0
-            )
+            holding_tension(without, theta, jacobian=slope)
             held.append(theta)
         except InfeasibleError:
             continue
