@@ -14,8 +14,8 @@ new samples; `whole` is what the learner of all muscles had from the beginning.
 
 from __future__ import annotations
 
-import argparse
 import copy
+import sys
 import tempfile
 from itertools import count
 from pathlib import Path
@@ -33,7 +33,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.robot.directories import find_robot
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 
 OFFSET = 0.020  # [m]
@@ -122,20 +122,22 @@ def report(robot: Robot, seed: int, muscles: list[int], quick: bool) -> str:
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> int:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog='relearning', description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0,1')
+    parser = Parser('relearning', 'Prints what a re-tied and an added muscle cost.')
+    parser.add_robot()
+    parser.add_seeds((0, 1))
     parser.add_argument('--muscles', default='2', help='numbers of muscles, from 0')
-    parser.add_argument('--quick', action='store_true', help='three minutes instead of ten')
+    parser.add_quick('three minutes instead of ten')
     args = parser.parse_args(argv)
-    robot = Robot.load(find_robot(args.robot))
-    for seed in map(int, args.seeds.split(',')):
-        muscles = [*map(int, args.muscles.split(','))]
-        print(report(robot, seed, muscles, args.quick), flush=True)
+
+    def work() -> None:
+        robot, muscles = Robot.load(args.robot), [*map(int, args.muscles.split(','))]
+        for seed in args.seeds:
+            print(report(robot, seed, muscles, args.quick), flush=True)
+
+    return exit_status(work)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

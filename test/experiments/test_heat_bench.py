@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from musculoskeletal_ae.experiments import heat
+from bench import heat
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.mae import checkpoint
 
