@@ -77,50 +77,49 @@ class BlockDiagonal:
 
 
 class Activation(NamedTuple):
-    """An activation h(x), and (h, h') together; both may overwrite x."""
+    """An activation h(u), and (h, dh/du) together, of u = gain · x; both may overwrite u."""
 
     value: Callable[[Singles], Singles]
     with_slope: Callable[[Singles], tuple[Singles, Singles]]
+    gain: float
 
 
-def _tanh_slope(x: Singles) -> tuple[Singles, Singles]:
-    h = np.tanh(x, out=x)
+def _tanh_slope(u: Singles) -> tuple[Singles, Singles]:
+    h = np.tanh(u, out=u)
     slope = h * h
     return h, np.subtract(1.0, slope, out=slope)
 
 
-def _silu(x: Singles) -> Singles:
-    # u (1 + tanh u) with u = x/2: does not overflow, and needs one temporary array.
-    x *= 0.5
-    result: Singles = np.tanh(x)
+def _silu(u: Singles) -> Singles:
+    # x σ(x) = u t with u = x/2 and t = 1 + tanh u: does not overflow, in one temporary array.
+    result: Singles = np.tanh(u)
     result += 1.0
-    result *= x
+    result *= u
     return result
 
 
-def _silu_slope(x: Singles) -> tuple[Singles, Singles]:
-    # h = x σ and h' = σ + h − h σ, in three arrays: a batch then stays in the cache.
-    sigmoid = 0.5 * x
-    np.tanh(sigmoid, out=sigmoid)
-    sigmoid *= 0.5
-    sigmoid += 0.5
-    h = x * sigmoid
-    np.multiply(h, sigmoid, out=x)
-    sigmoid += h
-    sigmoid -= x
-    return h, sigmoid
+def _silu_slope(u: Singles) -> tuple[Singles, Singles]:
+    # h = u t and dh/du = t + h (2 − t), in three arrays: a batch then stays in the cache.
+    t = np.tanh(u)
+    t += 1.0
+    h = np.multiply(u, t, out=u)
+    slope: Singles = np.subtract(2.0, t)
+    slope *= h
+    slope += t
+    return h, slope
 
 
 ACTIVATIONS = {
-    'tanh': Activation(lambda x: np.tanh(x, out=x), _tanh_slope),
-    'silu': Activation(_silu, _silu_slope),
+    'tanh': Activation(lambda u: np.tanh(u, out=u), _tanh_slope, 1.0),
+    'silu': Activation(_silu, _silu_slope, 0.5),
 }
 
 
 class Stack(NamedTuple):
     """Layers x @ weight + bias, weight (in, out); the activation follows all but the last.
 
-    What goes in and comes out is of double precision, what is between of single.
+    The gain of the activation is in the weights before it. What goes in and comes out is of double
+    precision, what is between of single.
     """
 
     layers: tuple[tuple[Singles | BlockDiagonal, Singles], ...]
@@ -232,7 +231,7 @@ class Mae:
                 constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
                 bias = first_bias + constant - weight @ mean[own][seen]
                 layer = _transposed(weight * scale[own][seen], bias)
-                stacks.append(Stack((layer, *after), activation))
+                stacks.append(_stack((layer, *after), activation))
             *rest, (last, last_bias) = decoder[layers]
             before = tuple(_transposed(*layer) for layer in rest)
             weight, bias = last * std[own][:, None], last_bias * std[own] + mean[own]
@@ -243,7 +242,7 @@ class Mae:
                 (leave_length, lengths),
                 (leave_scaled, (weight, bias)),
             ):
-                stacks.append(Stack((*before, _transposed(*final)), activation))
+                stacks.append(_stack((*before, _transposed(*final)), activation))
         all_columns = np.concatenate(columns)
         out = np.argsort(all_columns)
         out_length = np.argsort(np.concatenate([group.muscles for group in groups]))
@@ -397,6 +396,12 @@ def _frozen(array: Array) -> Array:
     copy = np.array(array, dtype=np.float64, order='C')
     copy.setflags(write=False)
     return copy
+
+
+def _stack(layers: tuple[tuple[Singles, Singles], ...], activation: Activation) -> Stack:
+    gain = np.float32(activation.gain)
+    hidden = tuple((gain * weight, gain * bias) for weight, bias in layers[:-1])
+    return Stack((*hidden, layers[-1]), activation)
 
 
 def _transposed(weight: Array, bias: Array) -> tuple[Singles, Singles]:
