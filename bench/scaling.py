@@ -86,7 +86,7 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     one = held_out.tension[0], held_out.length[0]
     row['estimate'] = microseconds(lambda: mae.estimate(*one))
     row['solve'] = microseconds(lambda: _solve(robot, mae))
-    row['update'] = _update_time(robot, mae, exploring)
+    row['update'] = update_time(robot, mae, exploring)
     row['checkpoint'] = (folder / f'learned_{INDIVIDUAL}.safetensors').stat().st_size / 1e6
     row['memory'] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     return row
@@ -98,7 +98,7 @@ def _solve(robot: Robot, mae: Mae) -> Array:
     return proposed(robot, mae, theta, torque, bias, robot.tension.limit).length
 
 
-def _update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
+def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     """Return the time of an update from a store that is full [s]."""
     part = exploring.part(np.linspace(0, len(exploring.theta) - 1, CAPACITY, dtype=int))
     none = np.zeros_like(part.tension)

@@ -4,7 +4,9 @@
     python -m bench timings [--robot NAME|DIR] [--preset NAME]
 
 The torch side is the same algorithm with the same numbers going in; only the network runs in torch,
-and its gradients come from autograd.
+and its gradients come from autograd. The bound is what the network's multiply-adds alone take, at
+the rate of this machine's products of matrices of that size: one row for a single call, a batch for
+many arms.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from musculoskeletal_ae.control.methods import first_command, msc_compensation, 
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
 from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -43,6 +45,36 @@ class Row(NamedTuple):
     ours: Callable[[], object]
     torch_eager: Callable[[], object] | None = None
     several: int = 1
+    products: int = 0  # multiply-adds of the network; 0 where how many depends on the numbers
+
+
+class Timed(NamedTuple):
+    """What one call takes [µs]; 0 where there is nothing to say."""
+
+    name: str
+    ours: float
+    torch_eager: float
+    bound: float
+
+
+def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
+    """Return the multiply-adds of an encoder with a mask, if any, and of the decoder, or of l."""
+    depth, total = len(mae.encoder) // len(mae.groups), sum(w.size for w, _ in mae.decoder)
+    for g, group in enumerate(mae.groups):
+        muscles = len(group.muscles)
+        last = mae.decoder[(g + 1) * depth - 1][0]
+        total -= last.shape[1] * (len(last) - muscles) if lengths else 0
+        if mask is not None:
+            first, *rest = (weight for weight, _ in mae.encoder[g * depth : (g + 1) * depth])
+            seen = int(visible(mask, len(group.joints), muscles).sum())
+            total += len(first) * seen + sum(weight.size for weight in rest)
+    return total
+
+
+def gemm_rate(rows: int) -> float:
+    """Return the multiply-adds a microsecond of products of (rows, 200) with (200, 100)."""
+    left, right = np.ones((rows, 200), np.float32), np.ones((200, 100), np.float32)
+    return rows * right.size / microseconds(lambda: left @ right)
 
 
 def microseconds(function: Callable[[], object], calls: int = 100, rounds: int = 20) -> float:
@@ -78,16 +110,19 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
             'estimate: θ, T, l from ②',
             lambda: mae.estimate(tension, length),
             _no_grad(lambda: eager(scaled, masks[Mask.TENSION_LENGTH])),
+            products=products(mae, Mask.TENSION_LENGTH),
         ),
         Row(
             'lengths from ①',
             lambda: mae.lengths(theta, tension),
             _no_grad(lambda: eager(scaled, masks[Mask.THETA_TENSION])),
+            products=products(mae, Mask.THETA_TENSION),
         ),
         Row(
             'decode and gradient by z',
             lambda: mae.decode_scaled.with_pullback(z)[1](gradient),
             lambda: _eager_gradient(eager, latent),
+            products=2 * products(mae, None),
         ),
         Row('muscle Jacobian G from ①', lambda: mae.muscle_jacobian(theta, tension)),
         Row(
@@ -227,10 +262,11 @@ def simulation_rows(robot: Robot, preset: str) -> list[Row]:
         simulated.wrench[:, 2] = -10.0
         return lambda: simulated.step(0.01)
 
-    eager = EagerLengths(mae)
+    eager, work = EagerLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
+    many = f'the same, each of {MANY} in one batch'
     return [
-        Row('simulation step', step(1, mae), step(1, eager)),
-        Row(f'the same, each of {MANY} in one batch', step(MANY, mae), step(MANY, eager), MANY),
+        Row('simulation step', step(1, mae), step(1, eager), 1, work),
+        Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
     ]
 
 
@@ -247,15 +283,30 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
     return torch.autograd.grad(network.decode(leaf).sum(), leaf)
 
 
-def measure(robot: Robot, preset: str) -> None:
-    """Print the table."""
+def measure(robot: Robot, preset: str) -> list[Timed]:
+    """Return what each step takes."""
     torch.set_num_threads(1)
+    rates = {1: gemm_rate(1), MANY: gemm_rate(256)}
+    return [
+        Timed(
+            row.name,
+            row_time(row, row.ours),
+            row_time(row, row.torch_eager) if row.torch_eager else 0.0,
+            row.products / rates[row.several],
+        )
+        for row in mae_rows(robot, preset) + simulation_rows(robot, preset)
+    ]
+
+
+def show(robot: Robot, preset: str) -> None:
+    """Print the table."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}, µs of one call (median), torch on one thread')
-    print(f'{"":<34}{"ours":>10}{"torch eager":>14}')
-    for row in mae_rows(robot, preset) + simulation_rows(robot, preset):
-        eager = '' if row.torch_eager is None else f'{row_time(row, row.torch_eager):.1f}'
-        print(f'{row.name:<34}{row_time(row, row.ours):>10.1f}{eager:>14}')
+    print(f'{"":<42}{"ours":>10}{"torch eager":>14}{"bound":>10}')
+    for row in measure(robot, preset):
+        numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))
+        told = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
+        print(f'{row.name:<42}{"".join(told)}')
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -264,4 +315,4 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_robot()
     parser.add_preset()
     args = parser.parse_args(argv)
-    return exit_status(lambda: measure(Robot.load(args.robot), args.preset))
+    return exit_status(lambda: show(Robot.load(args.robot), args.preset))

@@ -23,8 +23,9 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -139,8 +140,26 @@ class System:
         self._rclpy.try_shutdown()
 
 
-def measure(system: System, rate: float, seconds: float) -> str:
-    """Return one line of the table."""
+class Wire(NamedTuple):
+    """What a system of nodes did."""
+
+    latency: tuple[float, ...]  # 50 %, 99 %, largest [ms]
+    late: float  # [%]
+    missed: float  # [%]
+    cpu: dict[str, float]  # of each node [% of a core]
+
+    def __str__(self) -> str:
+        """Return one line of the table."""
+        half, most, largest = self.latency
+        cost = ', '.join(f'{name} {value:.0f}' for name, value in self.cpu.items())
+        return (
+            f'{half:6.2f}{most:7.2f}{largest:7.1f}{self.late:7.2f}{self.missed:7.2f}'
+            f'   {sum(self.cpu.values()):4.0f}   {cost}'
+        )
+
+
+def measure(system: System, rate: float, seconds: float) -> Wire:
+    """Listen to a system of nodes that starts."""
     deadline = time.monotonic() + 60.0
     while not system.stamps['muscle_length_command'] and time.monotonic() < deadline:
         system.spin(0.5)
@@ -160,14 +179,25 @@ def measure(system: System, rate: float, seconds: float) -> str:
     after = np.searchsorted(commands, states)
     known = after < len(commands)
     latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
-    late = float((latency > 2e3 / rate).mean())
-    missed = max(0.0, 1.0 - len(states) / (rate * passed))
-    spread = np.percentile(latency, (50, 99, 100))
-    cost = ', '.join(f'{name} {value:.0f}' for name, value in used.items())
-    return (
-        f'{spread[0]:6.2f}{spread[1]:7.2f}{spread[2]:7.1f}{100 * late:7.2f}{100 * missed:7.2f}'
-        f'   {sum(used.values()):4.0f}   {cost}'
-    )
+    late = 100.0 * float((latency > 2e3 / rate).mean())
+    missed = 100.0 * max(0.0, 1.0 - len(states) / (rate * passed))
+    return Wire(tuple(np.percentile(latency, (50, 99, 100)).tolist()), late, missed, used)
+
+
+def systems(
+    robot: str, rates: Iterable[float], kinds: Iterable[str], seconds: float
+) -> Iterator[tuple[float, str, Wire]]:
+    """Measure one robot at rates [Hz] with kinds of nodes; yield the rate, the kind, and what."""
+    with tempfile.TemporaryDirectory() as folder:
+        network = Path(folder) / 'network.safetensors'
+        checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
+        for rate in rates:
+            for kind in kinds:
+                system = System(robot, network, rate, KINDS[kind])
+                try:
+                    yield rate, kind, measure(system, rate, seconds)
+                finally:
+                    system.end()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -179,18 +209,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--repeat', type=whole(1, 100), default=1, help='so many times')
     args = parser.parse_args(argv)
     print('latency [ms]: 50 %, 99 %, largest; late and missed messages [%]; CPU [% of a core]')
-    with tempfile.TemporaryDirectory() as name:
-        for robot in args.robots.split(','):
-            network = Path(name) / f'{Path(robot).name}.safetensors'
-            checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
-            for rate in map(float, args.rates.split(',')):
-                for what, names in [*KINDS.items()] * args.repeat:
-                    system = System(robot, network, rate, names)
-                    try:
-                        line = measure(system, rate, args.seconds)
-                    finally:
-                        system.end()
-                    print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {what:<18}{line}', flush=True)
+    for robot in args.robots.split(','):
+        rates, kinds = map(float, args.rates.split(',')), [*KINDS] * args.repeat
+        for rate, kind, wire in systems(robot, rates, kinds, args.seconds):
+            print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<18}{wire}', flush=True)
     return 0
 
 

@@ -29,7 +29,7 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CorrectedBody
 
-DIFFERENCE = 1e-3  # [rad]
+DIFFERENCE = 1e-6  # [rad]
 ZERO = np.deg2rad(2.0)  # spread of the joint sensors' zeros [rad]
 #: What the body does not know is common to all samples, so that they count as no more than these
 #: in what they say of a zero.
@@ -91,7 +91,7 @@ class _GroupFit:
         self._least = least_noise
         self._known = seen.known[:, muscles].astype(float)
         # The torque of a muscle that was changed since is not that of the one there is.
-        crossed = body.robot.routes.crossed[np.ix_(muscles, joints)]
+        crossed = self._crossed = body.robot.routes.crossed[np.ix_(muscles, joints)]
         changed = ~seen.known[:, muscles] & (seen.tension[:, muscles] > 0.0)  # 0 N: isolated
         self._balanced = ~(changed @ crossed)
         self._read = np.isfinite(seen.theta[:, joints])
@@ -116,29 +116,32 @@ class _GroupFit:
         """Return residuals at θ of all joints (N, D), the body's parameters, and zeros (D,)."""
         body, seen, joints, muscles = self._body, self._seen, self._joints, self._muscles
         count, steps = len(theta), DIFFERENCE * np.eye(theta.shape[1])[joints]
-        moved = np.concatenate([theta[None], theta + steps[:, None], theta - steps[:, None]])
-        parts, flat = len(moved), moved.reshape(-1, theta.shape[1])
+        flat = np.concatenate([theta[None], theta + steps[:, None]]).reshape(-1, theta.shape[1])
         poses, places = body.poses(flat), len(joints)
         length = np.empty((count, len(muscles)))
-        slope = np.empty((count, len(muscles), places))
+        slope = np.zeros((count, len(muscles), places))
         by_body, columns = [], self._columns
-        torque_by_body = np.empty((count, places, columns[-1].stop))
+        torque_by_body = np.zeros((count, places, columns[-1].stop))
         end = np.empty_like(length)
         for i, m in enumerate(muscles):
             pull, way = seen.tension[:, m], seen.direction[:, m]
-            l_m, j_m = body.linearised(poses, flat, np.tile(pull, parts), np.tile(way, parts), m)
-            l_m, j_m = l_m.reshape(parts, count), j_m.reshape(parts, count, -1)
+            turns = np.flatnonzero(self._crossed[i])  # the other joints do not move it
+            parts = np.append(0, 1 + turns)
+            at = (count * parts[:, None] + np.arange(count)).ravel()
+            placed = poses._make(part[np.append(at, -1)] for part in poses)
+            pulls, ways = (np.tile(part, len(parts)) for part in (pull, way))
+            l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m)
+            l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
             length[:, i] = seen.length[:, m] - l_m[0]
             by_body.append(j_m[0])
-            slope[:, i] = (l_m[1 : 1 + places] - l_m[1 + places :]).T / (2.0 * DIFFERENCE)
-            turn = (j_m[1 : 1 + places] - j_m[1 + places :]) / (2.0 * DIFFERENCE)
+            slope[:, i, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
             end[:, i] = pull * np.exp(-body.friction(m) * way)
-            block = turn.swapaxes(0, 1) * end[:, i, None, None]
-            block[:, :, body.layouts[m].friction] -= (way * end[:, i])[:, None] * slope[:, i]
-            torque_by_body[:, :, columns[i]] = block
+            block = (j_m[1:] - j_m[0]) * (end[:, i, None] / DIFFERENCE)
+            block[:, :, body.layouts[m].friction] -= way * end[:, i] * slope[:, i, turns].T
+            torque_by_body[:, turns, columns[i]] = block.swapaxes(0, 1)
         muscular = end[:, :, None] * slope
         weight = body.robot.kinematics.holding_torque(theta)[:, joints]
-        down = self._down(poses.rotation[:-1].reshape(parts, count, -1, 3, 3))
+        down = self._down(poses.rotation[:-1].reshape(1 + places, count, -1, 3, 3))
         return _Rows(
             length,
             slope,
@@ -148,7 +151,7 @@ class _GroupFit:
             np.median(np.abs(muscular).sum(axis=1), axis=0),
             np.where(self._read, seen.theta[:, joints] - theta[:, joints] - self._own * zero, 0.0),
             self._tilted * (self._tilt - down[0]),
-            np.moveaxis(down[1 : 1 + places] - down[1 + places :], 0, -1) / (2.0 * DIFFERENCE),
+            np.moveaxis(down[1:] - down[0], 0, -1) / DIFFERENCE,
             self._mean - np.concatenate([body.parameters[m] for m in muscles]),
         )
 

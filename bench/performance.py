@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes doc/performance.md: core steps, the running system, starts, memory and learning times.
+
+    python -m bench performance [--seconds 20] [--flames] --out doc
+
+Times hold for the machine and the day that the page names, which should have nothing else to do.
+`--flames` draws, by py-spy, where each node spends its time at 200 Hz, as OUT/flames/NODE.svg.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import tempfile
+import time
+import sys
+from collections.abc import Iterable
+from datetime import date
+from pathlib import Path
+
+from bench import timings
+from bench.scaling import update_time
+from bench.wire import KINDS, System, cpu, systems
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, exit_status, number
+from musculoskeletal_ae.presets import DEFAULT
+from musculoskeletal_ae.robot.robot import Robot
+
+ARM = 'musashi_left_arm'
+RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, 'musashi_upper_body')
+EXPLORING = 60.0  # [s] that samples of an update come from
+FLAME_RATE, SETTLING = 200.0, 15.0  # [Hz], [s]
+
+#: what the first version that was measured (commit be0daee) took on an idle machine of two cores
+BEFORE_CORE = {
+    'estimate: θ, T, l from ②': 19.0, 'control solve: proposed, default': 380.0,
+    'control solve: proposed, paper': 530.0, 'simulation step': 150.0,
+    f'the same, each of {timings.MANY} in one batch': 6.7,
+}  # fmt: skip
+#: rate [Hz]: latency at 50 %, 99 %, largest [ms]; all nodes [% of a core]; with learner to 200 Hz
+BEFORE_WIRE = {100.0: ('3.4 / 9.4 / 19', 138), 200.0: ('2.4 / 8.6 / 17', 172),
+               500.0: ('0.6 / 6.1 / 12', 166)}  # fmt: skip
+BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'controller': 145,
+                 'learner': 338}  # fmt: skip
+PAGE = """# Performance
+
+Written by `python -m bench performance --out doc` on {day}: {machine}. Before: the first version
+that was measured (be0daee), on an idle machine of two cores.
+
+## One call of the core
+
+`bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound: the
+network's multiply-adds at the rate of this machine's own products of matrices of that size.
+
+{core}
+
+## At the wire
+
+`bench wire`: from the publishing of `muscle_states` to that of the command that answers it; late:
+after two periods; missed: messages that did not come; CPU: all nodes, learner and its training
+included. "Combined": estimator and controller in one process (`bringup.sh --combined`). "Plain node": what one would write, torch
+eager in one rclpy node, no safety, no control.
+
+{wire}
+
+## Starting, and memory
+
+CPU until the first command or answer, with everything compiled before; resident memory, of which
+shared libraries, which all processes have once together, are {shared:.0f} MB of the estimator's.
+
+{start}
+
+## Learning
+
+`{arm}`, one core.
+
+| | before | now |
+|---|---|---|
+| initial training [CPU s] | 28 | {training:.0f} |
+| one update, samples full [CPU s] | 0.5–1 | {update:.2f} |
+{flames}"""
+FLAMES = '\n## Where a node’s time goes\n\nBy py-spy at 200 Hz: {}.\n'
+
+
+def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
+    """Return a table in Markdown."""
+    columns = head.count('|') + 1
+    cells = (f'| {" | ".join(map(str, line))} |' for line in lines)
+    return '\n'.join((f'| {head} |', '|---' * columns + '|', *cells))
+
+
+def core(robot: Robot) -> str:
+    """Return the table of the core's steps."""
+    said = []
+    for row in timings.measure(robot, DEFAULT.name):
+        ratio = f'{row.torch_eager / row.ours:.1f}' if row.torch_eager else ''
+        numbers = (f'{v:.1f}' if v else '' for v in (row.ours, row.torch_eager, row.bound))
+        said.append((row.name, BEFORE_CORE.get(row.name, ''), *numbers, ratio))
+    return rows('| before [µs] | now [µs] | torch eager [µs] | bound [µs] | times faster', said)
+
+
+def wire(seconds: float) -> str:
+    """Return the table of the running system."""
+    said = []
+    for robot in SIZES:
+        kinds = KINDS if robot == ARM else ('nodes', 'with learner')
+        for rate, kind, found in systems(robot, RATES, kinds, seconds):
+            latency = ' / '.join(f'{value:.1f}' for value in found.latency)
+            watched = robot == ARM and (kind == 'nodes') is (rate == max(RATES))
+            known = BEFORE_WIRE[rate] if watched and kind in ('nodes', 'with learner') else ('', '')
+            said.append(
+                (
+                    robot,
+                    f'{rate:.0f}',
+                    kind,
+                    known[0],
+                    latency,
+                    f'{found.late:.1f}',
+                    f'{found.missed:.1f}',
+                    known[1],
+                    f'{sum(found.cpu.values()):.0f}',
+                )
+            )
+    head = (
+        'robot | rate [Hz] | nodes | before: 50 % / 99 % / largest [ms] | now [ms] | late [%] | '
+        'missed [%] | CPU before [%] | now [%]'
+    )
+    return rows(head, said)
+
+
+def resident(pid: int) -> tuple[float, float]:
+    """Return the resident memory of a process, and how much of it is files [MB]."""
+    text = Path(f'/proc/{pid}/status').read_text('ascii')
+    sizes = dict(line.split(':', 1) for line in text.splitlines())
+    whole, files = (int(sizes[key].split()[0]) / 1e3 for key in ('VmRSS', 'RssFile'))
+    return whole, files
+
+
+def starting(network: Path) -> tuple[str, float]:
+    """Return the table of starts and memory, and what the estimator has of files [MB]."""
+    system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
+    try:
+        while not system.stamps['muscle_length_command']:
+            system.spin(0.1)
+        used = {name: cpu(process.pid) for name, process in system.nodes.items()}
+        system.spin(SETTLING)
+        held = {name: resident(process.pid) for name, process in system.nodes.items()}
+    finally:
+        system.end()
+    said = (
+        (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
+    )
+    head = 'node | CPU until the first command [s] | memory before [MB] | now [MB]'
+    return rows(head, said), held['estimator'][1]
+
+
+def flames(network: Path, seconds: float, out: Path) -> str:
+    """Draw a flame graph of each node, and return the page's words of them."""
+    out.mkdir(parents=True, exist_ok=True)
+    system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
+    try:
+        system.spin(SETTLING)
+        for name, process in system.nodes.items():
+            command = ('py-spy', 'record', '--pid', str(process.pid), '--duration', f'{seconds:.0f}',
+                       '--output', str(out / f'{name}.svg'))  # fmt: skip
+            watching = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+            while watching.poll() is None:
+                system.spin(0.1)
+    finally:
+        system.end()
+    return FLAMES.format(', '.join(f'[{name}](flames/{name}.svg)' for name in system.nodes))
+
+
+def learning(robot: Robot, folder: Path) -> tuple[float, float, Path]:
+    """Return the time of initial training and of an update [s], and the network."""
+    begun, network = time.process_time(), folder / 'network.safetensors'
+    mae = initial_mae(robot).mae
+    training = time.process_time() - begun
+    checkpoint.save(mae, network)
+    exploring = record(EmulatedArm(robot, 0), mae, EXPLORATION_STREAM, EXPLORING)
+    return training, update_time(robot, mae, exploring), network
+
+
+def machine() -> str:
+    """Name the machine."""
+    text = Path('/proc/cpuinfo').read_text('utf-8')
+    names = {line.partition(':')[2].strip() for line in text.splitlines() if 'model name' in line}
+    return f'{os.cpu_count()} cores of {", ".join(sorted(names)) or platform.machine()}'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure everything and write the page."""
+    parser = Parser('performance', 'Writes doc/performance.md.')
+    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
+    parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
+    parser.add_out('DIR', 'performance.md and flames/')
+    args = parser.parse_args(argv)
+
+    def work() -> None:
+        robot = Robot.load(ARM)
+        with tempfile.TemporaryDirectory() as folder:
+            training, update, network = learning(robot, Path(folder))
+            start, shared = starting(network)
+            page = PAGE.format(
+                day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
+                wire=wire(args.seconds), start=start, shared=shared, training=training,
+                update=update,
+                flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
+            )  # fmt: skip
+        args.out.mkdir(parents=True, exist_ok=True)
+        (args.out / 'performance.md').write_text(page, encoding='utf-8')
+
+    return exit_status(work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
