@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+import sys
 import tempfile
 import time
-import sys
 from collections.abc import Iterable
 from datetime import date
 from pathlib import Path
@@ -53,8 +53,8 @@ that was measured (be0daee), on an idle machine of two cores.
 
 ## One call of the core
 
-`bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound: the
-network's multiply-adds at the rate of this machine's own products of matrices of that size.
+`bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound:
+the network's multiply-adds at the rate of this machine's own products of matrices of that size.
 
 {core}
 
@@ -62,8 +62,8 @@ network's multiply-adds at the rate of this machine's own products of matrices o
 
 `bench wire`: from the publishing of `muscle_states` to that of the command that answers it; late:
 after two periods; missed: messages that did not come; CPU: all nodes, learner and its training
-included. "Combined": estimator and controller in one process (`bringup.sh --combined`). "Plain node": what one would write, torch
-eager in one rclpy node, no safety, no control.
+included. "Combined": estimator and controller in one process (`bringup.sh --combined`). "Plain
+node": what one would write, torch eager in one rclpy node, no safety, no control.
 
 {wire}
 
@@ -165,8 +165,8 @@ def flames(network: Path, seconds: float, out: Path) -> str:
     try:
         system.spin(SETTLING)
         for name, process in system.nodes.items():
-            command = ('py-spy', 'record', '--pid', str(process.pid), '--duration', f'{seconds:.0f}',
-                       '--output', str(out / f'{name}.svg'))  # fmt: skip
+            command = f'py-spy record --pid {process.pid} --duration {seconds:.0f} --output'.split()
+            command.append(str(out / f'{name}.svg'))
             watching = subprocess.Popen(command, stdout=subprocess.DEVNULL)
             while watching.poll() is None:
                 system.spin(0.1)

@@ -220,8 +220,13 @@ class _GroupFit:
         stiffness = np.stack([kinematics.gravity_gradient(row) for row in theta])
         stiffness = stiffness[:, joints[:, None], joints]
         routes, tension = self._body.robot.routes, self._seen.tension[:, self._muscles]
-        bend = muscle_hessian(routes.muscle_jacobian, theta)
-        bend = bend[:, self._muscles[:, None, None], joints[:, None], joints]
+
+        def own(angles: Array) -> Array:  # G of the group, whose joints alone turn
+            whole = np.repeat(theta[:, None], places, axis=1)
+            whole[:, :, joints] = angles
+            return routes.muscle_jacobian(whole)[..., self._muscles[:, None], joints]
+
+        bend = muscle_hessian(own, theta[:, joints])
         stiffness += np.einsum('nm,nmij->nij', tension, bend)
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian
         turned, e = rows.gravity_by_posture, self._by_gravity

@@ -166,17 +166,27 @@ class Routes:
             direction[:, wraps] = 0.0
         jacobian = np.zeros((len(theta), len(self._sum), theta.shape[1]))
         for i in range(1, len(kin.parent)):
-            k = kin.theta_index[i]
-            axis, origin = poses.axis[:, i, None], poses.translation[:, i, None]
-            motion = axis if kin.prismatic[i] else np.cross(axis, points - origin)
-            motion = np.broadcast_to(motion, points.shape)
-            hangs = kin.hangs_on[:, i]
-            velocity = motion * hangs[self.joint][:, None]
-            rate = velocity[:, self.second] - velocity[:, self.first]
-            longer = np.einsum('nsi,nsi->ns', direction, rate)
+            k, hangs = kin.theta_index[i], kin.hangs_on[:, i]
+            moves = hangs[self.joint]
+            # A segment whose ends both move, or both stay, keeps its length.
+            across = np.flatnonzero(moves[self.first] != moves[self.second])
+            outer = moves[self.second[across]]
+            end = np.where(outer, self.second[across], self.first[across])
+            motion = self._motion(poses, i, points[:, end])
+            sign = np.where(outer, kin.ratio[i], -kin.ratio[i])
+            longer = np.einsum('nsi,nsi,s->ns', direction[:, across], motion, sign)
+            jacobian[:, :, k] += longer @ self._sum.T[across]
             if self.objects is not None:
                 for end, pull in zip(ends, (leave, arrive)):
-                    seen = 1.0 * hangs[self.joint[end]] - hangs[link]
-                    longer[:, wraps] -= np.einsum('nsi,nsi,s->ns', pull, motion[:, end], seen)
-            jacobian[:, :, k] += kin.ratio[i] * (longer @ self._sum.T)
+                    seen = kin.ratio[i] * (1.0 * moves[end] - hangs[link])
+                    motion = self._motion(poses, i, points[:, end])
+                    longer = np.einsum('nsi,nsi,s->ns', pull, motion, seen)
+                    jacobian[:, :, k] -= longer @ self._sum.T[wraps]
         return jacobian
+
+    def _motion(self, poses: JointPoses, i: int, points: Array) -> Array:
+        """Return ∂/∂q of points (N, S, 3) that joint i of the tree moves, the same shape."""
+        axis = np.broadcast_to(poses.axis[:, i, None], points.shape)
+        if self._kinematics.prismatic[i]:
+            return axis
+        return np.cross(axis, points - poses.translation[:, i, None])
