@@ -128,7 +128,7 @@ class _GroupFit:
             turns = np.flatnonzero(self._crossed[i])  # the other joints do not move it
             parts = np.append(0, 1 + turns)
             at = (count * parts[:, None] + np.arange(count)).ravel()
-            placed = poses._make(part[np.append(at, -1)] for part in poses)
+            placed = type(poses)(*(part[np.append(at, -1)] for part in poses))
             pulls, ways = (np.tile(part, len(parts)) for part in (pull, way))
             l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
@@ -221,12 +221,12 @@ class _GroupFit:
         stiffness = stiffness[:, joints[:, None], joints]
         routes, tension = self._body.robot.routes, self._seen.tension[:, self._muscles]
 
-        def own(angles: Array) -> Array:  # G of the group, whose joints alone turn
+        def turned_routes(angles: Array) -> Array:  # G of the group, whose joints alone turn
             whole = np.repeat(theta[:, None], places, axis=1)
             whole[:, :, joints] = angles
             return routes.muscle_jacobian(whole)[..., self._muscles[:, None], joints]
 
-        bend = muscle_hessian(own, theta[:, joints])
+        bend = muscle_hessian(turned_routes, theta[:, joints])
         stiffness += np.einsum('nm,nmij->nij', tension, bend)
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian
         turned, e = rows.gravity_by_posture, self._by_gravity
