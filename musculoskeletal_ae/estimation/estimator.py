@@ -183,11 +183,12 @@ class Estimator:
     def _suspected(self, mae: Mae, verdict: Verdict, tension: Array, length: Array) -> int:
         """Return the muscle without which the rest is most likely."""
         robot = self._robot
-        slack = tension[verdict.suspect] < SLACK * robot.tension.bias[verdict.suspect]
-        if verdict.sure or slack or not self.detector.calibrated:
+        # Where one is cut, another may be slack for a moment.
+        slack = robot.used & (tension < SLACK * robot.tension.bias)
+        if verdict.sure or slack.sum() == 1 or not self.detector.calibrated:
             return verdict.suspect
         isolated, distance = robot.isolated, np.full(robot.muscle_count, np.inf)
-        for muscle in np.flatnonzero(robot.used).tolist():
+        for muscle in np.flatnonzero(slack if slack.any() else robot.used).tolist():
             less = mae.without((*isolated, muscle))
             assert less.anomaly is not None
             error = residuals(less.estimate(tension, length), tension, length, less.isolated)

@@ -7,7 +7,7 @@ control demands of it, T_ref = T_bias + K (l − l_target), and with the length 
 muscles make likely:
 
     l does not change at all              its sensor is frozen, or dead
-    T near zero; l follows, or l' − l > FAR    ruptured: the winch winds in what is left of the wire
+    T near zero; l' − l > FAR or growing   ruptured: the winch winds in what is left of the wire
     T does not change at all, or is zero  its sensor is stuck, or dead
     |l − l'| > FAR                        the length sensor has jumped
     T follows T_ref                       healthy
@@ -64,7 +64,7 @@ class Verification:
         tension, length, demand, off = np.array(self._rows).T
         late = slice(len(tension) // 2, None)
         pull, wanted, beside = (float(np.median(part[late])) for part in (tension, demand, off))
-        gone, follows = pull < SLACK * self._bias, length[0] - length[-1] > FOLLOWED
+        gone, follows = pull < SLACK * self._bias, off[0] - off[-1] > FOLLOWED
         if np.ptp(length) < STILL:
             return 'its length sensor stands still'
         if gone and (beside < -FAR or follows):
