@@ -62,7 +62,6 @@ def measure(study: Study, seed: int) -> Measured:
             learner.imu(SAMPLE_TIME * n, hand, felt_at_rest(robot, theta, hand, rng))
 
     ways: dict[str, tuple[str, See]] = {
-        'all': (SENSOR, lambda _l, _n, _t, read: read),
         'elbow_only': (SENSOR, lambda _l, _n, _t, read: np.where(elbow, read, np.nan)),
         'none': (NONE, lambda *_: None),
         'marker_tenth': (MARKER, marker),
@@ -71,8 +70,11 @@ def measure(study: Study, seed: int) -> Measured:
     stream = study.stream(seed, 'exploring')
     length, tension = stream.length, stream.tension
     numbers = {'before_rad': estimation_error(study.network(None, 'default'), held_out)}
+    # The one that explored was taught by all joint sensors.
+    networks = {'all': study.network(seed, 'default')}
     for name, (source, see) in ways.items():
-        mae = _taught(study, seed, source, see, stream)
+        networks[name] = _taught(study, seed, source, see, stream)
+    for name, mae in networks.items():
         numbers[f'{name}_rad'] = estimation_error(mae, held_out)
         if mae.covariance is not None and name in ('all', 'none'):
             key = 'ellipsoid_share' if name == 'all' else 'none_ellipsoid_share'

@@ -45,10 +45,12 @@ LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 #: from a limit, where a joint that muscles push there is taken to be at its stop, how many such
 #: spreads that takes, and how far such a joint is from the limit [rad]
 NEAR_STOP, PUSHED, STOP = 0.15, 3.0, 0.01
-LARGEST_STEP = 0.3  # of a posture [rad]
-ENOUGH = 1e-3  # relative decrease of the cost that ends the rounds
-ROUNDS = 8
-SHARES = (1.0, 0.5, 0.25, 0.125)  # of a step, tried until one lowers the cost
+ROUNDS = 12
+#: decrease that a step should bring, in variances, that ends the rounds: the step is then far
+#: shorter than what the samples leave open, and the noise has settled
+ENOUGH = 0.1
+DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # of a step, tried until one lowers the cost
+EXPECTED = 0.3  # step of a posture [rad]
 FREEDOM = 4.0  # of the Student distribution
 SMALL = 1e-6
 
@@ -106,6 +108,7 @@ class _GroupFit:
         self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ZERO_SAMPLES)
         self._zero_precision = self._repeated / ZERO**2
         self._near = np.where(self._own, 2.0 * ZERO, NEAR_STOP)
+        self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
 
     # -- one point ------------------------------------------------------------------------------
 
@@ -173,27 +176,33 @@ class _GroupFit:
         score = rows.torque / sigma
         own = theta[:, self._joints]
         # What is left of the torque on a joint pushes it; at a stop that is the stop's own.
-        above = self._balanced & (own > self._upper - self._near) & (score > PUSHED)
-        below = self._balanced & (own < self._lower + self._near) & (score < -PUSHED)
-        at = np.where(above, self._upper, np.where(below, self._lower, own))
+        # One that leans on it does until it would have to be held there.
+        enough = np.where(np.isnan(self._at), PUSHED, 0.0)
+        above = self._balanced & (own > self._upper - self._near) & (score > enough)
+        below = self._balanced & (own < self._lower + self._near) & (score < -enough)
+        self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
         free = ~(above | below)
         wide = np.maximum(sigma, TORQUE * rows.load)
         self._by_torque = self._balanced * free * student(rows.torque / wide) / wide**2
-        self._target = np.clip(at, self._lower, self._upper)
-        outside = above | below | (self._target != own)
-        self._by_stop = outside / STOP**2 / self._repeated
         y = self._angle_precision
         self._by_angle = y * student(rows.angle * np.sqrt(y))
         self._by_gravity = self._tilted / GRAVITY**2
 
+    def _stops(self, theta: Array) -> tuple[Array, Array]:
+        """Return how far joints are from the stops they lean on or passed [rad], and weights."""
+        own = theta[:, self._joints]
+        goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
+        leaning = ~np.isnan(self._at) | (goal != own)
+        return goal - own, leaning / STOP**2 / self._repeated
+
     def cost(self, rows: _Rows, theta: Array, zero: Array) -> float:
         """Return what is to be minimised, with the weights as they are."""
-        stop = self._target - theta[:, self._joints]
+        stop, by_stop = self._stops(theta)
         return float(
             (self._by_length * rows.length**2).sum()
             + (self._by_torque * rows.torque**2).sum()
             + (self._by_angle * rows.angle**2).sum()
-            + (self._by_stop * stop**2).sum()
+            + (by_stop * stop**2).sum()
             + (self._by_gravity * rows.gravity**2).sum()
             + self._precision @ rows.prior**2
             + self._zero_precision @ zero**2
@@ -201,8 +210,8 @@ class _GroupFit:
 
     # -- one step -------------------------------------------------------------------------------
 
-    def step(self, rows: _Rows, theta: Array, zero: Array) -> tuple[Array, Array, Array]:
-        """Return how w, θ and z change."""
+    def system(self, rows: _Rows, theta: Array, zero: Array) -> tuple[Array, ...]:
+        """Return the normal equations: of θ, mixed, of w and z; their right sides."""
         joints, kinematics = self._joints, self._body.robot.kinematics
         count, places, size = len(theta), len(joints), len(self._mean)
         stiffness = np.stack([kinematics.gravity_gradient(row) for row in theta])
@@ -216,13 +225,14 @@ class _GroupFit:
         inner = np.einsum('nmi,nm,nmj->nij', slope, a, slope)
         inner += np.einsum('nki,nk,nkj->nij', stiffness, b, stiffness)
         inner += np.einsum('nki,nk,nkj->nij', turned, e, turned)
-        diagonal = self._by_angle + self._by_stop + SMALL / STOP**2
+        stop, by_stop = self._stops(theta)
+        diagonal = self._by_angle + by_stop + SMALL / STOP**2
         inner += diagonal[:, :, None] * np.eye(places)
         pulled = np.einsum('nmi,nm->ni', slope, a * rows.length)
         pulled += np.einsum('nki,nk->ni', stiffness, b * rows.torque)
         pulled += np.einsum('nki,nk->ni', turned, e * rows.gravity)
         pulled += self._by_angle * rows.angle
-        pulled += self._by_stop * (self._target - theta[:, joints])
+        pulled += by_stop * stop
 
         outer = np.zeros((size + places, size + places))
         right = np.zeros(size + places)
@@ -247,19 +257,30 @@ class _GroupFit:
         outer[np.arange(size), np.arange(size)] += self._precision
         right[:size] += self._precision * rows.prior
 
-        lower = np.linalg.cholesky(inner)
-        joined = np.concatenate([mixed, pulled[:, :, None]], axis=2)
-        reduced = np.linalg.solve(lower, joined)
-        last = reduced[:, :, -1]
-        tall = reduced[:, :, :-1].reshape(-1, size + places)
-        schur = outer - tall.T @ tall
         self.leverage = np.einsum('nmi,nij,nmj->nm', slope, np.linalg.inv(inner), slope) * a
-        self.root = cholesky(schur + SMALL * np.eye(len(schur)))
-        solved = cho_solve((self.root, False), right - tall.T @ last.ravel())
+        return inner, mixed, outer, pulled, right
+
+    def solve(self, system: tuple[Array, ...], damping: float) -> tuple[Array, Array, Array]:
+        """Return how w, θ and z change; undamped, note by how much that should lower the cost.
+
+        The damping counts steps in units of what is expected: s of w and z, `EXPECTED` of θ.
+        """
+        inner, mixed, outer, pulled, right = system
+        places = pulled.shape[1]
+        size = len(right) - places
+        usual = np.append(self._precision, self._zero_precision)
+        lower = np.linalg.cholesky(inner + damping / EXPECTED**2 * np.eye(places))
+        reduced = np.linalg.solve(lower, np.concatenate([mixed, pulled[:, :, None]], axis=2))
+        last = reduced[:, :, -1]
+        tall = reduced[:, :, :-1].reshape(-1, len(right))
+        schur = outer + np.diag(SMALL + damping * usual) - tall.T @ tall
+        root = cholesky(schur)
+        solved = cho_solve((root, False), right - tall.T @ last.ravel())
         back = last - reduced[:, :, :-1] @ solved
         posture = np.linalg.solve(lower.swapaxes(1, 2), back[:, :, None])[:, :, 0]
-        step = np.clip(posture, -LARGEST_STEP, LARGEST_STEP)
-        return solved[:size], step, solved[size:]
+        if not damping:
+            self.root, self.gain = root, right @ solved + (pulled * posture).sum()
+        return solved[:size], posture, solved[size:]
 
     def determined(self) -> Array:
         """Return how many unknowns each muscle's lengths pin down, (M,)."""
@@ -277,19 +298,25 @@ class _GroupFit:
         for _ in range(ROUNDS):
             self.weigh(rows, theta, determined)
             before = self.cost(rows, theta, zero[joints])
-            change, turn, shift = self.step(rows, theta, zero[joints])
-            determined = self.determined()
+            system = self.system(rows, theta, zero[joints])
             old = [body.parameters[m] for m in self._muscles], theta.copy(), zero.copy()
-            for share in (*SHARES, 0.0):
+            determined = self.determined()
+            for damping in DAMPING:
+                change, turn, shift = self.solve(system, damping)
                 for m, at, column in zip(self._muscles, old[0], self._columns):
-                    body.parameters[m] = at + share * change[column]
-                theta[:, joints] = old[1][:, joints] + share * turn
-                zero[joints] = old[2][joints] + share * shift
+                    body.parameters[m] = at + change[column]
+                theta[:, joints] = old[1][:, joints] + turn
+                zero[joints] = old[2][joints] + shift
                 rows = self.rows(theta, zero[joints])
-                after = self.cost(rows, theta, zero[joints])
-                if after <= before:
+                if self.cost(rows, theta, zero[joints]) <= before:
                     break
-            if before - after < ENOUGH * before:
+            else:
+                for m, at in zip(self._muscles, old[0]):
+                    body.parameters[m] = at
+                theta[:], zero[:] = old[1:]
+                rows = self.rows(theta, zero[joints])
+                break
+            if self.gain < ENOUGH:
                 break
         self.weigh(rows, theta, determined)
         for i in np.flatnonzero((self._known == 0.0).any(axis=0)):

@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import write_robot
 
-from learning.conftest import Stage
+from learning.conftest import Stage, drawn_body
+from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 from musculoskeletal_ae.learning.postures import _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.robot.robot import Robot
 
 
 class Resting(Stage):
@@ -68,6 +71,30 @@ def errors(arm26, seen, truth) -> tuple[float, float]:
 def test_postures_are_found_from_the_muscles_alone(arm26, seen):
     before, after = errors(arm26, blind(seen), seen.theta)
     assert after < before / 3.0
+
+
+def test_a_fit_goes_on_until_it_would_not_move(arm26, seen):
+    body, rng = CorrectedBody(arm26), np.random.default_rng(1)
+    guess = seen.theta + rng.normal(0.0, 0.3, seen.theta.shape)
+    first = fit_body(body, blind(seen), guess=guess).theta
+    second = fit_body(body, blind(seen), guess=first).theta
+    assert np.linalg.norm(second - first, axis=1).mean() < 0.005
+
+
+@pytest.mark.parametrize('other', [False, True], ids=['arm26', 'other'])
+@pytest.mark.parametrize('scale', [0.3, 1.0])
+def test_without_any_anchor_learning_is_better_than_not_learning(arm26, tmp_path, other, scale):
+    robot = Robot.load(write_robot(tmp_path / 'other')) if other else arm26
+    resting = Resting(drawn_body(robot, 7, seed=2, scale=scale), seed=9)
+    seen, test = resting.observations(40), resting.observations(40)
+
+    def estimate(body, at):
+        return learned(robot, body).estimate(at.tension, at.length)
+
+    before, body = CorrectedBody(robot), CorrectedBody(robot)
+    fit_body(body, blind(seen), guess=estimate(before, seen))
+    off = [np.linalg.norm(estimate(b, test) - test.theta, axis=1).mean() for b in (body, before)]
+    assert off[0] < off[1]
 
 
 def test_each_anchor_brings_them_nearer(arm26, seen):
