@@ -27,7 +27,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
 
-BANDWIDTH = 25.0  # [1/s] of the low pass, twice
+#: [1/s] of the low pass, whose damping is a half: critically damped it is a third slower to rise
+BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀ [N]
 SMALL = np.eye(3) / LARGEST_USUAL**2
 #: [rad] or [m] from a joint limit: what the estimate may be off by
@@ -84,7 +85,7 @@ class ExternalTorque:
         # Implicit Euler: stable however late a message is.
         share = BANDWIDTH * dt
         rate = self._rate + BANDWIDTH * share * (now - self._value)
-        rate /= (1.0 + share) ** 2
+        rate /= 1.0 + share + share**2
         acceleration = (rate - self._rate)[:joints] / max(dt, 1e-6)
         self._value, self._rate = self._value + dt * rate, rate
         smooth, self.velocity = self._value[:joints], rate[:joints]

@@ -5,7 +5,7 @@
          + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)² + Σ (z/s_z)²
 
 over the parameters w of the corrected body, the postures θ_n and the zeros z of the joint sensors,
-by damped Gauss–Newton. y are joint angles that a sensor read (with its zero z), a camera saw or somebody
+by Gauss–Newton. y are joint angles that a sensor read (with its zero z), a camera saw or somebody
 stated, u directions of gravity in links that carry an IMU; any of them may be missing anywhere.
 M > D makes that possible: N rests give N (M − D) equations of length more than there are angles,
 and N D of torque. A joint that muscles push against its stop harder than friction holds is taken to
@@ -46,9 +46,9 @@ LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 #: spreads that takes, and how far such a joint is from the limit [rad]
 NEAR_STOP, PUSHED, STOP = 0.15, 3.0, 0.01
 ROUNDS = 12
-#: decrease that a step should bring, in variances, that ends the rounds: the step is then shorter
-#: than what the samples leave open
-ENOUGH = 1.0
+#: decrease that a step should bring, in variances, that ends the rounds: the step is then far
+#: shorter than what the samples leave open, and the noise has settled
+ENOUGH = 0.1
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # of a step, tried until one lowers the cost
 EXPECTED = 0.3  # step of a posture [rad]
 FREEDOM = 4.0  # of the Student distribution
