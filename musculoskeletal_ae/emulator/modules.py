@@ -31,8 +31,8 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # Chosen, plausible for Musashi's (not public).
 RELEASE_RATE = 100.0  # [N/s] at which a module that went safe approaches T_bias
 MOTOR_GAIN = 0.004  # [m/s/N]
-# Heat: T_limit for good settles at 85 °C at the housing and 105 °C in the winding, of a mean module:
-# a motor is chosen by what its muscle is to pull.
+# Heat: a motor suits its muscle; T_limit for good settles at 85 °C at the housing and 105 °C in the
+# winding, of a mean module.
 AMBIENT = 25.0  # [°C]
 LOSS = 20.0  # [W] at T_limit
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]

@@ -14,10 +14,10 @@
 
 A share of 1 is what a network reaches that always says the same. Of a joint that the muscles tell
 little of, as where several postures have the same lengths, θ may be left unexplained UNTOLD times
-as much as the best affine map of (T, l) leaves it, if that is more, but not in the mean. LIMITS, WORSE, FLOOR and LEAST_CUT
-leave a margin to the largest that healthy networks showed: initial and learned ones of both presets
-on both shipped robots and both bodies (`python -m bench gate` prints them, beside those of
-attacks).
+as much as the best affine map of (T, l) leaves it, if that is more, but not in the mean. LIMITS,
+WORSE, FLOOR and LEAST_CUT leave a margin to the largest that healthy networks showed: initial and
+learned ones of both presets on both shipped robots and both bodies (`python -m bench gate` prints
+them, beside those of attacks).
 
 On an anomaly the newest network that has been in use for PROOF without one comes back.
 """
@@ -82,10 +82,11 @@ class Gate:
 
     def _states(self, count: int) -> tuple[Array, Array, Array]:
         """Return θ, T and l of random states of the geometric model."""
-        rng, tension, shape = np.random.default_rng(0), self._robot.tension, self._robot.muscle_count
-        theta, pull = self._robot.random_postures(count, rng), rng.uniform(size=(count, shape))
-        pull = tension.bias + pull * (tension.limit - tension.bias)
-        return theta, pull, self._robot.muscle_lengths(theta, pull)
+        robot, rng = self._robot, np.random.default_rng(0)
+        theta = robot.random_postures(count, rng)
+        share = rng.uniform(size=(count, robot.muscle_count))
+        pull = robot.tension.bias + share * (robot.tension.limit - robot.tension.bias)
+        return theta, pull, robot.muscle_lengths(theta, pull)
 
     @cached_property
     def _untold(self) -> Array:
@@ -211,7 +212,8 @@ class Gate:
                 worst = int(over.argmax())
                 who = (joints if 'θ' in name else muscles)[worst]
                 of = 'on the geometric model' if name.endswith('①') else 'of the lengths of ①'
-                yield f'{name}, {who}: {share[worst]:.2g} unexplained {of}, limit {limit[worst]:.3g}'
+                told = f'{share[worst]:.2g} unexplained {of}'
+                yield f'{name}, {who}: {told}, limit {limit[worst]:.3g}'
         left = self.message_errors(mae)
         before: dict[str, Array] = {}
         if self.mae is not None and left:
