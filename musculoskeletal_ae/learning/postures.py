@@ -207,8 +207,8 @@ class _GroupFit:
         count, places, size = len(theta), len(joints), len(self._mean)
         stiffness = np.stack([kinematics.gravity_gradient(row) for row in theta])
         stiffness = stiffness[:, joints[:, None], joints]
-        routes, tension = self._body.robot.routes, self._seen.tension[:, self._muscles]
-        bend = muscle_hessian(routes.muscle_jacobian, theta)
+        robot, tension = self._body.robot, self._seen.tension[:, self._muscles]
+        bend = muscle_hessian(robot.routes.muscle_jacobian, theta, groups=robot.groups)
         bend = bend[:, self._muscles[:, None, None], joints[:, None], joints]
         stiffness += np.einsum('nm,nmij->nij', tension, bend)
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian

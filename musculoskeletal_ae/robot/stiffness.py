@@ -10,11 +10,12 @@ holds at T_bias gives way without resistance when it is shortened: counted as sl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.groups import Group
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
@@ -23,15 +24,28 @@ def muscle_stiffness(module: Array, compliance: Array) -> Array:
 
 
 def muscle_hessian(
-    muscle_jacobian: Callable[[Array], Array], theta: Array, step: float = 1e-5
+    muscle_jacobian: Callable[[Array], Array],
+    theta: Array,
+    step: float = 1e-5,
+    groups: Sequence[Group] = (),
 ) -> Array:
     """Return ∂²l/∂θ² [m/rad²] (M, D, D) at θ (D,), by central differences over ±step [rad] of G.
 
     The callable maps θ (N, D) to G [m/rad] (N, M, D). With one of θ (..., D), θ may be (N, D).
+    Joints of different groups are turned at once, as they share no muscle.
     """
-    offsets, middle = step * np.eye(theta.shape[-1]), theta[..., None, :]
+    count, middle = theta.shape[-1], theta[..., None, :]
+    offsets = np.zeros((max((len(g.joints) for g in groups), default=count), count))
+    for joints in [g.joints for g in groups] or [tuple(range(count))]:
+        offsets[np.arange(len(joints)), joints] = step
     difference = muscle_jacobian(middle + offsets) - muscle_jacobian(middle - offsets)
     raw = np.moveaxis(difference, -3, -1) / (2.0 * step)
+    if len(groups) > 1:
+        turned, raw = raw, np.zeros((*raw.shape[:-1], count))
+        for joints, muscles in groups:
+            row, column = np.asarray(muscles)[:, None, None], np.asarray(joints)
+            own = turned[..., row, column[:, None], np.arange(len(joints))]
+            raw[..., row, column[:, None], column] = own
     return 0.5 * (raw + raw.swapaxes(-1, -2))
 
 
