@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 
 
@@ -66,3 +67,11 @@ def test_muscle_hessian_is_symmetric_and_the_second_derivative_of_length(robot):
         ]
         diagonal = np.einsum('mii->im', hessian)
         np.testing.assert_allclose(diagonal, curvature, atol=1e-4)
+
+
+def test_turning_joints_of_different_groups_at_once_changes_no_second_derivative():
+    body = Robot.load('musashi_upper_body')
+    theta = body.random_postures(2, np.random.default_rng(3))
+    each = muscle_hessian(body.routes.muscle_jacobian, theta)
+    together = muscle_hessian(body.routes.muscle_jacobian, theta, groups=body.groups)
+    np.testing.assert_allclose(together, each, rtol=0.0, atol=1e-9)
