@@ -30,6 +30,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from musculoskeletal_ae.options import Parser
@@ -42,7 +43,8 @@ RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
 TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
 # Of `teaching`, which is short: also what is shown, how the hand is pushed, and what is sent then.
 TEACHING_RATE = 50.0  # [Hz]
-TAUGHT = 'muscle_tension_command,estimated_joint_states,joint_trajectory'
+TAUGHT = ',muscle_tension_command,estimated_joint_states,joint_trajectory'
+LEFT_OUT = ',anomaly_detected,isolated_muscles,target_joint_states'  # of `isolation`
 PUSHED = 'hardware_emulator/external_wrench'
 POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 
@@ -50,27 +52,31 @@ POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 class Arm:
     """The running nodes, ended by pid."""
 
-    def __init__(self, bag: Path, checkpoint: Path, exploration: int | None) -> None:
-        """Start emulator, estimator, controller and recorder; None: do not explore."""
+    def __init__(self, bag: Path, checkpoint: Path, exploration: int | None, more: str) -> None:
+        """Start emulator, estimator, controller, recorder (of more topics).
+
+        Without a random seed of the exploration it is none.
+        """
         self._processes: list[subprocess.Popen[bytes]] = []
+        self.scratch = checkpoint.parent
         rate = RATE if exploration else TEACHING_RATE
-        common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={rate}']
-        network = ['-p', f'checkpoint:={checkpoint}']
+        self.common = common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={rate}']
+        self.network = network = ['-p', f'checkpoint:={checkpoint}']
         explore = ['-p', 'explore:=true', '-p', f'seed:={exploration}'] if exploration else []
-        topics = TOPICS if exploration else f'{TOPICS},{TAUGHT},{PUSHED}'
-        self._start('hardware_emulator', *common, '-p', f'seed:={INDIVIDUAL}')
-        self._start('estimator', *common, *network)
-        self._start('record', '-o', str(bag), '--topics', topics)
-        self._start('controller', *common, *network, *explore, '-p', 'max_age:=0.5')
+        self.start('hardware_emulator', *common, '-p', f'seed:={INDIVIDUAL}')
+        self.start('estimator', *common, *network)
+        self.start('record', '-o', str(bag), '--topics', TOPICS + more)
+        self.start('controller', *common, *network, *explore, '-p', 'max_age:=0.5')
         rclpy.init()
         self.node = rclpy.create_node('make_bag')
-        names = 'hardware_emulator', 'controller'
+        names = 'hardware_emulator', 'controller', 'estimator'
         self._parameters = {name: AsyncParameterClient(self.node, name) for name in names}
         for name, client in self._parameters.items():
             if not client.wait_for_services(timeout_sec=60.0):
                 raise TimeoutError(f'{name} did not start within 60 s')
 
-    def _start(self, name: str, *arguments: str) -> None:
+    def start(self, name: str, *arguments: str) -> None:
+        """Start a node that ends with the others."""
         self._processes.append(self.run(name, *arguments))
 
     def run(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
@@ -92,6 +98,16 @@ class Arm:
         print(f'{name}: {value}')
         future = self._parameters[node].set_parameters([Parameter(name, value=value)])
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
+
+    def call(self, name: str, value: bool | None = None) -> None:
+        """Call a service, of SetBool if there is a value, else of Trigger."""
+        kind = Trigger if value is None else SetBool
+        client = self.node.create_client(kind, name)
+        if not client.wait_for_service(timeout_sec=60.0):
+            raise TimeoutError(f'{name} did not start within 60 s')
+        future = client.call_async(kind.Request() if value is None else kind.Request(data=value))
+        rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
+        print(f'{name}: {future.result()}')
 
     def close(self) -> None:
         """End all processes, the recorder last but one so that the bag is complete."""
@@ -159,13 +175,36 @@ def teaching(arm: Arm) -> None:
     arm.spend(20.0)
 
 
+def isolation(arm: Arm) -> None:
+    """A muscle is cut, verified and isolated; the arm moves on; it is mended and learned anew."""
+    targets = arm.node.create_publisher(JointState, 'target_joint_states', 10)
+    joints, muscle = Robot.load(ROBOT).joints, 'deltoid_middle'
+    arm.set('on_anomaly', 'isolate', 'estimator')
+    arm.spend(25.0)
+    arm.set('ruptured_muscles', [muscle])
+    arm.spend(15.0)
+    targets.publish(JointState(name=joints, position=POSTURE))
+    arm.spend(10.0)
+    arm.set('ruptured_muscles', [''])
+    arm.spend(3.0)
+    arm.call('estimator/restore')
+    options = f'state_directory:={arm.scratch}', f"relearn_muscles:=['{muscle}']"
+    pairs = (part for option in options for part in ('-p', option))
+    arm.start('learner', *arm.common, *arm.network, *pairs)
+    arm.call('learner/relearn')
+    arm.call('controller/explore', True)
+    arm.spend(120.0)
+
+
 # [N] of the hand, one after the other.
 PUSHES = ((15.0, 0.0, 10.0), (0.0, 0.0, 0.0), (-10.0, 8.0, 12.0), (0.0, 0.0, 0.0))
-RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None]] = {
-    'exploration': (exploration, 101),
-    'rupture': (rupture, 102),
-    'faults': (faults, 103),
-    'teaching': (teaching, None),
+#: what is done, the random seed of the exploration, and what else is recorded
+RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None, str]] = {
+    'exploration': (exploration, 101, ''),
+    'rupture': (rupture, 102, ''),
+    'faults': (faults, 103, ''),
+    'teaching': (teaching, None, f'{TAUGHT},{PUSHED}'),
+    'isolation': (isolation, 104, LEFT_OUT),
 }
 
 
@@ -181,8 +220,8 @@ def main() -> None:
         checkpoint = Path(scratch) / 'initial.safetensors'
         train = [sys.executable, '-c', 'from musculoskeletal_ae.tools.train import main; main()']
         subprocess.run([*train, '--robot', ROBOT, '--out', str(checkpoint)], check=True)
-        drive, seed = RECORDINGS[name]
-        arm = Arm(bag, checkpoint, seed)
+        drive, seed, more = RECORDINGS[name]
+        arm = Arm(bag, checkpoint, seed, more)
         try:
             drive(arm)
         finally:

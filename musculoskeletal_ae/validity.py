@@ -31,10 +31,11 @@ UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
-def read_array(message: Any, rows: int, columns: int) -> Array:
+def read_array(message: Any, rows: int, columns: int, ignored: Sequence[int] = ()) -> Array:
     """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
 
     Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
+    Of ignored columns nothing counts: what is not finite there is returned as 0.
     """
     if len(message.data) > MOST_ENTRIES:
         raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
@@ -53,8 +54,10 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
         raise MessageError('wrong layout', f'{given}; expected {legal}')
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
-    values = np.asarray(message.data, dtype=float)
+    values = np.array(message.data, dtype=float)
     finite = np.isfinite(values)
+    unknown = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
+    values[unknown], finite[unknown] = 0.0, True
     if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
         finite[2 * columns :] |= np.isnan(values[2 * columns :])
     if not finite.all():

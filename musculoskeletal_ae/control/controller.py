@@ -33,7 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import safety
+from musculoskeletal_ae.control import reach, safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.heat import Heat
@@ -62,6 +62,7 @@ NOTABLE = 0.05  # [N·m] of missing torque
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
+APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
 ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
 
 
@@ -89,6 +90,7 @@ class Controller:
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
         self._follows = False  # a trajectory, or holds where it ended
+        self._approaches = 0  # of a target that are left, if the arm falls
         self._hand = Hand(robot)
         self.short = ''  # what the last target was out of reach by
         self.floating = FloatControl(robot, self.settings)
@@ -222,14 +224,19 @@ class Controller:
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
         if self._quick and not self.safety.cause:
             with suppress(MessageError):  # not ready: then by a ramp, once it is
-                planned = Trajectory.to(self._ready(), inside, self.settings.target_duration)
                 clamped = self.clamped
-                self._follow(planned, effort=effort)
-                self.clamped, self.short = clamped, short
+                self._approach(inside, effort)
+                self.clamped, self.short, self._approaches = clamped, short, APPROACHES
                 return
         self._starts |= self.posture.exploring or self._follows
         self._follows, self.short = False, short
         self.posture.set_target(inside, effort)
+
+    def _approach(self, theta: Array, effort: Array) -> None:
+        start, mae = self._ready(), self._mae
+        assert mae is not None  # else it was not ready
+        way = reach.way(self._robot, mae, start.theta, theta)
+        self._follow(Trajectory.to(start, way, self.settings.target_duration), effort=effort)
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
         """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
@@ -285,7 +292,7 @@ class Controller:
         """
         if self._robot.used.all() or self._mae is None or self._estimate is None:
             return theta, ''
-        nearest, short = self._hand.held(self._mae, self._estimate, theta)
+        nearest, short = reach.nearest_held(self._robot, self._mae, self._estimate, theta)
         if not short:
             return theta, ''
         angles = ', '.join(f'{n} {a:.2f}' for n, a in zip(self._robot.joints, nearest))
@@ -323,6 +330,7 @@ class Controller:
             if delay > 0.0:
                 self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
+        self._approaches = 0
         try:
             self.motion.follow(planned, delay)
             self.motion.exert(np.zeros(self._robot.joint_count) if effort is None else effort)
@@ -589,6 +597,11 @@ class Controller:
         if self._starts and self._follows:  # after a pause: on from where it was
             self._starts = False
             self.motion.start()
+        if self._follows and self._approaches and self.motion.fallen:
+            assert posture.theta is not None  # what is followed has led there
+            self._starts, left, kept = True, self._approaches - 1, (self.clamped, self.short)
+            self._approach(posture.theta, posture.effort)
+            self._approaches, (self.clamped, self.short) = left, kept
         if self._starts:
             self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.

@@ -18,18 +18,16 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.reach import lacking, nearest_held
 from musculoskeletal_ae.control.trajectory import STOPPING, Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
 
 #: to which a pose is sought: [m] and [rad]; only its position
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
 FAR, TURNED = 0.005, 0.05  # [m], [rad] from a pose that is not reached
-NOTABLE = 0.05  # [N·m] of missing torque at which a posture is not held
-HALVINGS = 6  # of the way to a posture that cannot be held
 SHORTEST = 0.3  # [s] of a movement to a single pose
 PEAK = 1.875  # fastest over mean speed of a motion of least jerk
 #: [s] and [m/s] within which poses are a path, and how soon a new interval counts
@@ -62,34 +60,11 @@ class Hand:
         if distance > FAR or (whole and angle > TURNED):
             short = f'{1000.0 * distance:.0f} mm'
             short += f' and {angle:.2f} rad' * whole + ' beyond the joint limits or the arm'
-        theta, lack = self.held(mae, start, theta)
+        theta, lack = nearest_held(robot, mae, start, theta)
         short = '; '.join(filter(None, (short, lack)))
         if short and not nearest:
             raise MessageError('out of reach', short)
         return theta, short
-
-    def held(self, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
-        """Return the posture nearest to θ on the way from `start` [rad] (D,) that can be held.
-
-        And what θ itself lacks, or ''.
-        """
-        missing = self.missing(mae, theta)
-        if not missing:
-            return theta, ''
-        low, high = 0.0, 1.0
-        for _ in range(HALVINGS):
-            share = 0.5 * (low + high)
-            held = not self.missing(mae, start + share * (theta - start))
-            low, high = (share, high) if held else (low, share)
-        return start + low * (theta - start), f'the muscles lack {missing} there'
-
-    def missing(self, mae: Mae, theta: Array) -> str:
-        """Return which joint lacks how much torque to hold θ [rad] (D,), or ''."""
-        robot, bias, limit = self._robot, self._robot.tension.bias, self._robot.tension.limit
-        torque = robot.kinematics.holding_torque(theta)
-        lacks = np.abs(least_tension(mae.muscle_jacobian(theta, bias), torque, bias, limit)[1])
-        joint = int(lacks.argmax())
-        return f'{lacks[joint]:.2f} N·m at {robot.joints[joint]}' if lacks[joint] > NOTABLE else ''
 
     def towards(
         self, start: Setpoint, pose: pin.SE3, theta: Array, speed: float, now: float
@@ -132,7 +107,7 @@ class Hand:
         inside = np.clip(theta, robot.lower, robot.upper)
         # A joint that would meet its limit stops there, the others go on.
         free = (inside == theta).all(axis=0)
-        if missing := self.missing(mae, inside[-1]):
+        if missing := lacking(robot, mae, inside[-1]):
             raise MessageError('out of reach', f'the muscles lack {missing} there')
         rates = np.array([1.0, 1.0, 0.0])[:, None] * velocity * free
         return Trajectory.through(

@@ -42,6 +42,7 @@ SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the f
 PLANS = 4  # times a plan is slowed and tried again
 SLOWNESS = 20.0  # at most
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
+FALLEN, FALLING = 0.2, 2.0  # [rad] off, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
 TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
@@ -156,6 +157,13 @@ class MotionControl:
         """Whether a trajectory goes on or is to come."""
         going = self.trajectory is not None and self.time < self.trajectory.duration
         return going or self.next is not None
+
+    @property
+    def fallen(self) -> bool:
+        """Whether the arm lacks a muscle and rests elsewhere than where a trajectory has led."""
+        rested = self.trajectory is not None and self.time > self.trajectory.duration + FALLING
+        rested = rested and self.next is None and not self._robot.used.all()
+        return bool(rested and np.abs(self.error).max() > FALLEN)
 
     @property
     def latest(self) -> Trajectory | None:

@@ -119,10 +119,14 @@ class Trajectory:
 
     @classmethod
     def to(cls, start: Setpoint, theta: Array, duration: float) -> Trajectory:
-        """Lead to rest at θ [rad] (D,) by a quintic, from rest the motion of least jerk."""
-        goal, still = theta[None], np.zeros((1, len(theta)))
-        joints = np.arange(len(theta))
-        return cls.through(start, Points(joints, np.array([duration]), goal, still, still))
+        """Lead to rest at θ [rad] (D,) by a quintic, from rest the motion of least jerk.
+
+        Or to rest at each of some postures (K, D), each within the duration [s].
+        """
+        path = np.atleast_2d(theta)
+        (count, joints), still = path.shape, np.zeros(path.shape)
+        time = duration * np.arange(1.0, count + 1.0)
+        return cls.through(start, Points(np.arange(joints), time, path, still, still))
 
     @classmethod
     def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:

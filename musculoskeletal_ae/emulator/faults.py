@@ -42,6 +42,7 @@ KINDS = {
     'reorder': Kind('readings come after the next one', 0.5, 1.0, 'share', of_muscle=False),
     'freeze': Kind('sensors repeat what they read', of_quantity=True),
     'dead_sensor': Kind('sensors read 0', of_quantity=True),
+    'nan_sensor': Kind('sensors say NaN', of_quantity=True),
     'spike': Kind('sensors are off now and then', *SIZES['length'], of_quantity=True),
     'bias': Kind('sensors are off', *SIZES['length'], of_quantity=True),
     'stuck_motor': Kind('motors stand'),
@@ -151,13 +152,15 @@ class Faults:
     def sensed(self, readings: Readings) -> Readings:
         """Return what the broken sensors read instead."""
         values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
-        for fault in self._of('bias', 'spike', 'dead_sensor', 'freeze'):
+        for fault in self._of('bias', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'):
             for name in fault.quantities:
                 value, which = values[name], fault.which
                 if fault.kind == 'bias':
                     value[which] += fault.size
                 elif fault.kind == 'dead_sensor':
                     value[which] = 0.0
+                elif fault.kind == 'nan_sensor':
+                    value[which] = np.nan
                 elif fault.kind == 'freeze':
                     value[which] = [
                         self._frozen.setdefault((name, m), float(value[m])) for m in which

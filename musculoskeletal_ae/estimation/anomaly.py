@@ -18,6 +18,9 @@ zero while much is commanded has no wire, or a slack one. Slack is wound in by a
 longer than it can be; meanwhile the rule waits. So does d, as long as that muscle reads longer than
 ② restores it: slack wire is too long, and what is left of a cut one too short.
 
+A winch that is jammed may say nothing that a posture would not explain. But it stands, though its
+tension is far from what is commanded.
+
 Preset `paper` decides on A alone, against the checkpoint's threshold of A.
 """
 
@@ -41,6 +44,8 @@ DISTANCE, NORM = 'distance', 'norm'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
+#: a winch is jammed that stands, but for so much, so long, so far from the tension it is to have
+STANDS, JAM_TIME, JAM = 0.001, 1.0, 50.0  # [m], [s], [N]
 #: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
 NEAR, WIDEST = 0.25, 3.0
 
@@ -72,6 +77,8 @@ class AnomalyDetector:
         #: [s] without tension, without winding in; l [m] beyond what the posture explains when
         #: tension went, and l when it wound last
         self._torn, self._stood, self._tight, self._wound = np.zeros((4, robot.muscle_count))
+        #: [s] of a winch that stands, where [m]
+        self._jammed, self._stands = np.zeros((2, robot.muscle_count))
         self._winds_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._beyond = 0
         self.commanded()
@@ -93,7 +100,7 @@ class AnomalyDetector:
 
     def reset(self) -> None:
         """Forget counts, as after a jump of the clock or a reset by the user."""
-        self._torn[:] = self._stood[:] = 0.0
+        self._torn[:] = self._stood[:] = self._jammed[:] = 0.0
         self._beyond = 0
 
     def commanded(self, length: Array | None = None, tension: Array | None = None) -> None:
@@ -117,6 +124,9 @@ class AnomalyDetector:
         dead = self._dead(state.theta, tension, length, dt)
         if dead is not None and self.whitened:
             return Verdict(size, distance, dead, 'no tension where the command demands it', True)
+        jammed = self._jam(tension, length, dt)
+        if jammed is not None and self.whitened and self.judges:
+            return Verdict(size, distance, jammed, 'its winch stands, whatever is commanded', True)
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = tension < SLACK * self._robot.tension.bias
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
@@ -156,11 +166,25 @@ class AnomalyDetector:
             return ''
         return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running{where}'
 
+    def _demand(self, length: Array, command: Array) -> Array:
+        pulled: Array = np.maximum(0.0, self._robot.stiffness * (length - command))
+        return self._robot.tension.bias + pulled
+
+    def _jam(self, tension: Array, length: Array, dt: float) -> int | None:
+        if self._length_command is None:
+            self._jammed[:] = 0.0
+            return None
+        demand = np.minimum(self._demand(length, self._length_command), self._robot.tension.max)
+        told = (np.abs(tension - demand) > JAM) & self._robot.used
+        stands = told & (np.abs(length - self._stands) < STANDS)
+        self._stands = np.where(stands, self._stands, length)
+        self._jammed = np.where(stands, self._jammed + dt, 0.0)
+        return int(self._jammed.argmax()) if self._jammed.max() >= JAM_TIME else None
+
     def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
         bias, demand = self._robot.tension.bias, self._tension_command
         if self._length_command is not None:
-            pulled = self._robot.stiffness * (length - self._length_command)
-            demand = bias + np.maximum(0.0, pulled)
+            demand = self._demand(length, self._length_command)
         if demand is None:
             # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
             lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE

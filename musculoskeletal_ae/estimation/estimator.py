@@ -49,6 +49,8 @@ SHIFTED = 0.02  # [m] by which a guess of a zero may be off before it is told an
 # A sensor that says exactly the same for so long, while the others say that the muscle moves by so
 # much, is dead or frozen, however little that disturbs the estimate.
 STILL_TIME, MOVED = 1.0, 0.006  # [s], [m]
+# Whose sensor says no number for so long is isolated: nothing is estimated while it does.
+SILENT = 0.15  # [s]
 # So many suspects that turn out healthy within so many seconds, and the arm stays stopped.
 ACQUITTALS, WITHIN = 2, 60.0
 
@@ -76,6 +78,7 @@ class Estimator:
         self._read: Array | None = None  # l and T of the last message, and for how long so far [s]
         self._same: Array = np.zeros((2, robot.muscle_count))
         self._moved: tuple[Mae, float, float] | None = None  # without it: its l at least, at most
+        self._silent: tuple[int | None, float] = None, 0.0  # the one muscle without numbers, since
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self._external = ExternalTorque(robot)
@@ -149,7 +152,7 @@ class Estimator:
         dt = min(max(time - self._time, 0.0), LONGEST_PERIOD)
         if time - self._time > SILENCE:
             self._external.reset()
-        self._time, self._stepped_at = time, now
+        self._time, self._stepped_at, self._silent = time, now, (None, 0.0)
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
             self._command = None
@@ -183,11 +186,12 @@ class Estimator:
     def _suspected(self, mae: Mae, verdict: Verdict, tension: Array, length: Array) -> int:
         """Return the muscle without which the rest is most likely."""
         robot = self._robot
-        slack = tension[verdict.suspect] < SLACK * robot.tension.bias[verdict.suspect]
-        if verdict.sure or slack or not self.detector.calibrated:
+        # Where one is cut, another may be slack for a moment.
+        slack = robot.used & (tension < SLACK * robot.tension.bias)
+        if verdict.sure or slack.sum() == 1 or not self.detector.calibrated:
             return verdict.suspect
         isolated, distance = robot.isolated, np.full(robot.muscle_count, np.inf)
-        for muscle in np.flatnonzero(robot.used).tolist():
+        for muscle in np.flatnonzero(slack if slack.any() else robot.used).tolist():
             less = mae.without((*isolated, muscle))
             assert less.anomaly is not None
             error = residuals(less.estimate(tension, length), tension, length, less.isolated)
@@ -223,6 +227,23 @@ class Estimator:
             self._suspect = self._robot.muscles[muscle]
             self.cause = f'{self._suspect}: its length jumped'
             self._begin_verification(muscle, now)
+
+    def unread(self, states: Array, now: float) -> bool:
+        """Take muscle_states (3, M) with what is not finite; return whether a muscle was isolated.
+
+        Where all of that is one muscle's, its sensor is broken: there is nothing to verify.
+        """
+        broken = ~np.isfinite(states[:2]).all(axis=0) & self._robot.used
+        muscle = int(broken.argmax()) if broken.sum() == 1 else None
+        if muscle != self._silent[0]:
+            self._silent = muscle, now
+        waits = muscle is None or now - self._silent[1] < SILENT
+        if waits or self.detector.settings.on_anomaly == 'stop':
+            return False
+        assert muscle is not None
+        self.verified = f'{self._robot.muscles[muscle]}: a sensor says no number'
+        self.isolate((*self._robot.isolated, muscle))
+        return True
 
     def _begin_verification(self, suspect: int, now: float) -> None:
         robot = self._robot

@@ -6,12 +6,14 @@ again (`control/safety.Winding`), what it reads, T and l, is compared with what 
 control demands of it, T_ref = T_bias + K (l − l_target), and with the length l' that the other
 muscles make likely:
 
-    l does not change at all              its sensor is frozen, or dead
-    T near zero; l follows, or l' − l > FAR    ruptured: the winch winds in what is left of the wire
-    T does not change at all, or is zero  its sensor is stuck, or dead
-    |l − l'| > FAR                        the length sensor has jumped
-    T follows T_ref                       healthy
-    else                                  jammed: the winch does not do as it is told
+    l does not change at all                its sensor is frozen, or dead
+    T near zero; l' − l > FAR or growing    ruptured: the winch winds in what is left of the wire
+    T does not change at all                its sensor is stuck, or dead
+    |l − l'| > FAR                          the length sensor has jumped
+    l stays, T does not rise                jammed: the winch does not do as it is told
+    T near zero all the same                its sensor is dead
+    T follows T_ref                         healthy
+    else                                    jammed
 
 A sound sensor is never quite still. A suspect that nobody winds stays isolated.
 """
@@ -29,6 +31,7 @@ BEGUN, JUDGED = 0.001, 0.8  # [m] that the command has fallen, [s] of that
 PATIENCE = 8.0  # [s] without an answer
 FAR, FOLLOWED = 0.025, 0.005  # [m]
 CLOSE, SHARE = 8.0, 0.35  # [N]; of what is demanded beyond T_bias: T is as demanded
+TIGHT, STOOD = 20.0, 0.0005  # [N]; [m] that the winch moves by though it is told to
 STILL = 1e-6  # [m], [N] of a sensor that says always the same
 
 
@@ -39,6 +42,7 @@ class Verification:
         """The muscle's place, its T_bias [N] and K [N/m]."""
         self.muscle, self._bias, self._stiffness = muscle, bias, stiffness
         self._time, self._highest = 0.0, -math.inf
+        self._before = bias, bias  # T and T_ref where it was not wound in yet
         self._rows: list[tuple[float, float, float, float]] = []
         self._watched = 0.0
 
@@ -49,30 +53,40 @@ class Verification:
 
         l_target is None where none is known.
         """
-        self._time += dt
+        self._time, demand = self._time + dt, math.inf
         if command is not None:
-            self._highest = max(self._highest, command)
+            demand = self._bias + max(0.0, self._stiffness * (length - command))
+            if command >= self._highest:
+                self._highest, self._before = command, (tension, demand)
             if command < self._highest - BEGUN:
                 self._watched += dt
-                demand = self._bias + max(0.0, self._stiffness * (length - command))
                 self._rows.append((tension, length, demand, length - likely))
         if self._watched >= JUDGED:
             return self._judged()
-        return 'nobody wound it in' if self._time > PATIENCE else ''
+        if self._time < PATIENCE:
+            return ''
+        # One that pulls as if it were wound in already is not.
+        return 'jammed' if tension > demand + TIGHT else 'nobody wound it in'
 
     def _judged(self) -> str:
         tension, length, demand, off = np.array(self._rows).T
-        late = slice(len(tension) // 2, None)
+        late, quarter = slice(len(tension) // 2, None), max(len(tension) // 4, 1)
         pull, wanted, beside = (float(np.median(part[late])) for part in (tension, demand, off))
-        gone, follows = pull < SLACK * self._bias, length[0] - length[-1] > FOLLOWED
+        gone, follows = pull < SLACK * self._bias, off[0] - off[-1] > FOLLOWED
         if np.ptp(length) < STILL:
             return 'its length sensor stands still'
         if gone and (beside < -FAR or follows):
             return 'ruptured'
-        if gone or np.ptp(tension) < STILL:
+        if np.ptp(tension) < STILL:
             return 'its tension sensor stands still'
-        if abs(beside) > FAR:
+        if not gone and abs(beside) > FAR:
             return f'its length sensor is off by {1e3 * beside:.0f} mm'
+        stood = abs(length[:quarter].mean() - length[-quarter:].mean()) < STOOD
+        rise, asked = pull - self._before[0], wanted - self._before[1]
+        if stood and (gone or rise < SHARE * asked > SHARE * CLOSE):
+            return 'jammed'
+        if gone:
+            return 'its tension sensor stands still'
         if abs(pull - wanted) < CLOSE + SHARE * (wanted - self._bias):
             return HEALTHY
         return 'jammed'

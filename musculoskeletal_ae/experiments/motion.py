@@ -33,8 +33,9 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
-from musculoskeletal_ae.control.hand import POSITION, Hand
+from musculoskeletal_ae.control.hand import POSITION
 from musculoskeletal_ae.control.posture import RAMP_SHARE
+from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
@@ -158,7 +159,7 @@ def circles(
     robot: Robot, mae: Mae, rng: np.random.Generator, count: int
 ) -> list[tuple[Array, Place]]:
     """Return random circles that can be followed: a posture, and where the hand is at times [s]."""
-    hand, found = Hand(robot), list[tuple[Array, Place]]()
+    found = list[tuple[Array, Place]]()
     for theta, _ in holdable_postures(robot, robot.random_postures(TRIES, rng), 40):
         centre = robot.kinematics.end_effector_pose(theta).translation
         frame = np.linalg.qr(robot.kinematics.end_effector_jacobian(theta)[:3])[0]
@@ -172,7 +173,7 @@ def circles(
         at, far = theta, False
         for time in np.linspace(0.0, LAP, 25):
             at, distance, _ = inverse_kinematics(robot, place(time), at, POSITION)
-            far = far or distance > NEAR or bool(hand.missing(mae, at))
+            far = far or distance > NEAR or bool(lacking(robot, mae, at))
         if not far:
             found.append((theta, place))
         if len(found) == count:

@@ -79,7 +79,7 @@ class Estimator(Shell):
             self.follow_parameter(name, partial(self._configure, name))
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
-        self.follow_muscle_states(self._estimate, as_read=True)
+        self.follow_muscle_states(self._estimate, as_read=True, unread=self._unread)
         self.follow_posture('joint_states', self._measured)
         self._tell_zeros()
         for kind in ('length', 'tension'):
@@ -154,7 +154,7 @@ class Estimator(Shell):
 
     def _tell_isolated(self) -> None:
         if self.core.robot.isolated != self.told_isolated:
-            self.told_isolated = self.gate.isolated = self.core.robot.isolated
+            self.told_isolated = self.gate.isolated = self.left_out = self.core.robot.isolated
             self.isolated.publish(String(data=self._isolated_names()))
 
     def _tell_anomaly(self) -> None:
@@ -215,6 +215,12 @@ class Estimator(Shell):
             wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force.tolist())))
             self.wrench.publish(wrench)
         self._tell_anomaly()
+
+    def _unread(self, states: Array) -> None:
+        if self.core.unread(states, time.monotonic()):
+            self.get_logger().warning(self.core.verified)
+            self.chosen = True
+            self._tell_isolated()
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.root_frame))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from collections import Counter, deque
@@ -78,6 +79,7 @@ class Shell(Node):
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
+        self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
@@ -243,13 +245,15 @@ class Shell(Node):
         follow: Callable[[Array], object],
         warn: Callable[[str], object] | None = None,
         as_read: bool = False,
+        unread: Callable[[Array], object] | None = None,
     ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
         If several nodes publish them, `warn` is told who, '' once it is one; without it their
-        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`.
+        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`. What
+        is rejected though it has the right shape is given to `unread`.
         """
-        intruders = ''
+        intruders, shape = '', (len(QUANTITIES), self.robot.muscle_count)
 
         def look_around() -> None:
             nonlocal intruders
@@ -257,7 +261,13 @@ class Shell(Node):
             if warn:
                 warn(intruders)
 
-        def from_one(states: Array) -> None:
+        def from_one(message: Float64MultiArray) -> None:
+            try:
+                states = read_array(message, *shape, self.left_out)
+            except MessageError:
+                if unread and not intruders and len(message.data) == math.prod(shape):
+                    unread(np.reshape(message.data, shape))
+                raise
             if intruders and not warn:
                 raise MessageError('several publishers', intruders)
             if not as_read:
@@ -265,7 +275,7 @@ class Shell(Node):
             follow(states)
 
         self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
-        self.follow_muscles('muscle_states', from_one, len(QUANTITIES), SENSOR)
+        self.listen(Float64MultiArray, 'muscle_states', from_one, SENSOR)
 
     def _several_publishers(self, name: str) -> str:
         """Return which nodes publish a topic, '' if it is one."""
@@ -297,7 +307,7 @@ class Shell(Node):
         def take(message: String) -> None:
             names = filter(None, map(str.strip, message.data.split(',')))
             muscles = tuple(sorted({*self.robot.muscle_indices(names)}))
-            self.gate.isolated = muscles
+            self.gate.isolated = self.left_out = muscles
             isolate(muscles)
 
         self.listen(String, 'isolated_muscles', take, LATCHED)

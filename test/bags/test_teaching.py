@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recording of an arm that was shown a motion and repeated it, in real processes."""
+"""The recordings of an arm that was taught a motion, and of one that lost a muscle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from musculoskeletal_ae.bags.reader import Bag
 
-TEACHING = Path(__file__).parents[2] / 'bags' / 'teaching'
+BAGS = Path(__file__).parents[2] / 'bags'
 
 
 def series(bag, topic):
@@ -19,7 +19,7 @@ def series(bag, topic):
 
 
 def test_the_recorded_arm_was_moved_by_hand_and_repeated_what_it_was_shown():
-    bag = Bag.open(TEACHING)
+    bag = Bag.open(BAGS / 'teaching')
     pushed, wrenches = series(bag, '/hardware_emulator/external_wrench')
     assert np.linalg.norm([wrenches[0].wrench.force.x, wrenches[0].wrench.force.z]) > 15.0
     times, states = series(bag, '/joint_states')
@@ -41,3 +41,20 @@ def test_the_recorded_arm_was_moved_by_hand_and_repeated_what_it_was_shown():
     moved = np.linalg.norm(shown[1] - shown[0])
     assert np.linalg.norm(begun - shown[0]) < 0.5 * moved
     assert np.linalg.norm(ended - shown[1]) < 0.5 * moved
+
+
+def test_the_recorded_arm_lost_a_muscle_moved_on_and_used_it_again():
+    bag = Bag.open(BAGS / 'isolation')
+    at, names = series(bag, '/isolated_muscles')
+    assert [message.data for message in names] == ['', 'deltoid_middle', '']
+    noticed, detected = series(bag, '/anomaly_detected')
+    assert [message.data for message in detected] == [False, True, False]
+    times, states = series(bag, '/muscle_states')
+    tension = np.array([message.data[10] for message in states])  # of the first muscle
+    assert (tension[(times > at[1]) & (times < noticed[2])] < 3.0).all()
+    assert tension[times > at[2]].max() > 100.0
+    (sent,), (target,) = series(bag, '/target_joint_states')
+    assert noticed[2] < sent < at[2]
+    times, states = series(bag, '/joint_states')
+    where = np.array([state.position for state in states])[np.searchsorted(times, sent + 8.0)]
+    assert np.linalg.norm(where - target.position) < 0.3  # by the network of the geometric model

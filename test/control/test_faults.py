@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import read_array
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]
@@ -54,7 +57,10 @@ class Loop:
 
     def read(self, reading):
         try:
-            self.controller.muscles(Muscles(*reading[1:]), self.now)
+            data = np.concatenate(reading[1:])
+            message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
+            states = read_array(message, 3, ROBOT.muscle_count)
+            self.controller.muscles(Muscles(*states), self.now)
             estimate = self.estimator.step(reading.tension, reading.length, self.now, self.now)
             if estimate is not None:
                 self.controller.estimated(estimate.state.theta, self.now)
@@ -98,6 +104,7 @@ PROMISES = {
     f'freeze:{MUSCLE}': None,
     'freeze': None,
     f'dead_sensor:{MUSCLE}': None,
+    f'nan_sensor:{MUSCLE}': 'older than',
     f'dead_sensor:tension:{MUSCLE}': None,
     f'stuck_motor:{MUSCLE}': None,
     f'slack:{MUSCLE}': None,

@@ -3,15 +3,21 @@
 
 from __future__ import annotations
 
+import copy
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from control_bench import OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 
-from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.control.controller import APPROACHES, Controller
+from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.safety import DEPTH, LENGTH, PAYING_OUT, TENSION, WIND, Muscles
 from musculoskeletal_ae.control.settings import METHODS
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -93,7 +99,7 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench.configure(unreachable='nearest')
     bench.target(NOT_THERE)
     goal = bench.core.posture.theta
-    assert not bench.core._hand.missing(bench.mae, goal)
+    assert not lacking(bench.core._robot, bench.mae, goal)
     way, whole = goal - THERE, NOT_THERE - THERE
     np.testing.assert_allclose(way, whole * (way @ whole) / (whole @ whole), atol=1e-9)
     bench.step()
@@ -101,6 +107,43 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench.core.isolate([])
     bench.target(NOT_THERE)
     np.testing.assert_array_equal(bench.core.posture.theta, NOT_THERE)
+
+
+def test_an_arm_that_falls_on_its_way_goes_there_again_a_few_times():
+    for lost, times in (([LOST], APPROACHES), ([], 0)):
+        bench = Bench(target_duration=0.2)
+        bench.core.isolate(lost)
+        bench.theta = REST
+        bench.step()
+        bench.target(THERE)
+        ways = [bench.core.motion.trajectory]
+        for _ in range(4 * (APPROACHES + 1)):
+            bench.step(100)
+            if (last := bench.core.motion.trajectory) is not ways[-1]:
+                ways.append(last)
+            np.testing.assert_array_equal(last.end, THERE)
+        assert len(ways) == 1 + times
+
+
+def test_a_way_leads_round_what_is_not_held():
+    robot = copy.copy(Robot.load('musashi_left_arm'))
+    robot.isolate([robot.muscles.index('pectoralis_major')])
+    mae = ExactMae(robot)
+
+    def lack(start, path):
+        ends = pairwise([start, *path])
+        ways = [a + np.linspace(0.0, 1.0, 12)[:, None] * (b - a) for a, b in ends]
+        return np.mean([bool(lacking(robot, mae, at)) for at in np.vstack(ways)])
+
+    postures = robot.random_postures(200, np.random.default_rng(0))
+    known = [theta for theta in postures if not lacking(robot, mae, theta)]
+    start, goal = next(pair for pair in pairwise(known) if lack(pair[0], pair[1:]) > 0.3)
+    path = reach.way(robot, mae, start, goal)
+    np.testing.assert_array_equal(path[-1], goal)
+    assert ((robot.lower <= path) & (path <= robot.upper)).all()
+    assert lack(start, path) == 0.0
+    robot.isolate([])
+    np.testing.assert_array_equal(reach.way(robot, mae, start, goal), [goal])
 
 
 class Verified(Bench):

@@ -159,3 +159,22 @@ def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
     assert not any(verdict.cause for verdict in verdicts(healthy, IN_A_ROW))
     detector.settings = Detection(1e6)  # as large as no A is: no physics comes to its aid
     assert not any(verdict.cause for verdict in verdicts(slack, round(2 * DEAD_TIME / DT)))
+
+
+@pytest.mark.parametrize('wound', [-0.01, 0.01])
+def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound):
+    detector, rng, named = AnomalyDetector(robot), np.random.default_rng(0), []
+    detector.use(mae)
+    theta, tension = np.array([0.1, -1.0]), np.where(np.arange(6) == 3, 100.0, 60.0)
+    state = State(theta, tension, mae.lengths(theta, tension))
+    told = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
+    for n in range(300):
+        length = state.length + 1e-4 * rng.standard_normal(6)
+        length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
+        told[0] = 140.0 if n < 200 else 60.0
+        detector.commanded(length=length - (told - 30.0) / 1e4)
+        verdict = detector.step(state, tension, length, 0.01)
+        named += [(n, verdict.suspect)] * ('its winch stands' in verdict.cause)
+    assert named
+    assert {suspect for _, suspect in named} == {3}
+    assert 95 <= named[0][0] <= 110

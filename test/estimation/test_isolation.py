@@ -43,6 +43,8 @@ def still(_, stir):
         (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, 'ruptured'),
         (lambda _, __: 0.0, lambda n, stir: stir - 0.0002 * n, -0.05, 'ruptured'),
         (lambda _, __: 0.0, still, 0.0, 'its tension sensor stands still'),
+        (lambda _, shake: 0.2 * shake, still, 0.0, 'jammed'),
+        (lambda _, shake: BIAS + 15.0 + shake, still, 0.0, 'jammed'),
         (lambda _, __: 71.0, still, 0.0, 'its tension sensor stands still'),
         (follows, lambda _, __: 0.0, 0.03, 'its length sensor stands still'),
         (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0, 'its length sensor is'),
@@ -117,6 +119,7 @@ def test_a_cut_muscle_is_isolated_at_once_and_stays_so(loop, robot, healthy, cut
 
 def test_a_healthy_suspect_is_used_again_but_not_acquitted_for_ever(loop, healthy, wound):
     for count in range(3):
+        loop.command = healthy.length - (healthy.tension - 30.0) / 1e4
         loop.step(healthy, 30)
         loop.step(wound, 8)
         assert loop.core.cause
@@ -124,10 +127,10 @@ def test_a_healthy_suspect_is_used_again_but_not_acquitted_for_ever(loop, health
             break
         assert len(loop.core.robot.isolated) == 1
         (suspect,) = loop.core.robot.isolated
-        loop.command = healthy.length - (healthy.tension - 30.0) / 1e4
         loop.step(healthy, 10)
-        loop.command = loop.command - 0.0015 * (np.arange(6) == suspect)
-        loop.step(healthy, 100)
+        wound_in = 0.0015 * (np.arange(6) == suspect)
+        loop.command = loop.command - wound_in
+        loop.step(healthy._replace(tension=healthy.tension + 1e4 * wound_in), 100)
         assert loop.core.verified.endswith(HEALTHY)
         assert loop.core.robot.isolated == ()
         assert loop.core.cause == ''

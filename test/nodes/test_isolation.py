@@ -48,6 +48,20 @@ def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
     graph.wait(lambda: arm.controller.core._robot.isolated == (), 'its use')
 
 
+def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
+    graph, name = arm.graph, arm.robot.muscles[2]
+    assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+    assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
+    graph.wait(lambda: arm.controller.core._robot.isolated == (2,), 'the controller')
+    assert arm.estimator.core.verified == f'{name}: a sensor says no number'
+    graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
+    arm.target(THERE)
+    arm.goes_to(THERE)
+    assert np.isfinite(arm.controller.core.safety.command.value).all()
+    for node in (arm.estimator, arm.controller):
+        assert any('not finite' in reason for reason in node.rejected)
+
+
 def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, trained):
     graph, names = arm.graph, list(arm.robot.muscles[1:3])
     assert not graph.call(Trigger, 'estimator/isolate').success  # none is named
