@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-MANY = 4096
+MANY, LONGEST = 4096, 0.05  # arms, [s] of a round
 
 
 class Row(NamedTuple):
@@ -78,8 +78,11 @@ def gemm_rate(rows: int) -> float:
 
 
 def microseconds(function: Callable[[], object], calls: int = 100, rounds: int = 20) -> float:
-    """Return the time of one call [µs]: of the process, the median of rounds."""
+    """Return the time of one call [µs]: of the process, the median of rounds, shorter if slow."""
     function()
+    start = time.process_time()
+    function()
+    calls = max(1, min(calls, round(LONGEST / (time.process_time() - start + 1e-9))))
     times = []
     for _ in range(rounds):
         start = time.process_time()

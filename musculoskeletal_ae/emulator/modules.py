@@ -31,9 +31,10 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # Chosen, plausible for Musashi's (not public).
 RELEASE_RATE = 100.0  # [N/s] at which a module that went safe approaches T_bias
 MOTOR_GAIN = 0.004  # [m/s/N]
-# Heat: 200 N for good settles at 85 °C at the housing and 105 °C in the winding, of a mean module.
+# Heat: a motor suits its muscle; T_limit for good settles at 85 °C at the housing and 105 °C in the
+# winding, of a mean module.
 AMBIENT = 25.0  # [°C]
-LOSS = 5.0e-4  # [W/N²]
+LOSS = 20.0  # [W] at T_limit
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
 HEAT_SPREAD = 0.15  # standard deviation of the logarithm of each of the five, as of elastic units
@@ -189,9 +190,10 @@ class Arm(ABC):
         """Return the constants, for lengths [m] (N, M) of postures and L_e at T_max [m] (M,)."""
         low, high = span.min(axis=0) - stretch - 0.05, span.max(axis=0) + 0.05
         tension = self.robot.tension
-        mean = LOSS, WINDING_CAPACITY, HOUSING_CAPACITY, WINDING_RESISTANCE, HOUSING_RESISTANCE
+        loss = LOSS / tension.limit**2
+        mean = loss, WINDING_CAPACITY, HOUSING_CAPACITY, WINDING_RESISTANCE, HOUSING_RESISTANCE
         spread = self._heat_rng.normal(0.0, HEAT_SPREAD, (5, self.robot.muscle_count))
-        warmth = np.array(mean)[:, None] * np.exp(spread)
+        warmth = (one * np.exp(factor) for one, factor in zip(mean, spread, strict=True))
         return Modules(low, high, self.robot.stiffness, tension.bias, tension.max, *warmth)
 
     def reset(self, theta: Array | None = None) -> None:

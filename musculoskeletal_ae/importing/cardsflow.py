@@ -88,11 +88,23 @@ def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
     return source
 
 
+def _endless(*ends: str | None) -> bool:
+    """Return whether limits are such as exporters write where there are none, as 1e16."""
+    try:
+        return any(abs(float(end or 0.0)) > 1e6 for end in ends)
+    except ValueError:
+        return False
+
+
 def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
-    for joint in root.findall('joint[@type="continuous"]'):
+    for joint in root.findall('joint'):
+        limits, kind = joint.findall('limit'), joint.get('type')
+        ends = [limit.get(end) for limit in limits for end in ('lower', 'upper')]
+        if kind != 'continuous' and not (kind == 'revolute' and _endless(*ends)):
+            continue
         joint.set('type', 'revolute')
-        for limit in joint.findall('limit'):
+        for limit in limits:
             joint.remove(limit)
         ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
     text = ET.tostring(root, encoding='unicode')
@@ -149,6 +161,8 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
                 axis = here.rotation.T @ axis
             if kind in ('revolute', 'continuous', 'prismatic'):
                 limit = joint.find('axis/limit') if kind != 'continuous' else None
+                if limit is not None and _endless(limit.findtext('lower'), limit.findtext('upper')):
+                    limit = None
                 limits = float(value(limit, 'lower')[0]), float(value(limit, 'upper')[0])
                 here_in, slides = at.inverse() * here, kind == 'prismatic'
                 carrier = source.add_joint(label, carrier, here_in, slides, axis, limits)

@@ -37,12 +37,12 @@ class Blocks(nn.Module):
         self.register_buffer('order', torch.as_tensor(np.argsort(np.concatenate(out))))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the outputs (N, out) of inputs (N, in)."""
+        """Return the outputs (..., out) of inputs (..., in)."""
         if len(self.stacks) == 1:
             result: Tensor = self.stacks[0](x)
             return result
-        each = [stack(x[:, own]) for stack, own in zip(self.stacks, self._into, strict=True)]
-        return torch.cat(each, dim=-1)[:, self.order]
+        each = [stack(x[..., own]) for stack, own in zip(self.stacks, self._into, strict=True)]
+        return torch.cat(each, dim=-1)[..., self.order]
 
 
 class Network(nn.Module):

@@ -58,9 +58,9 @@ class TensionProgramme:
         try:
             return quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)[0]
         except ValueError as error:
-            torque = np.round(self._torque, 2)
+            torque = ', '.join(f'{value:.2f}' for value in self._torque.tolist())
             raise InfeasibleError(
-                f'no tension within its limits produces the torque {torque} N·m'
+                f'no tension within its limits produces the torque ({torque}) N·m'
             ) from error
 
     def nearest(self, desired: Array | float) -> Array:

@@ -22,8 +22,8 @@ class Motors:
         self.rng, self.hold = np.random.default_rng(seed), hold
         factors = np.exp(self.rng.normal(0.0, modules.HEAT_SPREAD, (5, COUNT)))
         mean = (
-            modules.LOSS, modules.WINDING_CAPACITY, modules.HOUSING_CAPACITY,
-            modules.WINDING_RESISTANCE, modules.HOUSING_RESISTANCE,
+            modules.LOSS / TENSION.limit[0] ** 2, modules.WINDING_CAPACITY,
+            modules.HOUSING_CAPACITY, modules.WINDING_RESISTANCE, modules.HOUSING_RESISTANCE,
         )  # fmt: skip
         self.constants = np.array(mean)[:, None] * factors
         self.winding, self.housing = np.full((2, COUNT), modules.AMBIENT)

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import copy_robot
 
 from bench.gate import ATTACKS, ON_MESSAGES
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
@@ -59,6 +61,14 @@ def test_an_attack_is_refused_without_any_message_and_the_figures_are_said(train
     with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
         Gate(ROBOT).check(ATTACKS[attack](trained[preset]))
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
+
+
+def test_less_is_asked_only_of_joints_that_the_muscles_do_not_tell(tmp_path):
+    assert Gate(ROBOT)._untold.max() < 0.5 * LIMITS['θ by ①']
+    urdf = copy_robot('arm26', tmp_path / 'round') / 'robot.urdf'
+    circle = 'lower="-3.14159" upper="3.14159"'
+    urdf.write_text(re.sub('lower="[^"]*" upper="[^"]*"', circle, urdf.read_text()))
+    assert Gate(Robot.load(tmp_path / 'round'))._untold.max() > LIMITS['θ by ①']
 
 
 @pytest.mark.parametrize('attack', ON_MESSAGES)

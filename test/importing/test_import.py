@@ -78,12 +78,14 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
 
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     text = re.sub(r' rpy="[^"]*"', '', (tmp_path / 'model.urdf').read_text())
-    put(tmp_path, 'model.urdf', text.replace('0.01 0 -0.15', '0 0 -0.1'))
+    endless = text.replace('lower="-1" upper="1"', 'lower="-1e16" upper="1e16"', 1)
+    put(tmp_path, 'model.urdf', endless.replace('0.01 0 -0.15', '0 0 -0.1'))
     first = import_robot(cardsflow, tmp_path / 'two', end='arm').robot
     (tmp_path / 'model.urdf').unlink()
-    put(tmp_path, 'model.sdf', bodies.SDF)
+    put(tmp_path, 'model.sdf', bodies.SDF.replace('<lower>-1', '<lower>-1e16'))
     second = import_robot(cardsflow, tmp_path / 'three').robot
     assert second.joints == first.joints == ('shoulder',)
+    assert second.lower == first.lower == pytest.approx(-np.pi)
     theta = np.linspace(-1.0, 1.0, 9)[:, None]
     expected = first.routes.absolute_lengths(theta)
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
