@@ -44,8 +44,9 @@ DISTANCE, NORM = 'distance', 'norm'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-#: a winch is jammed that stands, but for so much, so long, so far from the tension it is to have
-STANDS, JAM_TIME, JAM = 0.001, 1.0, 50.0  # [m], [s], [N]
+#: a winch is jammed that stands, but for so much, so long, so far from the tension it is to have: in
+#: newtons and as a share of it, since tension sensors differ in gain
+STANDS, JAM_TIME, JAM, JAM_SHARE = 0.001, 1.0, 50.0, 0.3  # [m], [s], [N]
 #: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
 NEAR, WIDEST = 0.25, 3.0
 
@@ -175,7 +176,8 @@ class AnomalyDetector:
             self._jammed[:] = 0.0
             return None
         demand = np.minimum(self._demand(length, self._length_command), self._robot.tension.max)
-        told = (np.abs(tension - demand) > JAM) & self._robot.used
+        far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
+        told = far & self._robot.used
         stands = told & (np.abs(length - self._stands) < STANDS)
         self._stands = np.where(stands, self._stands, length)
         self._jammed = np.where(stands, self._jammed + dt, 0.0)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from argparse import ArgumentTypeError
 from pathlib import Path
 
 from musculoskeletal_ae.experiments import NAMES
@@ -25,8 +26,8 @@ def main(argv: list[str] | None = None) -> int:
         "and writes DIR/NAME/result.json, plots, and DIR/report.html with the paper's numbers "
         'beside ours. Exit status 1: a part failed or a file is not usable, 2: bad options.',
     )
-    names = (*NAMES, 'all')
-    parser.add_argument('name', metavar='NAME', choices=names, help=', '.join(names))
+    told = f'{", ".join(NAMES)}; several, with a comma between; or all'
+    parser.add_argument('names', metavar='NAME', type=_names, help=told)
     parser.add_robot()
     parser.add_preset('networks to measure; preset paper is always shown beside them')
     parser.add_seeds(None, 'individual arms (default: 0,1,2,3,4; quick: 0)')
@@ -44,6 +45,13 @@ def main(argv: list[str] | None = None) -> int:
     # Ended by whoever started it, it clears up as on Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     return exit_status(lambda: load('musculoskeletal_ae.tools.measuring').measure(args))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = NAMES if text == 'all' else tuple(dict.fromkeys(text.split(',')))
+    if unknown := [name for name in names if name not in NAMES]:
+        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)} or all')
+    return names
 
 
 if __name__ == '__main__':

@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import NAMES, results
+from musculoskeletal_ae.experiments import results
 from musculoskeletal_ae.experiments.report import write_report
 from musculoskeletal_ae.experiments.runner import run
 from musculoskeletal_ae.experiments.study import Study
@@ -23,8 +23,7 @@ BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 def measure(args: Namespace) -> None:
     """Measure as the options say and write results, plots and report."""
     start = time.perf_counter()
-    names = NAMES if args.name == 'all' else (args.name,)
-    robot = Robot.load(args.robot)
+    names, robot = args.names, Robot.load(args.robot)
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
         study = Study(

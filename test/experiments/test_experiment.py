@@ -165,6 +165,7 @@ def test_the_report_of_one_experiment_has_that_one_only(quick, tmp_path):
     'wrong',
     [
         ['nothing'],
+        ['control,nothing'],
         [],
         ['all', '--seeds', '0,x'],
         ['all', '--seeds', '1,1'],
