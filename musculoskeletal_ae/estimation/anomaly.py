@@ -44,8 +44,8 @@ DISTANCE, NORM = 'distance', 'norm'
 
 IN_A_ROW = 5  # messages beyond the threshold that make a decision
 DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
-#: a winch is jammed that stands, but for so much, so long, so far from the tension it is to have: in
-#: newtons and as a share of it, since tension sensors differ in gain
+#: a winch is jammed that stands, but for so much, so long, so far from the tension it is to have:
+#: in newtons and as a share of it, since tension sensors differ in gain
 STANDS, JAM_TIME, JAM, JAM_SHARE = 0.001, 1.0, 50.0, 0.3  # [m], [s], [N]
 #: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
 NEAR, WIDEST = 0.25, 3.0
