@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes doc/performance.md: core steps, the running system, starts, memory and learning times.
 
-    python -m bench performance [--seconds 20] [--flames] --out doc
+    python -m bench performance [--seconds 20] [--robots NAME,…] [--flames] --out doc
 
 Times hold for the machine and the day that the page names, which should have nothing else to do.
 `--flames` draws, by py-spy, where each node spends its time at 200 Hz, as OUT/flames/NODE.svg.
@@ -23,6 +23,7 @@ from bench import timings
 from bench.scaling import update_time
 from bench.wire import KINDS, System, cpu, systems
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
@@ -31,9 +32,9 @@ from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = 'musashi_left_arm'
-RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, 'musashi_upper_body')
+RATES, SIZES = (100.0, 200.0, 500.0), f'arm26,{ARM},musashi_upper_body'
 EXPLORING = 60.0  # [s] that samples of an update come from
-FLAME_RATE, SETTLING = 200.0, 15.0  # [Hz], [s]
+FLAME_RATE, STARTING, SETTLING = 200.0, 60.0, 15.0  # [Hz], [s], [s]
 
 #: what the first version that was measured (commit be0daee) took on an idle machine of two cores
 BEFORE_CORE = {
@@ -103,10 +104,10 @@ def core(robot: Robot) -> str:
     return rows('| before [µs] | now [µs] | torch eager [µs] | bound [µs] | times faster', said)
 
 
-def wire(seconds: float) -> str:
+def wire(robots: Iterable[str], seconds: float) -> str:
     """Return the table of the running system."""
     said = []
-    for robot in SIZES:
+    for robot in robots:
         kinds = KINDS if robot == ARM else ('nodes', 'with learner')
         for rate, kind, found in systems(robot, RATES, kinds, seconds):
             latency = ' / '.join(f'{value:.1f}' for value in found.latency)
@@ -135,7 +136,10 @@ def starting(network: Path) -> tuple[str, float]:
     """Return the table of starts and memory, and what the estimator has of files [MB]."""
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
+        deadline = time.monotonic() + STARTING
         while not system.stamps['muscle_length_command']:
+            if time.monotonic() > deadline:
+                raise MusculoskeletalError(f'no command came within {STARTING:g} s')
             system.spin(0.1)
         used = {name: cpu(process.pid) for name, process in system.nodes.items()}
         system.spin(SETTLING)
@@ -187,6 +191,7 @@ def main(argv: list[str] | None = None) -> int:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
+    parser.add_argument('--robots', default=SIZES, help='at the wire: names or directories')
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
@@ -198,7 +203,7 @@ def main(argv: list[str] | None = None) -> int:
             start, shared = starting(network)
             page = PAGE.format(
                 day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
-                wire=wire(args.seconds), start=start, shared=shared, training=training,
+                wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared, training=training,
                 update=update,
                 flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
             )  # fmt: skip
