@@ -203,8 +203,8 @@ def main(argv: list[str] | None = None) -> int:
             start, shared = starting(network)
             page = PAGE.format(
                 day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
-                wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared, training=training,
-                update=update,
+                wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared,
+                training=training, update=update,
                 flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
             )  # fmt: skip
         args.out.mkdir(parents=True, exist_ok=True)
