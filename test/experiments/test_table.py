@@ -20,7 +20,7 @@ from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 
 REPOSITORY = Path(__file__).parents[2]
 #: too long for the machine that measured the others; its rows appear once it was run
-NOT_YET = {'motion', 'resilience', 'robustness', 'sensors'}
+NOT_YET = {'resilience', 'robustness', 'sensors'}
 ROWS = [(name, row) for name, experiment in EXPERIMENTS.items() for row in experiment.rows]
 
 
