@@ -19,7 +19,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
@@ -64,6 +63,9 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     """Return postures that lead from `start` to θ [rad] (D,), the last of them θ, (K, D)."""
     if robot.used.all():
         return theta[None]
+    # Only here, so that an arm with all its muscles does without scipy.
+    from scipy.sparse.csgraph import dijkstra
+
     limits, joints = robot.tension, np.eye(robot.joint_count)
     most = limits.bias + USED * (limits.limit - limits.bias)
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.wrapping import WrappedRoutes, wrapped_lengths
+from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.robot.tree import Tree
 from musculoskeletal_ae.robot.wrapping import WrapObjects
 
 THICKEST_BONE = 0.04  # [m] radius of a bone's head
@@ -54,7 +53,13 @@ class Individual:
         muscles = robot.muscle_count
         kin = robot.kinematics
         self._kinematics = kin
-        self.tree = Tree.of(kin)
+        self.tree = Tree(
+            kin.parent.astype(np.int64),
+            kin.placement_rotation,
+            kin.placement_translation,
+            kin.local_axis,
+            kin.prismatic,
+        )
         nominal = robot.routes
         shift = rng.normal(0.0, spread.attachment, nominal.point.shape)
         self.routes = WrappedRoutes(

@@ -19,13 +19,14 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState, heat, wind
 from musculoskeletal_ae.emulator.wrapping import (
+    Tree,
     WrappedRoutes,
     add_pull,
     add_torque,
     place_points,
     route_segment,
+    tree_poses,
 )
-from musculoskeletal_ae.robot.tree import Tree, tree_poses
 
 SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
 # Joints.

@@ -8,14 +8,24 @@ object of its own size. How a wire lies on either, `robot/wrapping.py` says.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.robot.tree import Tree, tree_poses
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segment
+
+
+class Tree(NamedTuple):
+    """Joints in pinocchio's order, joint 0 being the root link."""
+
+    parent: Ints  # (J,)
+    rotation: Array  # fixed placement in the parent, (J, 3, 3)
+    translation: Array  # [m], (J, 3)
+    axis: Array  # in the joint's frame, (J, 3)
+    prismatic: Bools  # (J,)
 
 
 class WrappedRoutes(NamedTuple):
@@ -27,6 +37,48 @@ class WrappedRoutes(NamedTuple):
     second: Ints  # and ends, (S,)
     muscle: Ints  # it belongs to, (S,)
     objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
+
+
+@njit(cache=True)
+def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array) -> None:
+    """Fill rotation (J, 3, 3), translation (J, 3), axis (J, 3) of all joints for q (J−1,)."""
+    rotation[0] = np.eye(3)
+    translation[0] = 0.0
+    for i in range(1, tree.parent.shape[0]):
+        up = tree.parent[i]
+        ux, uy, uz = tree.axis[i]
+        sine, cosine = math.sin(q[i - 1]), math.cos(q[i - 1])
+        if tree.prismatic[i]:
+            sine, cosine = 0.0, 1.0
+        rest = 1.0 - cosine
+        turn = np.array(
+            (
+                (cosine + ux * ux * rest, ux * uy * rest - uz * sine, ux * uz * rest + uy * sine),
+                (uy * ux * rest + uz * sine, cosine + uy * uy * rest, uy * uz * rest - ux * sine),
+                (uz * ux * rest - uy * sine, uz * uy * rest + ux * sine, cosine + uz * uz * rest),
+            )
+        )
+        for r in range(3):
+            translation[i, r] = translation[up, r]
+            axis[i, r] = 0.0
+            for k in range(3):
+                translation[i, r] += rotation[up, r, k] * tree.translation[i, k]
+                placed = 0.0
+                for j in range(3):
+                    placed += rotation[up, r, j] * tree.rotation[i, j, k]
+                axis[i, r] += placed * tree.axis[i, k]
+        for r in range(3):
+            for c in range(3):
+                total = 0.0
+                for k in range(3):
+                    placed = 0.0
+                    for j in range(3):
+                        placed += rotation[up, r, j] * tree.rotation[i, j, k]
+                    total += placed * turn[k, c]
+                rotation[i, r, c] = total
+        if tree.prismatic[i]:
+            for r in range(3):
+                translation[i, r] += axis[i, r] * q[i - 1]
 
 
 @njit(cache=True)

@@ -187,9 +187,9 @@ class LeanExecutor(SingleThreadedExecutor):
             self._guard = guard
 
     def _escaped(self, entity: Any, error: Exception) -> None:
-        # The end, asked for by a callback or by a signal while it published, is none.
+        # The end, asked for by a callback or by a signal while it took or published, is none.
         if isinstance(error, ExternalShutdownException) or not self.context.ok():
-            raise error
+            raise ExternalShutdownException from error
         named = getattr(entity, 'topic_name', None) or getattr(entity, 'srv_name', None)
         nodes: list[Any] = self.get_nodes()
         owners = (n for n in nodes if entity in (*n.subscriptions, *n.timers, *n.services))

@@ -12,8 +12,7 @@ the posture of rest. (Solved for z itself, with decoded θ and T instead of exac
 no nearer to the body's and each step dearer.) The arm creeps towards it through a viscous medium B,
 by linearly implicit Euler steps: Newton steps on those equations with B/h on the diagonal. B stands
 for what joints and geared modules resist, so that speeds look right; it has no say in where the arm
-comes to rest. A joint limit is a hard stop that gives whatever torque it takes. The network is
-asked for all arms at once; the rest of a step is a loop over them, compiled by numba.
+comes to rest. A joint limit is a hard stop that gives whatever torque it takes.
 """
 
 from __future__ import annotations
@@ -22,12 +21,11 @@ from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Weights, load, new_scratch
+from musculoskeletal_ae.simulation.load import Load
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias
 PAID_OUT = np.inf  # [m]
@@ -47,19 +45,93 @@ class ArmState(NamedTuple):
     holding: Array  # torque of a stop, or of whoever holds a joint, on it [N·m], (N, D)
 
 
-class Muscles(NamedTuple):
-    """What pulls, each (M,)."""
+class QuasiStatics:
+    """The equations above for one robot and one network."""
 
-    stiffness: Array  # of MSC [N/m]
-    bias: Array  # tensions that MSC keeps [N]
-    most: Array  # and the highest ever [N]
-    length_at_zero: Array  # [m]
-    force: Array  # of the elastic units, as in `SeriesElastic`
-    rate: Array
-    wire_stretch: Array
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        self._robot, self._mae = robot, mae
+        self._load, self._slopes = Load(robot.kinematics), Slopes(robot, mae)
+        self._eye = np.eye(robot.joint_count)
+
+    def step(
+        self,
+        state: ArmState,
+        command: Array,
+        h: float,
+        wrench: Array | None = None,
+        fixed: Array | None = None,
+    ) -> ArmState:
+        """Return the arms h [s] later, under l_target [m] (N, M), PAID_OUT for none.
+
+        A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
+        forced to the angles `fixed` (N, D) [rad], nan for a free joint.
+        """
+        robot, theta, tension = self._robot, state.theta, state.tension
+        stiffness, limits = robot.stiffness, robot.tension
+        length, pullback = self._mae.lengths_with_pullback(theta, tension)
+        span = (limits.max - limits.bias) / stiffness
+        followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
+        # MSC and the elastic unit in series: at rest posture T moves to `desired`, and with the
+        # posture by `soft` K G Δθ.
+        absolute = robot.routes.length_at_zero + length
+        compliance = robot.series_elastic.compliance(absolute, tension)
+        soft = 1.0 / (1.0 + stiffness * compliance)
+        command_tension = limits.bias + stiffness * (length - followed)
+        desired = tension + soft * (command_tension - tension)
+        # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth Newton).
+        settled = np.minimum(np.maximum(desired, limits.bias), limits.max)
+        spring = stiffness * soft * (desired == settled)
+        jacobian, curvature = self._slopes(theta, tension)
+        load, load_slope = self._load(theta, wrench)
+        pull = ((settled - tension)[:, None, :] @ jacobian)[:, 0]
+        push = -(load + pullback(tension) + pull)
+        matrix = (jacobian * spring[..., None]).swapaxes(1, 2) @ jacobian
+        matrix += curvature + load_slope + (VISCOSITY / h) * self._eye
+        turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
+        arrived = np.minimum(np.maximum(theta + turned, robot.lower), robot.upper)
+        stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
+        after = desired + stiffness * soft * stretch
+        after = np.minimum(np.maximum(after, limits.bias), limits.max)
+        length = length + stretch - compliance * (after - tension)
+        held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
+        if fixed is not None:
+            held |= np.isfinite(fixed)
+        return ArmState(arrived, after, length, followed, np.where(held, -push, 0.0))
+
+    def _turn(
+        self, theta: Array, push: Array, matrix: Array, most: float, fixed: Array | None
+    ) -> Array:
+        """Return Δθ of one step; joints at a stop stay, forced joints go where they are forced."""
+        robot = self._robot
+        held = (theta <= robot.lower) & (push < 0.0) | (theta >= robot.upper) & (push > 0.0)
+        forced = np.zeros_like(theta)
+        if fixed is not None:
+            given = np.isfinite(fixed)
+            way = np.minimum(np.maximum(fixed, robot.lower), robot.upper) - theta
+            forced[given] = np.minimum(np.maximum(way, -most), most)[given]
+            held |= given
+            push = push - (matrix @ forced[..., None])[..., 0]
+        free = ~held
+        matrix = matrix * (free[:, :, None] & free[:, None, :]) + held[:, :, None] * self._eye
+        turned = np.linalg.solve(matrix, (push * free)[..., None])[..., 0]
+        largest = np.abs(turned).max(axis=1, keepdims=True)
+        scaled: Array = turned * (most / np.maximum(largest, most)) + forced
+        return scaled
 
 
-class Slopes(NamedTuple):
+def follow(command: Array, followed: Array, length: Array, span: Array, most: float) -> Array:
+    """Return the command as far as modules have wound that wind at most `most` [m] in a step.
+
+    Command, how far they had `followed` it a step before, and length are (N, M) [m]; a command
+    adds tension as far as `span` [m] (M,) below the length.
+    """
+    reached = followed + np.minimum(np.maximum(command - followed, -most), most)
+    # What lies beyond changes no tension; following it would take as long to come back from.
+    within: Array = np.minimum(np.maximum(reached, length - span), length + most)
+    return within
+
+
+class Slopes:
     """How a network's lengths change with posture, nearly: a cubic through what it says.
 
         l_i(θ) ≈ Σ_n c_ni θ^n,  |n| ≤ 3      G = ∂l/∂θ,   Σ_i T_i ∂²l_i/∂θ²
@@ -69,12 +141,7 @@ class Slopes(NamedTuple):
     exact second derivatives would cost ten times the rest of the step.
     """
 
-    first: Array  # of 1, θ and products of two angles to G, (Q, M·D)
-    second: Array  # of T_i to the second derivatives by 1 and θ, (M, (1 + D)·D·D)
-    pairs: Ints  # the two angles of each product, (2, Q − 1 − D)
-
-    @classmethod
-    def of(cls, robot: Robot, mae: Mae) -> Slopes:
+    def __init__(self, robot: Robot, mae: Mae) -> None:
         """Fit the cubic over the whole joint range, muscles in the middle of their tensions."""
         joints, muscles = robot.joint_count, robot.muscle_count
         basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
@@ -88,207 +155,24 @@ class Slopes(NamedTuple):
         linear = [term for term in basis if len(term) <= 1]
         slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
         bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
+        pairs = [term for term in quadratic if len(term) == 2]
+        self._left, self._right = np.array(pairs).T
         first = np.einsum('dqb,bm->qmd', slope, cubic)
+        self._shape = (muscles, joints)
+        self._first = np.ascontiguousarray(first.reshape(len(quadratic), -1))
         second = np.einsum('elq,qmd->mlde', bend, first)
-        return cls(
-            first.reshape(len(quadratic), -1).copy(),
-            second.reshape(muscles, -1).copy(),
-            np.array([term for term in quadratic if len(term) == 2]).T.copy(),
-        )
+        self._second = np.ascontiguousarray(second.reshape(muscles * len(linear), -1))
 
-
-class QuasiStatics:
-    """The equations above for one robot and one network."""
-
-    def __init__(self, robot: Robot, mae: Mae) -> None:
-        elastic, tension = robot.series_elastic, robot.tension
-        self._mae = mae
-        self._body = (
-            Weights.of(robot.kinematics),
-            Muscles(robot.stiffness, tension.bias, tension.max, robot.routes.length_at_zero,
-                    elastic.force, elastic.rate, elastic.wire_stretch),
-            Slopes.of(robot, mae),
-            np.stack([robot.lower, robot.upper]),
-        )  # fmt: skip
-
-    def step(
-        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
-    ) -> ArmState:
-        """Return the arms h [s] later, under l_target [m] (N, M), PAID_OUT for none.
-
-        A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
-        forced to the angles `fixed` (N, D) [rad], nan for a free joint.
-        """
-        length, pullback = self._mae.lengths_with_pullback(state.theta, state.tension)
-        after = ArmState(*map(np.empty_like, state))
-        _creep(
-            *self._body, state, length, pullback(state.tension), command, h, wrench, fixed, after
-        )
-        return after
-
-
-@njit(cache=True, nogil=True)
-def _creep(
-    weights: Weights, muscles: Muscles, slopes: Slopes, limits: Array, state: ArmState,
-    length: Array, pulled: Array, command: Array, h: float, wrench: Array, fixed: Array,
-    after: ArmState,
-) -> None:  # fmt: skip
-    """Fill the state after h [s]; limits of joints are (2, D), l and Gᵀ T of the network given."""
-    count, joints = pulled.shape
-    scratch = new_scratch(weights)
-    torque, push, turned = np.empty((3, joints))
-    matrix, jacobian = np.empty((joints, joints)), np.empty((command.shape[1], joints))
-    spring, desired, compliance, stretch = np.empty((4, command.shape[1]))
-    for n in range(count):
-        theta, tension = state.theta[n], state.tension[n]
-        load(weights, scratch, theta, wrench[n], torque, matrix)
-        add_slopes(slopes, theta, tension, jacobian, matrix)
-        for d in range(joints):
-            push[d] = -(torque[d] + pulled[n, d])
-            matrix[d, d] += VISCOSITY / h
-        for i in range(len(tension)):
-            stiffness, bias, most = muscles.stiffness[i], muscles.bias[i], muscles.most[i]
-            span = (most - bias) / stiffness
-            followed = follow(
-                command[n, i], state.followed[n, i], length[n, i], span, MODULE_SPEED * h
-            )
-            after.followed[n, i] = followed
-            # MSC and the elastic unit in series: at rest posture T moves to `desired`, and with
-            # the posture by `soft` K G Δθ.
-            unit = 1.0 / (muscles.rate[i] * (muscles.force[i] + max(tension[i], 0.0)))
-            absolute = muscles.length_at_zero[i] + length[n, i]
-            compliance[i] = unit + muscles.wire_stretch[i] * absolute
-            soft = 1.0 / (1.0 + stiffness * compliance[i])
-            commanded = bias + stiffness * (length[n, i] - followed)
-            desired[i] = tension[i] + soft * (commanded - tension[i])
-            # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
-            # Newton).
-            settled = min(max(desired[i], bias), most)
-            spring[i] = stiffness * soft
-            for d in range(joints):
-                push[d] -= (settled - tension[i]) * jacobian[i, d]
-                slope = spring[i] * jacobian[i, d] if settled == desired[i] else 0.0
-                for e in range(joints):
-                    matrix[d, e] += slope * jacobian[i, e]
-        arrived, held = after.theta[n], after.holding[n]
-        turn(limits, theta, push, matrix, JOINT_SPEED * h, fixed[n], turned, arrived, held)
-        for i in range(len(tension)):
-            stretch[i] = 0.0
-            for d in range(joints):
-                stretch[i] += jacobian[i, d] * (arrived[d] - theta[d])
-            pull = desired[i] + spring[i] * stretch[i]
-            pull = min(max(pull, muscles.bias[i]), muscles.most[i])
-            after.tension[n, i] = pull
-            after.length[n, i] = length[n, i] + stretch[i] - compliance[i] * (pull - tension[i])
-
-
-@njit(cache=True, nogil=True)
-def follow(command: float, followed: float, length: float, span: float, most: float) -> float:
-    """Return the command as far as a module has wound that winds at most `most` [m] in a step.
-
-    Command, how far it had `followed` it a step before, and length are in [m]; a command adds
-    tension as far as `span` [m] below the length.
-    """
-    reached = followed + min(max(command - followed, -most), most)
-    # What lies beyond changes no tension; following it would take as long to come back from.
-    return min(max(reached, length - span), length + most)
-
-
-@njit(cache=True, nogil=True)
-def turn(
-    limits: Array, theta: Array, push: Array, matrix: Array, most: float, fixed: Array,
-    turned: Array, arrived: Array, holding: Array,
-) -> None:  # fmt: skip
-    """Fill θ after a step and what stops and holders give, (D,) each; `matrix` is used up.
-
-    Joints at a stop stay, forced joints go where they are forced.
-    """
-    joints = len(theta)
-    lower, upper = limits
-    for d in range(joints):
-        way = min(max(fixed[d], lower[d]), upper[d]) - theta[d]
-        arrived[d] = min(max(way, -most), most) if np.isfinite(fixed[d]) else 0.0
-    for d in range(joints):
-        turned[d] = push[d]
-        for e in range(joints):
-            turned[d] -= matrix[d, e] * arrived[e]
-    for d in range(joints):
-        if np.isfinite(fixed[d]) or stopped(theta[d], push[d], lower[d], upper[d]):
-            turned[d] = 0.0
-            for e in range(joints):
-                matrix[d, e], matrix[e, d] = 0.0, 0.0
-            matrix[d, d] = 1.0
-    solve(matrix, turned)
-    largest = most
-    for d in range(joints):
-        largest = max(largest, abs(turned[d]))
-    for d in range(joints):
-        angle = theta[d] + turned[d] * (most / largest) + arrived[d]
-        arrived[d] = min(max(angle, lower[d]), upper[d])
-        held = np.isfinite(fixed[d]) or stopped(arrived[d], push[d], lower[d], upper[d])
-        holding[d] = -push[d] if held else 0.0
-
-
-@njit(cache=True, nogil=True)
-def stopped(theta: float, push: float, lower: float, upper: float) -> bool:
-    """Return whether a torque pushes a joint against a stop."""
-    return (theta <= lower and push < 0.0) or (theta >= upper and push > 0.0)
-
-
-@njit(cache=True, nogil=True)
-def solve(matrix: Array, vector: Array) -> None:
-    """Put the solution of matrix (D, D) x = vector (D,) into the vector; both are used up.
-
-    Small and compiled: LAPACK's call takes longer than the elimination.
-    """
-    count = len(vector)
-    for k in range(count):
-        best = k
-        for i in range(k + 1, count):
-            best = i if abs(matrix[i, k]) > abs(matrix[best, k]) else best
-        if best != k:
-            for c in range(k, count):
-                matrix[k, c], matrix[best, c] = matrix[best, c], matrix[k, c]
-            vector[k], vector[best] = vector[best], vector[k]
-        if matrix[k, k] == 0.0:
-            raise FloatingPointError('the equilibrium of the network cannot be solved for')
-        for i in range(k + 1, count):
-            share = matrix[i, k] / matrix[k, k]
-            vector[i] -= share * vector[k]
-            for c in range(k + 1, count):
-                matrix[i, c] -= share * matrix[k, c]
-    for k in range(count - 1, -1, -1):
-        for c in range(k + 1, count):
-            vector[k] -= matrix[k, c] * vector[c]
-        vector[k] /= matrix[k, k]
-
-
-@njit(cache=True, nogil=True)
-def add_slopes(
-    slopes: Slopes, theta: Array, tension: Array, jacobian: Array, curvature: Array
-) -> None:
-    """Fill G [m/rad] (M, D) and add Σ T_i ∂²l_i/∂θ² [N·m/rad] (D, D) at θ (D,), T (M,)."""
-    joints, flat, flat_curvature = len(theta), jacobian.reshape(-1), curvature.reshape(-1)
-    flat[:] = slopes.first[0]
-    for d in range(joints):
-        add(flat, theta[d], slopes.first[1 + d])
-    for p in range(slopes.pairs.shape[1]):
-        product = theta[slopes.pairs[0, p]] * theta[slopes.pairs[1, p]]
-        add(flat, product, slopes.first[1 + joints + p])
-    pulled = np.zeros(slopes.second.shape[1])
-    for i in range(len(tension)):
-        add(pulled, tension[i], slopes.second[i])
-    size = joints * joints
-    add(flat_curvature, 1.0, pulled[:size])
-    for d in range(joints):
-        add(flat_curvature, theta[d], pulled[(1 + d) * size : (2 + d) * size])
-
-
-@njit(cache=True, nogil=True)
-def add(result: Array, scale: float, values: Array) -> None:
-    """Add scale · values to a result, without an array between."""
-    for i in range(len(result)):
-        result[i] += scale * values[i]
+    def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
+        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
+        count, joints = theta.shape
+        linear = np.ones((count, 1 + joints))
+        linear[:, 1:] = theta
+        products = theta[:, self._left] * theta[:, self._right]
+        jacobian = np.concatenate((linear, products), axis=1) @ self._first
+        weighted = (tension[:, :, None] * linear[:, None, :]).reshape(count, -1)
+        curvature = weighted @ self._second
+        return jacobian.reshape(count, *self._shape), curvature.reshape(count, joints, joints)
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:

@@ -24,7 +24,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
-from musculoskeletal_ae.simulation.load import Weights, loads
+from musculoskeletal_ae.simulation.load import Load
 
 TENSION_WEIGHT, LENGTH_WEIGHT, TORQUE_WEIGHT, POSTURE_WEIGHT = 0.1, 1.0, 0.001, 1.0  # w₄ … w₇
 SEARCH = StepSearch(largest_step=0.2, candidates=10, epochs=3)
@@ -34,23 +34,24 @@ class PaperDescent:
     """The descent above for one robot and one network; arguments as for `QuasiStatics`."""
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
-        self._robot, self._mae, self._weights = robot, mae, Weights.of(robot.kinematics)
+        self._robot, self._mae, self._load = robot, mae, Load(robot.kinematics)
 
     def step(
         self,
         state: ArmState,
         command: Array,
         h: float,  # noqa: ARG002 (the print knows no time: one step is one descent)
-        wrench: Array,
-        fixed: Array,
+        wrench: Array | None = None,
+        fixed: Array | None = None,
     ) -> ArmState:
         """Return the arms after one descent each."""
-        load, _ = loads(self._weights, state.theta, wrench)
+        load, _ = self._load(state.theta, wrench)
         length = np.where(command == PAID_OUT, state.length, command)
         # A bound that no command in its senses meets: no muscle is wound in by its whole length.
         whole = self._robot.routes.length_at_zero
         length = np.clip(length, -whole, whole)
-        arms = zip(state.theta, state.tension, length, load, fixed, strict=True)
+        forced = np.full_like(state.theta, np.nan) if fixed is None else fixed
+        arms = zip(state.theta, state.tension, length, load, forced, strict=True)
         theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
         return ArmState(theta, tension, reached, length, np.zeros_like(theta))
 

@@ -115,9 +115,12 @@ class Simulation:
         return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
     def _advance(self, h: float) -> None:
+        wrench = self.wrench if self.wrench.any() else None
+        fixed = self.fixed if np.isfinite(self.fixed).any() else None
+
         def advance(rows: slice) -> ArmState:
             state = ArmState(*(part[rows] for part in self.state))
-            pushed, forced = self.wrench[rows], self.fixed[rows]
+            pushed, forced = (None if part is None else part[rows] for part in (wrench, fixed))
             return self._body.step(state, self.command[rows], h, pushed, forced)
 
         count = len(self.command)

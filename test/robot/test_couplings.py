@@ -12,7 +12,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Weights, loads
+from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.tools.robot_report import joint_notes
 
 COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
@@ -50,7 +50,7 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
         gradient = slope(kin.holding_torque, theta)
         np.testing.assert_allclose(kin.gravity_gradient(theta), gradient, atol=1e-5)
-        load, load_slope = loads(Weights.of(kin), theta[None], np.zeros((1, 6)))
+        load, load_slope = Load(kin)(theta[None])
         np.testing.assert_allclose(load[0], kin.holding_torque(theta), atol=1e-9)
         np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)
         lengths = slope(robot.routes.absolute_lengths, theta)

@@ -9,7 +9,7 @@ import pytest
 
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Weights, loads
+from musculoskeletal_ae.simulation.load import Load
 
 
 def sliding_tree():
@@ -43,12 +43,12 @@ def test_load_is_pinocchio_s_gravity_less_the_push(kinematics):
     rng = np.random.default_rng(0)
     theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
     wrench = rng.normal(0.0, 20.0, (20, 6))
-    load, _ = loads(Weights.of(kinematics), theta, wrench)
+    load, _ = Load(kinematics)(theta, wrench)
     for i in range(20):
         jacobian = kinematics.end_effector_jacobian(theta[i])
         expected = kinematics.holding_torque(theta[i]) - jacobian.T @ wrench[i]
         np.testing.assert_allclose(load[i], expected, atol=1e-9)
-    alone, _ = loads(Weights.of(kinematics), theta, np.zeros((20, 6)))
+    alone, _ = Load(kinematics)(theta)
     np.testing.assert_allclose(alone, kinematics.holding_torque(theta), atol=1e-9)
 
 
@@ -56,10 +56,8 @@ def test_the_slope_of_the_load_is_its_derivative(kinematics):
     rng = np.random.default_rng(0)
     theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
     wrench = np.hstack([rng.normal(0.0, 20.0, (20, 3)), np.zeros((20, 3))])
-    weights = Weights.of(kinematics)
-    _, slope = loads(weights, theta, wrench)
+    load = Load(kinematics)
+    _, slope = load(theta, wrench)
     for k, offset in enumerate(1e-6 * np.eye(theta.shape[1])):
-        change = (
-            loads(weights, theta + offset, wrench)[0] - loads(weights, theta - offset, wrench)[0]
-        )
+        change = load(theta + offset, wrench)[0] - load(theta - offset, wrench)[0]
         np.testing.assert_allclose(slope[:, :, k], change / 2e-6, atol=1e-5)
