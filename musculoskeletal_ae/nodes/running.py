@@ -32,7 +32,7 @@ from rclpy.executors import (
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from rclpy.signals import SignalHandlerOptions, uninstall_signal_handlers
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 from rclpy.waitable import NumberOfEntities
@@ -240,6 +240,11 @@ def run(name: str) -> None:
         if rclpy.ok():
             raise
     finally:
+        # The thread that shuts the context down at a signal is waited for: beside it, what is
+        # destroyed here is destroyed twice.
+        uninstall_signal_handlers()
+        for again in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(again, signal.SIG_IGN)
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
