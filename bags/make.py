@@ -63,7 +63,9 @@ class Arm:
         self.common = common = ['--ros-args', '-p', f'robot:={ROBOT}', '-p', f'rate:={rate}']
         self.network = network = ['-p', f'checkpoint:={checkpoint}']
         explore = ['-p', 'explore:=true', '-p', f'seed:={exploration}'] if exploration else []
-        self.start('hardware_emulator', *common, '-p', f'seed:={INDIVIDUAL}')
+        body = 'foreign' if bag.name == 'foreign' else 'kin'
+        emulated = '-p', f'seed:={INDIVIDUAL}', '-p', f'reality:={body}'
+        self.start('hardware_emulator', *common, *emulated)
         self.start('estimator', *common, *network)
         self.start('record', '-o', str(bag), '--topics', TOPICS + more)
         self.start('controller', *common, *network, *explore, '-p', 'max_age:=0.5')
@@ -120,6 +122,11 @@ class Arm:
 def exploration(arm: Arm) -> None:
     """Ten minutes of the three steps of exploration."""
     arm.spend(600.0)
+
+
+def foreign(arm: Arm) -> None:
+    """Three and a half minutes of exploration of the second body."""
+    arm.spend(210.0)
 
 
 def rupture(arm: Arm) -> None:
@@ -205,6 +212,7 @@ RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None, str]] = {
     'faults': (faults, 103, ''),
     'teaching': (teaching, None, f'{TAUGHT},{PUSHED}'),
     'isolation': (isolation, 104, LEFT_OUT),
+    'foreign': (foreign, 105, ''),
 }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of an arm that was taught a motion, and of one that lost a muscle."""
+"""The recordings of an arm that was taught a motion, of one that lost a muscle, of another body."""
 
 from __future__ import annotations
 
@@ -58,3 +58,14 @@ def test_the_recorded_arm_lost_a_muscle_moved_on_and_used_it_again():
     times, states = series(bag, '/joint_states')
     where = np.array([state.position for state in states])[np.searchsorted(times, sent + 8.0)]
     assert np.linalg.norm(where - target.position) < 0.3  # by the network of the geometric model
+
+
+def test_the_recorded_second_body_was_explored_until_a_muscle_pulled_too_much():
+    bag = Bag.open(BAGS / 'foreign')
+    times, states = series(bag, '/muscle_states')
+    tension = np.array([message.data[10:20] for message in states])
+    stopped = times[tension[:, 7] > 350.0][-1]  # of triceps_brachii
+    _, states = series(bag, '/joint_states')
+    moved = np.ptp([state.position for state in states], axis=0)
+    assert moved.min() > 0.3 and stopped - times[0] > 150.0
+    assert (tension[times > stopped + 10.0] < 50.0).all()  # paid out to T_bias
