@@ -65,7 +65,8 @@ class Winches:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._products, self._squares, self._since = 0.0, LAGS, 0.0
+        self._products, self._squares = 0.0, LAGS
+        self._since = self._last = 0.0
         self._length: Array | None = None
 
     @property
@@ -75,10 +76,12 @@ class Winches:
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
         """Take l [m], T [N] (M,), `dt` [s] after the ones before, and what was commanded then."""
-        self._since += dt
+        # Medians of three messages tell how it was one message ago.
+        self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return
-        before, self._length, since, self._since = self._length, length, self._since, 0.0
+        before, since = self._length, self._since
+        self._length, self._since = length, 0.0
         if before is None:
             return
         speed = (length - before) / since
