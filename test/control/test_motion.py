@@ -60,10 +60,16 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
 
 
-@pytest.mark.parametrize('dt', [DT, 0.002])
-def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(bench, dt, monkeypatch):
+@pytest.mark.parametrize(('dt', 'ramp'), [(DT, False), (0.002, False), (DT, True)])
+def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(
+    bench, dt, ramp, monkeypatch
+):
     bench.dt = dt
-    bench.core.trajectory(points(OTHER))
+    if ramp:
+        bench.configure(first_duration=1.0)
+        bench.target(OTHER)
+    else:
+        bench.core.trajectory(points(OTHER))
     moved(bench, round((1.6 + SETTLING) / dt))
     solved = []
 
@@ -177,7 +183,7 @@ def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands(dt):
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
     for n in range(round(3.0 / dt)):
-        if n % round(DT / dt) == 0:
+        if n % round(0.1 / dt) == 0:
             speed = rng.uniform(-0.2, 0.2, ROBOT.muscle_count)
             tension = rng.uniform(60.0, 120.0, ROBOT.muscle_count)
         length = length + speed * dt
