@@ -36,7 +36,6 @@ from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, estimation_error
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.tension import holding_tension
@@ -230,17 +229,4 @@ def isolated(study: Study, rows: Rows) -> Plot:
     return figure, 'Error of the estimate with each muscle isolated; one point per individual.'
 
 
-ROWS = (
-    Row('estimate, healthy [rad]', NOTHING, '', 'healthy_rad'),
-    Row('estimate, one muscle isolated [rad]', NOTHING, '', 'one_isolated_rad'),
-    Row('estimate, two muscles isolated [rad]', NOTHING, '', 'two_isolated_rad'),
-    Row('estimate, one length or tension sensor dead [rad]', NOTHING, '', 'dead_sensor_rad'),
-    Row('`proposed` without a cut muscle [rad]', NOTHING, '', 'proposed_one_isolated_rad', '',
-        0.08),
-    Row('postures held without it, of those held with it [share]', NOTHING, '', 'held_share', '',
-        None, 2),
-    Row('cuts that end in the right isolation within 10 s [share]', NOTHING, '',
-        'right_isolations_share', '', 0.98, 2, more_is_better=True),
-    Row('healthy muscles isolated in 5 h', NOTHING, '', 'wrong_isolations', '', 0.0, 0),
-)  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (isolated,), 60.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (isolated,), 60.0)
