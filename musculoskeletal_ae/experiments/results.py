@@ -125,8 +125,9 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for key, first in (rows[0] if rows else {}).items():
+    for key in dict.fromkeys(key for row in rows for key in row):
         values = [row[key] for row in rows if key in row]
+        first = values[0]
         if isinstance(first, Mapping):
             result[key] = _mean(values)
         elif None in values:
