@@ -37,7 +37,8 @@ Results = Mapping[str, Mapping[str, Any]]
 
 #: counted in all, not per individual: the hour of healthy motion is spread over the seeds
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts', 'paper_false_alarms')
-TOTALS = (*ALARMS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
+ISOLATIONS = ('wrong_isolations', 'acquittals')
+TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 DIGITS = 6  # significant; more is noise
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
