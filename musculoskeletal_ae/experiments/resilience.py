@@ -8,12 +8,12 @@ Here. Estimates of the held-out motion with every muscle isolated in turn, and w
 beside the healthy one. Then estimator and controller as the nodes connect them, `on_anomaly:
 isolate`, on the exploring arm: every muscle is cut in turn, and it is right if that muscle, and no
 other, is isolated as broken within 10 s. After that `proposed` goes to random postures that the
-true body can hold without the muscle (which share of all that it holds with it is "held"; where
-that is none, the muscle has no targets and counts in all else); "known" is how many of those the
-learned body knows to hold, the others are refused. Every length and tension sensor dies in turn
-(reads 0): the error counts from the isolation on, or from the fault if there is none. Five hours
-of healthy exploration, over all individuals, with 3.6 kg grasped and released each minute and a
-push of 10 to 30 N for a second every ten: isolations there are wrong.
+true body can hold without the muscle, a minute at most until it rests (which share of all that it
+holds with it is "held"; where that is none, the muscle has no targets and counts in all else);
+"known" is how many of those the learned body knows to hold, the others are refused. Every length
+and tension sensor dies in turn (reads 0): the error counts from the isolation on, or from the fault
+if there is none. Five hours of healthy exploration, over all individuals, with 3.6 kg grasped and
+released each minute and a push of 10 to 30 N for a second every ten: isolations there are wrong.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ EVERY = 10  # messages of the held-out motion
 TARGETS = 2
 #: [s] before a fault, at most until it is isolated, and after that
 MOVING, DECIDED, AFTERWARDS = 12.0, 10, 6.0
-GOING, SETTLING = 30.0, 4.0  # [s] to a target at most (winches slow it), and there
+#: [s] to a target at most (winches slow it, and an arm that falls is sent again), and at rest there;
+#: what rests turns no joint by more than this in a second [rad]
+GOING, SETTLING, STILL = 60, 4, 0.02
 HEALTHY_TIME = 18_000.0  # [s] over all individuals
 PUSH_EVERY, PUSH = 10.0, (10.0, 30.0)  # [s], [N]
 
@@ -144,11 +146,14 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
     for theta in held[:TARGETS]:
         try:
             loop.core.target({n: (a, 0.0) for n, a in zip(robot.joints, theta.tolist())})
-            for _ in range(round(GOING)):
-                loop.run(1.0)
-                if not loop.core.motion.moving:
+            rested, before = 0, loop.arm.theta
+            for _ in range(GOING):
+                if rested == SETTLING:
                     break
-            loop.run(SETTLING)
+                loop.run(1.0)
+                still = np.abs(loop.arm.theta - before).max() < STILL
+                rested = rested + 1 if still and not loop.core.motion.moving else 0
+                before = loop.arm.theta
             ended.append(float(np.linalg.norm(loop.arm.theta - theta)))
         except MessageError:
             ended.append(None)
