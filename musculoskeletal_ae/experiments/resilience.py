@@ -45,7 +45,7 @@ EVERY = 10  # messages of the held-out motion
 TARGETS = 2
 #: [s] before a fault, at most until it is isolated, and after that
 MOVING, DECIDED, AFTERWARDS = 12.0, 10, 6.0
-#: [s] to a target at most (winches slow it, and an arm that falls is sent again), and at rest there;
+#: [s] to a target at most (winches slow it; an arm that falls is sent again), and at rest there;
 #: what rests turns no joint by more than this in a second [rad]
 GOING, SETTLING, STILL = 60, 4, 0.02
 HEALTHY_TIME = 18_000.0  # [s] over all individuals
