@@ -50,7 +50,6 @@ from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.experiments import plots, touch
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, times
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -314,22 +313,5 @@ def motion_hand(_: Study, rows: Rows) -> Plot:
     return figure, f'Circles of the hand at {SPEED} m/s by target_pose, individual {seed}.'
 
 
-ROWS = (
-    Row('motions of 1 s, tracking [rad]', NOTHING, '', 'track_1s_rad', '', 0.10),
-    Row('motions of 2 s, tracking [rad]', NOTHING, '', 'track_2s_rad', '', 0.06),
-    Row('0.5 s after a motion [rad]', NOTHING, '', 'settled_rad', '', 0.05),
-    Row('from a target to within 0.05 rad of it [s]', NOTHING, '', 'settle_s', '', 2.0, 2),
-    Row('‖T‖ of motions beside the inverse dynamics’ least [ratio]', NOTHING, '', 'tension_ratio',
-        '', 1.15, 2),
-    Row('‖T‖ of motions beside the least with winches’ drag and friction [ratio]', NOTHING, '',
-        'tension_ratio_attainable', '', None, 2),
-    Row('circles of 10 cm by `target_pose` at 0.1 m/s [m]', NOTHING, '', 'hand_circle_m', '', 0.01),
-    Row('force of pushes, 10 to 50 N, error [share]', NOTHING, '', 'wrench_error', '', 0.2),
-    Row('their direction, error [degrees]', NOTHING, '', 'wrench_error_deg', '', 15.0, 1),
-    Row('time until a collision in motion is noticed, median [s]', NOTHING, '', 'collision_s', '',
-        0.1, 2),
-    Row('false contacts in a healthy hour', NOTHING, '', 'false_contacts', '', 0.0, 0),
-    Row('drift of a floating arm in 30 s [rad]', NOTHING, '', 'float_drift_rad', '', 0.05),
-)  # fmt: skip
 PLOTS = motion, motion_hand, touch.forces
-EXPERIMENT = Experiment(__doc__, measure, PLOTS, 16.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, PLOTS, 16.0)
