@@ -76,6 +76,8 @@ def run(args: Namespace) -> int:
     robot, notes, errors = import_robot(args.file, args.out, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
+    for told in robot.description.joint_notes:
+        print(f'coupled: {told}')
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
     print(length_verdict(errors))

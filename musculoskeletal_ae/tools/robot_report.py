@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.checks import (
     RobotCheck,
     check_robot,
 )
-from musculoskeletal_ae.robot.description import RobotDescription, shown
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.suggestion import suggest, write
@@ -64,7 +64,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     lines = [
         f'{robot.description.directory}',
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',
-        *joint_notes(robot.description),
+        *robot.description.joint_notes,
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
@@ -87,17 +87,6 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             spread = np.percentile(values, [0, 5, 50, 100])
             lines.append(f'{title:<44}' + ''.join(f'{value:9.1f}' for value in spread))
     return '\n'.join(lines)
-
-
-def joint_notes(description: RobotDescription) -> list[str]:
-    """Return lines that name the joints which are not in θ: coupled ones, and those held fixed."""
-    lines = [
-        f'{joint} = {c.ratio:g} · {c.master}' + (f' {c.offset:+g}' if c.offset else '')
-        for joint, c in description.couplings.items()
-    ]
-    if held := ', '.join(description.held_joints):
-        lines.append(f'held fixed at 0: {held}')
-    return lines
 
 
 def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
