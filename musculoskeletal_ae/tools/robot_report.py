@@ -45,7 +45,10 @@ def check(args: Namespace) -> int:
     if not (count and args.suggest):
         return 1 if count else 0
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
-    far = 1e3 * np.linalg.norm(change, axis=1)
+    far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
+    if not before:
+        print('no via point is to blame, nothing is written')
+        return 1
     if after:
         print(f'no sound arm was found within {1e3 * args.reach:g} mm; the best is', end=' ')
         if after >= before:
@@ -53,6 +56,10 @@ def check(args: Namespace) -> int:
             return 1
     write(robot, change, args.out)
     print(f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, up to {far.max():.1f} mm')
+    for m, name in enumerate(robot.muscles):
+        own = routes.muscle == m
+        if (moved := far[np.union1d(routes.first[own], routes.second[own])]).any():
+            print(f'    {name}, point by point: {", ".join(f"{each:.1f}" for each in moved)} mm')
     return check(Namespace(**{**vars(args), 'robot': args.out, 'plot': None, 'suggest': False}))
 
 
