@@ -110,6 +110,10 @@ class ClosedLoop:
         self.core.target({name: (angle, 0.0) for name, angle in joints})
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()
+        self.check()
+
+    def check(self) -> None:
+        """Raise a MusculoskeletalError if the controller has stopped."""
         if self.core.safety.cause:
             raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
 

@@ -28,7 +28,6 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae.mae import Mae
@@ -124,12 +123,4 @@ def sensors(_: Study, rows: Rows) -> Plot:
     )
 
 
-ROWS = (
-    Row('learned with all joint sensors [rad]', NOTHING, '', 'all_rad', '', 0.035),
-    Row('learned with the elbow’s sensors only [rad]', NOTHING, '', 'elbow_only_rad', '', 0.05),
-    Row('learned without joint sensors [rad]', NOTHING, '', 'none_rad', '', 0.09),
-    Row('… and a marker in one of ten samples [rad]', NOTHING, '', 'marker_tenth_rad', '', 0.045),
-    Row('… and an accelerometer on the hand [rad]', NOTHING, '', 'imu_rad', '', 0.06),
-    Row('true angles in the ellipsoid of 95 %', NOTHING, '', 'ellipsoid_share', digits=2),
-)  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (sensors,), 24.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (sensors,), 24.0)
