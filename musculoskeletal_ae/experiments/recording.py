@@ -108,6 +108,10 @@ class ClosedLoop:
         """
         self.target(theta)
         self.wait(duration)
+        self.check()
+
+    def check(self) -> None:
+        """Raise a MusculoskeletalError if the controller has stopped."""
         if self.core.safety.cause:
             raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
 

@@ -37,7 +37,8 @@ Results = Mapping[str, Mapping[str, Any]]
 
 #: counted in all, not per individual: the hour of healthy motion is spread over the seeds
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts', 'paper_false_alarms')
-TOTALS = (*ALARMS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
+ISOLATIONS = ('wrong_isolations', 'acquittals')
+TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 DIGITS = 6  # significant; more is noise
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
@@ -125,8 +126,9 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for key, first in (rows[0] if rows else {}).items():
+    for key in dict.fromkeys(key for row in rows for key in row):
         values = [row[key] for row in rows if key in row]
+        first = values[0]
         if isinstance(first, Mapping):
             result[key] = _mean(values)
         elif None in values:
