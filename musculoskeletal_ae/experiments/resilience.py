@@ -11,9 +11,9 @@ other, is isolated as broken within 10 s. After that `proposed` goes to random p
 true body can hold without the muscle (which share of all that it holds with it is "held"; where
 that is none, the muscle has no targets and counts in all else); "known" is how many of those the
 learned body knows to hold, the others are refused. Every length and tension sensor dies in turn
-(reads 0): the error counts from the isolation on, or from the fault if there is none. Five hours of
-healthy exploration, over all individuals, with 3.6 kg grasped and released each minute and a push
-of 10 to 30 N for a second every ten: isolations there are wrong.
+(reads 0): the error counts from the isolation on, or from the fault if there is none. Five hours
+of healthy exploration, over all individuals, with 3.6 kg grasped and released each minute and a
+push of 10 to 30 N for a second every ten: isolations there are wrong.
 """
 
 from __future__ import annotations
