@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A day of learning in an hour or two: does the error stay down, do memory and time stay flat?
 
-python -m bench.soak [--hours 24] [--quick]
+python -m bench soak [--hours 24] [--creep 1] [--moving 60] [--quick]
 
 The emulated arm explores on and on; every message goes through the learner. To fit a day into an
 hour or two it updates after every `--every`-th sample only (the first ones after each), where the
-node updates after each: so many fewer updates are judged than a day would bring. One line per
+node updates after each: so many fewer updates are judged than a day would bring. With --moving it
+moves for less of every five minutes, with --creep all wires get longer meanwhile. One line per
 report: robot time, samples, held-out error, d's threshold, memory, time of an update.
 
 Exit status 1 if the error ever rose by more than a fifth over its least, memory by more than a
@@ -112,6 +113,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--hours', type=float, default=24.0, help='of robot time')
     parser.add_argument('--quick', action='store_true', help='two hours, to try things out')
     parser.add_argument('--every', type=int, default=20, help='samples between updates')
+    parser.add_argument('--creep', type=float, default=0.0, help='of every wire [mm/h]')
+    parser.add_argument('--moving', type=float, default=PART, help='of every five minutes [s]')
     parser.add_argument('--steps', type=int, default=STEPS, help='of training per update')
     parser.add_argument('--seed', type=int, default=0, help='which individual')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
@@ -126,19 +129,23 @@ def main(argv: list[str] | None = None) -> int:
     training.every = args.every
     arm = EmulatedArm(robot, args.seed)
     least, worst, reopened = np.inf, 0.0, 0
-    messages = reported = 0
+    reported = 0
     filled = most = 0.0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        stream = record(arm, mae, part, PART)
-        for tension, length, theta in zip(stream.tension, stream.length, stream.theta_sensor):
+        # A longer wire has to be wound in further, so that it reads as a shorter muscle.
+        crept = np.full(robot.muscle_count, -1e-3 * args.creep * PART / 3600.0 * part)
+        arm.set_length_offset(crept)
+        stream = record(arm, learner.mae, part, args.moving)
+        for n, row in enumerate(zip(stream.tension, stream.length, stream.theta_sensor)):
+            tension, length, theta = row
             accepted, update = learner.samples.accepted, learner.last_update
-            messages += 1
-            learner.step(messages * SAMPLE_TIME, theta, tension, length)
+            learner.step(PART * part + n * SAMPLE_TIME, theta, tension, length)
             training.samples += learner.samples.accepted - accepted
             if learner.last_update is not None and learner.last_update is not update:
                 reopened += bool(learner.last_update.changed)
         now = PART * (part + 1)
-        error = estimation_error(learner.mae, held_out, 10)
+        shifted = held_out._replace(length=held_out.length + crept)
+        error = estimation_error(learner.mae, shifted, 10)
         if now >= SETTLED:
             least, worst = min(least, error), max(worst, error / least)
         if now == FILLED:

@@ -36,7 +36,6 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach, safety
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.heat import Heat
 from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
 from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl
@@ -44,6 +43,7 @@ from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles,
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
+from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.presets import PRESETS
@@ -144,7 +144,7 @@ class Controller:
         if settings.method != before.method and not self.posture.exploring:
             self._starts, self._follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
-            self.posture.start()
+            (self.motion.plan_anew if self._follows else self.posture.start)()
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
@@ -416,7 +416,8 @@ class Controller:
     def report(self, now: float) -> Report:
         """Say what control is doing and what is in its way."""
         chosen, posture, robot = self.settings, self.posture, self._robot
-        solution, missing = posture.solution, np.zeros(0)
+        solution = self.motion.solution if self._follows else posture.solution
+        missing = np.zeros(0)
         values, warnings = {'method': chosen.method, 'preset': chosen.preset}, []
         if self.clamped:
             values['target clamped at'] = ', '.join(self.clamped)
@@ -456,8 +457,6 @@ class Controller:
         if np.isfinite(core := self.heat.core).any():
             windings = (f'{n} {c:.0f} °C' for n, c in zip(robot.muscles, core))
             values['temperature of windings'] = ', '.join(windings)
-        for m, how in self.heat.changed.items():
-            warnings.append(f'heat: {robot.muscles[m]} {how}')
         limited = zip(robot.muscles, self.limit, robot.tension.limit)
         hot = {name: limit for name, limit, most in limited if limit < most}
         if hot:

@@ -17,29 +17,12 @@ ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chose
 
 
 class EmulatedArm(Arm):
-    """Rigid bodies by pinocchio, muscles by `mechanics`, modules by `modules`, faults on request.
+    """Rigid bodies by pinocchio, muscles by `mechanics`, modules and faults by `modules`."""
 
-    Attributes:
-        individual: The true body that `seed` picked.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        seed: int = 0,
-        individual: Individual | None = None,
-        command_timeout: float = 0.5,
-    ) -> None:
-        """Build an arm at rest, modules safe.
-
-        Args:
-            robot: The description's nominal body.
-            seed: Which individual, and its sensor noise.
-            individual: The true body; drawn from `seed` by default.
-            command_timeout: Seconds without a command until the modules go safe.
-        """
+    def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
+        """Build an individual of a robot at rest, modules safe; `seed` is of its noise, too."""
         self.individual = individual or Individual(robot, seed)
-        super().__init__(robot, seed, self.individual.length_bias, command_timeout)
+        super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
         self._model.armature = np.full(self._model.nv, ARMATURE)
@@ -52,39 +35,24 @@ class EmulatedArm(Arm):
         true, zero = self.individual, self.individual.length_at_zero
         span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - zero
         self._wound = self._modules(span, true.elastic.elongation(zero, robot.tension.max))
-        tree_joints, segments = len(self.individual.tree.parent), len(self.individual.routes.first)
-        self._scratch = mechanics.Scratch(
-            np.zeros((tree_joints, 3, 3)),
-            np.zeros((tree_joints, 3)),
-            np.zeros((tree_joints, 3)),
-            np.zeros(self.individual.routes.point.shape),
-            np.zeros(robot.muscle_count),
-            np.zeros((segments, 3)),
-            np.zeros((segments, 3)),
-            np.zeros(3),
-        )
+        points, joints = true.routes.point.shape, len(true.tree.parent)
+        ends = len(true.routes.first), 3
+        shapes = (joints, 3, 3), (joints, 3), (joints, 3), points, robot.muscle_count, ends, ends, 3
+        self._scratch = mechanics.Scratch(*map(np.zeros, shapes))
         self._joint = mechanics.JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self._angles, self._rates = self._joint.q, self._joint.velocity
         self.reset()
 
     def _constants(self) -> mechanics.Body:
-        robot, true = self.robot, self.individual
+        robot, true, unit = self.robot, self.individual, self.individual.elastic
         # Joints that follow others have no friction and no stops of their own.
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
         friction[self._order] = true.joint_friction
         lower[self._order], upper[self._order] = robot.lower, robot.upper
         return mechanics.Body(
-            true.elastic.force,
-            true.elastic.rate,
-            true.elastic.wire_stretch,
-            true.length_at_zero,
-            true.cable_friction,
-            friction,
-            lower,
-            upper,
-            true.tension_gain,
-            true.tension_bias,
-        )
+            unit.force, unit.rate, unit.wire_stretch, true.length_at_zero, true.cable_friction,
+            true.tension_gain, true.tension_bias, friction, lower, upper,
+        )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:
         for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
@@ -98,22 +66,11 @@ class EmulatedArm(Arm):
         self._model.inertias[self._effector_joint] = self._bare_inertia + placed
 
     def _step(self) -> None:
-        acceleration = self._acceleration()
         mechanics.muscle_step(
-            self.individual.tree,
-            self.individual.routes,
-            self._body,
-            self._wound,
-            self._muscle,
-            self._joint,
-            self._scratch,
-            self._kind,
-            self._command,
-            self._wrench,
-            self._effector,
-            self._effector_joint,
-            acceleration,
-        )
+            self.individual.tree, self.individual.routes, self._body, self._wound, self._muscle,
+            self._joint, self._scratch, self._kind, self._command, self._wrench, self._effector,
+            self._effector_joint, self._acceleration(),
+        )  # fmt: skip
 
     def _acceleration(self) -> Array:
         """Return q̈ of the tree; of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h)."""

@@ -88,27 +88,14 @@ class ForeignBody:
 
 
 class ForeignArm(Arm):
-    """An arm of MuJoCo.
-
-    Attributes:
-        individual: The true body that `seed` picked.
-        effects: How much is wrong with it.
-    """
+    """An arm of MuJoCo."""
 
     def __init__(
-        self,
-        robot: Robot,
-        seed: int = 0,
-        effects: Effects | None = None,
-        file: Path | None = None,
+        self, robot: Robot, seed: int = 0, effects: Effects | None = None, file: Path | None = None
     ) -> None:
-        """Build an arm at rest, modules safe.
+        """Build an individual at rest, modules safe; effects are as calibrated by default.
 
-        Args:
-            robot: The description's nominal body.
-            seed: Which individual, and its sensor noise.
-            effects: How much is wrong with it; as calibrated by default.
-            file: A user's own MJCF arm instead, which has its own effects and none of ours.
+        A `file` is a user's own MJCF arm instead, which has its own effects and none of ours.
 
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.

@@ -12,7 +12,7 @@ Joint friction is Dahl's as well, so that the arm rests where it rubs, without c
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
 
 from numba import njit
 
@@ -35,41 +35,18 @@ VISCOUS = 0.5  # [N·m·s/rad] or [N·s/m]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
 
 
-class Body(NamedTuple):
-    """Constants of one individual, as the compiled step wants them (orders of the tree)."""
-
-    force: Array
-    rate: Array
-    wire_stretch: Array
-    length_at_zero: Array
-    cable_friction: Array
-    joint_friction: Array
-    lower: Array
-    upper: Array
-    sensor_gain: Array
-    sensor_offset: Array
-
-
-class JointState(NamedTuple):
-    """q, q̇, friction state in [−1, 1], and generalised torque, each (D,) in tree order."""
-
-    q: Array
-    velocity: Array
-    sticking: Array
-    torque: Array
-
-
-class Scratch(NamedTuple):
-    """Work arrays, so that a step allocates nothing."""
-
-    rotation: Array
-    translation: Array
-    axis: Array
-    world: Array
-    absolute: Array
-    leave: Array  # unit pulls at the ends of each segment, (S, 3)
-    arrive: Array
-    point: Array
+#: Constants of one individual, as the compiled step wants them: elastic units, wires and sensors of
+#: M muscles, friction and stops of the J−1 joints of the tree.
+Body = namedtuple(
+    'Body',
+    'force rate wire_stretch length_at_zero cable_friction sensor_gain sensor_offset '
+    'joint_friction lower upper',
+)
+#: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
+JointState = namedtuple('JointState', 'q velocity sticking torque')
+#: Work arrays, so that a step allocates nothing: poses of the joints; route points and lengths;
+#: unit pulls at the ends of each segment, (S, 3); a point.
+Scratch = namedtuple('Scratch', 'rotation translation axis world absolute leave arrive point')
 
 
 @njit(cache=True)
@@ -96,36 +73,15 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def muscle_step(
-    tree: Tree,
-    routes: WrappedRoutes,
-    body: Body,
-    modules: Modules,
-    muscle: MuscleState,
-    joint: JointState,
-    scratch: Scratch,
-    kind: int,
-    command: Command,
-    wrench: Array,
-    effector: Array,
-    effector_joint: int,
-    acceleration: Array,
-) -> None:
+    tree: Tree, routes: WrappedRoutes, body: Body, modules: Modules, muscle: MuscleState,
+    joint: JointState, scratch: Scratch, kind: int, command: Command, wrench: Array,
+    effector: Array, effector_joint: int, acceleration: Array,
+) -> None:  # fmt: skip
     """Move joints and motors by one STEP and leave the generalised torque in joint.torque.
 
-    Args:
-        tree: Kinematic tree.
-        routes: True routes.
-        body: Constants of the individual.
-        modules: Constants of its muscle modules.
-        muscle: Muscle state, changed.
-        joint: Joint state, changed.
-        scratch: Work arrays.
-        kind: SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
-        command: What the modules follow.
-        wrench: External force and torque on the end effector, axes of the root link, shape (6,).
-        effector: End effector in its joint's frame [m], shape (3,).
-        effector_joint: Tree joint that carries it.
-        acceleration: q̈ from the rigid-body dynamics, shape (D,).
+    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `wrench` the force and torque on the end
+    effector, axes of the root link, (6,), which stands at `effector` [m] in its joint's frame;
+    `acceleration` q̈ from the rigid-body dynamics, (J−1,).
     """
     for i in range(joint.q.shape[0]):
         joint.velocity[i] += STEP * acceleration[i]
@@ -193,13 +149,9 @@ def _friction_and_stops(body: Body, joint: JointState) -> None:
 
 @njit(cache=True)
 def _external_wrench(
-    tree: Tree,
-    joint: JointState,
-    scratch: Scratch,
-    wrench: Array,
-    effector: Array,
+    tree: Tree, joint: JointState, scratch: Scratch, wrench: Array, effector: Array,
     effector_joint: int,
-) -> None:
+) -> None:  # fmt: skip
     point = scratch.point
     for r in range(3):
         point[r] = scratch.translation[effector_joint, r]

@@ -155,27 +155,18 @@ def noisy(value: Array, noise: float, resolution: float, rng: np.random.Generato
 
 
 class Arm(ABC):
-    """An arm that plays reality behind the topics.
+    """An arm that plays reality behind the topics."""
 
-    Attributes:
-        robot: The geometric model that the description gives.
-        individual: The true body that `seed` picked.
-        command_timeout: Seconds without a command until the modules go safe.
-        faults: Of wires, motors and sensors.
-    """
-
-    individual: Any
+    individual: Any  # the true body that a seed picked
     #: angles and velocities of all joints, and where those of θ stand in either
     _angles: Array
     _rates: Array
     _order: Ints
 
-    def __init__(
-        self, robot: Robot, seed: int, length_bias: Array, command_timeout: float = 0.5
-    ) -> None:
+    def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
         """Build the modules, whose length sensors are off by `length_bias` [m] (M,)."""
         self.robot, self._length_bias = robot, length_bias
-        self.command_timeout = command_timeout
+        self.command_timeout = 0.5  # [s] without a command until the modules go safe
         self._rng = np.random.default_rng([seed, 0x5E45])
         self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))

@@ -16,15 +16,11 @@ KIN, FOREIGN = 'kin', 'foreign'
 
 
 def make_arm(robot: Robot, seed: int = 0, reality: str = KIN, friction: bool = True) -> Arm:
-    """Return an arm at rest.
+    """Return an individual at rest, or the same body without friction in wires and joints.
 
-    Args:
-        robot: The description's nominal body.
-        seed: Which individual.
-        reality: 'kin', the first body, which differs from its model in what the learner fits;
-            'foreign', the second one, whose mechanics are foreign too; or a user's MJCF file, whose
-            joints and tendons have the names of the robot's joints and muscles.
-        friction: False: the same body otherwise, without friction in wires and joints.
+    Realities are 'kin', the first body, which differs from its model in what the learner fits;
+    'foreign', the second one, whose mechanics are foreign too; or a user's MJCF file, whose joints
+    and tendons have the names of the robot's joints and muscles.
 
     Raises:
         MusculoskeletalError: If there is no such reality, or the robot's names are not in the file.

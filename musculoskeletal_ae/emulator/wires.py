@@ -49,13 +49,7 @@ class Springs:
     """Laws of M elastic units with their wires: elongation as a table over tension, from 0 on."""
 
     def __init__(self, robot: Robot, at_zero: Array, draw: Draw) -> None:
-        """Draw the laws; the data sheet's is what the description says of it.
-
-        Args:
-            robot: Its data sheet.
-            at_zero: Lengths of the wires [m], (M,).
-            draw: Draws of the individual.
-        """
+        """Draw the laws of wires of a length at θ = 0 [m], (M,); the robot is the data sheet."""
         sheet, limit, count = robot.series_elastic, robot.tension.limit, robot.muscle_count
         self.tension: Array = np.linspace(0.0, 1.5, KNOTS)[:, None] * robot.tension.max
         share = self.tension / limit
@@ -124,15 +118,9 @@ Guides = namedtuple('Guides', 'tendon point kind start count site body turn plac
 def make_wires(
     robot: Robot, springs: Springs, at_zero: Array, span: Array, bend: Array, draw: Draw
 ) -> Wires:
-    """Draw the constants of wires.
+    """Draw the constants of wires of a length at θ = 0 [m] (M,), bent at mid-range [rad] (M,).
 
-    Args:
-        robot: Its data sheet.
-        springs: Laws of the elastic units.
-        at_zero: Lengths of the routes at θ = 0 [m], (M,).
-        span: How much longer they are in N postures, (N, M).
-        bend: By how much they are bent at mid-range [rad], (M,).
-        draw: Draws of the individual.
+    `span` is how much longer their routes are in N postures [m], (N, M).
     """
     count, full, rng = robot.muscle_count, robot.tension.max, draw.rng('spool')
     about = 'hysteresis', 'creep', 'stiction', 'spool_layer', 'eccentricity'

@@ -42,8 +42,7 @@ class WrappedRoutes(NamedTuple):
 @njit(cache=True)
 def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array) -> None:
     """Fill rotation (J, 3, 3), translation (J, 3), axis (J, 3) of all joints for q (J−1,)."""
-    rotation[0] = np.eye(3)
-    translation[0] = 0.0
+    rotation[0], translation[0], placed = np.eye(3), 0.0, np.zeros(3)
     for i in range(1, tree.parent.shape[0]):
         up = tree.parent[i]
         ux, uy, uz = tree.axis[i]
@@ -63,19 +62,14 @@ def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: 
             axis[i, r] = 0.0
             for k in range(3):
                 translation[i, r] += rotation[up, r, k] * tree.translation[i, k]
-                placed = 0.0
+                placed[k] = 0.0
                 for j in range(3):
-                    placed += rotation[up, r, j] * tree.rotation[i, j, k]
-                axis[i, r] += placed * tree.axis[i, k]
-        for r in range(3):
+                    placed[k] += rotation[up, r, j] * tree.rotation[i, j, k]
+                axis[i, r] += placed[k] * tree.axis[i, k]
             for c in range(3):
-                total = 0.0
+                rotation[i, r, c] = 0.0
                 for k in range(3):
-                    placed = 0.0
-                    for j in range(3):
-                        placed += rotation[up, r, j] * tree.rotation[i, j, k]
-                    total += placed * turn[k, c]
-                rotation[i, r, c] = total
+                    rotation[i, r, c] += placed[k] * turn[k, c]
         if tree.prismatic[i]:
             for r in range(3):
                 translation[i, r] += axis[i, r] * q[i - 1]

@@ -10,6 +10,10 @@ What was detected first names the suspect for as long as the latch holds. With `
 isolate` the suspect is isolated at once and verified (`verification`), also one whose length has
 jumped: if it is broken it stays isolated, else it is used again, and either way the anomaly is
 over. The robot in here is the estimator's own: its isolated muscles are those of which it knows.
+
+A module whose thermal constants drift (`heat`) is an anomaly too. It latches where the winding is
+hot; a cool arm is not stopped for it, but the suspect is named all the same, until `reset` takes
+the module as it is.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
 from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.plausibility import SLACK
@@ -52,6 +57,8 @@ STILL_TIME, MOVED = 1.0, 0.006  # [s], [m]
 SILENT = 0.15  # [s]
 # So many suspects that turn out healthy within so many seconds, and the arm stays stopped.
 ACQUITTALS, WITHIN = 2, 60.0
+# A winding below this may warm as it likes: the arm is not stopped for it.
+COOL = 60.0  # [°C]
 
 
 class Estimate(NamedTuple):
@@ -80,6 +87,7 @@ class Estimator:
         self._silent: tuple[int | None, float] = None, 0.0  # the one muscle without numbers, since
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
+        self.heat = Heat(robot)
         self._external = ExternalTorque(robot)
         self._touch: Touch | None = None
         self._contacts = 0
@@ -141,17 +149,23 @@ class Estimator:
         self.detector.judges, self._verdict = False, None
         self.reset()
 
-    def step(self, tension: Array, length: Array, time: float, now: float) -> Estimate | None:
-        """Return the estimate from measured T [N] (M,) and read l [m] (M,).
+    def step(
+        self, tension: Array, length: Array, time: float, now: float,
+        temperature: Array | None = None,
+    ) -> Estimate | None:  # fmt: skip
+        """Return the estimate from measured T [N], read l [m] and temperatures [°C], (M,) each.
 
         None without a network, or while nothing is known of the zeros of l.
         """
+        since, self._time = max(time - self._time, 0.0), time
+        if temperature is not None:
+            self.heat.step(tension, np.where(self._robot.used, temperature, np.nan), since)
         if self.mae is None:
             return None
-        dt = min(max(time - self._time, 0.0), LONGEST_PERIOD)
-        if time - self._time > SILENCE:
+        dt = min(since, LONGEST_PERIOD)
+        if since > SILENCE:
             self._external.reset()
-        self._time, self._stepped_at, self._silent = time, now, (None, 0.0)
+        self._stepped_at, self._silent = now, (None, 0.0)
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
             self._command = None
@@ -169,6 +183,9 @@ class Estimator:
         if still is not None and not verdict.cause:
             why = 'a sensor stands still while the arm moves'
             verdict = verdict._replace(suspect=still, cause=why)
+        for m, how in self.heat.changed.items():
+            if self.heat.core[m] > COOL and not verdict.cause:
+                verdict = verdict._replace(suspect=m, cause=f'its module {how}')
         detected = bool(verdict.cause) and not self.cause
         if detected:
             self._suspect = self._robot.muscles[verdict.suspect]
@@ -287,6 +304,7 @@ class Estimator:
     def reset(self) -> None:
         """Clear the anomaly."""
         self.cause = self._suspect = ''
+        self.heat.accept()
         suspect, self._verification = self._verification, None
         if suspect is not None:  # whoever resets it says that it is sound
             self.isolate(m for m in self._robot.isolated if m != suspect.muscle)
@@ -314,11 +332,13 @@ class Estimator:
             values['isolated muscles'] = isolated
         if self.verified:
             values['last verified'] = self.verified
+        drifting = {self._robot.muscles[m]: how for m, how in self.heat.changed.items()}
         if self._verdict is not None:
+            named = next(iter(drifting), self._robot.muscles[self._verdict.suspect])
             values |= {
                 'A': f'{self._verdict.anomaly:.4f}',
                 'd': f'{self._verdict.distance:.1f}',
-                'suspect muscle': self._suspect or self._robot.muscles[self._verdict.suspect],
+                'suspect muscle': self._suspect or named,
             }
             if self.detector.calibrated:
                 letter = 'd' if self.detector.whitened else 'A'
@@ -343,6 +363,9 @@ class Estimator:
         if self._zeroing is not None:
             return Report('warn', f'finding the length zeros: {self._zeroing.progress}', values)
         calibrated = '' if self.detector.calibrated else ', uncalibrated'
+        if drifting:
+            told = (f'{name}: its module {how}' for name, how in drifting.items())
+            return Report('warn', f'anomaly of a cool muscle: {"; ".join(told)}', values)
         if isolated:
             return Report('warn', f'estimating{calibrated} without {isolated}', values)
         return Report('ok', f'estimating{calibrated}', values)

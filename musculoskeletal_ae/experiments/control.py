@@ -31,7 +31,6 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.tension import holding_tension
 
@@ -204,17 +203,4 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
     return figure
 
 
-OTHERS = {'geometric': NOTHING, **dict.fromkeys(('first', 'second'), 'far below `geometric`')}
-ROWS = (
-    *(Row(f'`{name}`, distance from θ_eval [rad]', paper, '', f'{name}.error_rad')
-      for name, paper in OTHERS.items()),
-    Row('`proposed`, distance from θ_eval [rad]', 'as `second`',
-        'proposed_paper.error_rad', 'proposed.error_rad', '', 0.06),
-    *(Row(f'`{name}`, ‖T‖ [N]', NOTHING, '', f'{name}.tension_n', f'{name}.bound_reached_n',
-          digits=0) for name in OTHERS),
-    Row('`proposed`, ‖T‖ [N]', 'below `first`, `second`', 'proposed_paper.tension_n',
-        'proposed.tension_n', 'proposed.bound_reached_n', digits=0),
-    Row('`proposed`, ‖T‖ beside the QP bound at θ_eval [ratio]', NOTHING,
-        'proposed_paper.tension_to_bound', 'proposed.tension_to_bound', '', 1.1, 2),
-)  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (control, control_all), 22.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (control, control_all), 22.0)

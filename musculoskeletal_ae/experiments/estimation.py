@@ -50,7 +50,6 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.roles import plotted
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 
 HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
@@ -278,31 +277,5 @@ def baselines(study: Study, rows: Rows) -> Plot:
     )
 
 
-ROWS = (
-    *(
-        Row(f'{name}, {when} learning [rad]', NOTHING, '', f'baselines.{key}.{when}_rad')
-        for name, key in (
-            ('least squares on the geometric model', 'geometric model, least squares'),
-            ('polynomial mapping and EKF', 'polynomial mapping, EKF'),
-            ('table search', 'table search'),
-        )
-        for when in ('before', 'after')
-    ),
-    Row('estimate before learning, 3.6 kg in the hand [rad]', NOTHING,
-        '', 'before_payload_rad'),
-    Row('estimate after learning, 3.6 kg in the hand [rad]', '≈ 0.186',
-        '', 'after_payload_rad', '', 0.10),
-    Row('A before learning, healthy at most', NOTHING, '', 'a_before_healthy_max', digits=2),
-    Row('A before learning, muscle cut', 'hardly rises', '', 'a_before_ruptured_min', digits=2),
-    Row('A after learning, healthy at most', NOTHING, '', 'a_healthy_max', digits=2),
-    Row('A after learning, muscle cut', 'rises', '', 'a_ruptured_min', digits=2),
-    Row('time until a cut muscle is noticed, slowest muscle [s]', NOTHING,
-        '', 'detection_worst_s', '', 0.5, 2, worst=True),
-    Row('cut muscle named rightly [share]', NOTHING,
-        '', 'named_share', '', 0.9, 2, more_is_better=True),
-    Row('false alarms in the healthy time', NOTHING,
-        '', 'false_alarms', '', 0.0, 0),
-    Row('AUROC of the detector', NOTHING, '', 'auroc', '', None, 4),
-)  # fmt: skip
 PLOTS = (appearance, grasp_and_cut, tracking, cuts, baselines)
-EXPERIMENT = Experiment(__doc__, measure, PLOTS, 7.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, PLOTS, 7.0)

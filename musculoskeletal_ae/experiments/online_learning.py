@@ -41,7 +41,6 @@ from musculoskeletal_ae.experiments.recording import (
     times,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
@@ -264,16 +263,4 @@ def online_learning(study: Study, rows: Rows) -> Plot:
     )
 
 
-ROWS = (
-    Row('estimate, held-out motion, before learning [rad]', '0.414',
-        'paper_before_rad', 'before_rad', 'oracle_rad'),
-    Row('estimate, held-out motion, after learning [rad]', '0.186',
-        'paper_after_rad', 'after_rad', 'oracle_rad', 0.10),
-    Row('error while exploring, exponential fit, start [rad]', '0.324',
-        'paper_fit_start_rad', 'fit_start_rad'),
-    Row('error while exploring, exponential fit, end [rad]', '0.154',
-        'paper_fit_end_rad', 'fit_end_rad'),
-    Row('samples at rest until the error is halved', NOTHING,
-        'paper_samples_to_halve', 'samples_to_halve', digits=0),
-)  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (online_learning, initial_training), 16.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (online_learning, initial_training), 16.0)

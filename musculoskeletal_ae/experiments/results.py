@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a call leaves in its folder: result.json and plots of every experiment, the results table.
+"""What `experiment` does, and leaves in its folder: result.json, plots, report, results table.
 
 python -m musculoskeletal_ae.experiments.results doc/experiments.md
 
@@ -9,31 +9,66 @@ doc/experiments.md` first puts what it measured there.
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import shutil
 import sys
+import tempfile
+import time
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
-from musculoskeletal_ae.experiments.runner import EXPERIMENTS
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study
-from musculoskeletal_ae.experiments.table import Cells, markdown
+from musculoskeletal_ae.experiments.table import NOTHING, ROWS, Cells, individuals, markdown
+from musculoskeletal_ae.robot.robot import Robot
 
 #: result.json of every experiment that was run, by name
 Results = Mapping[str, Mapping[str, Any]]
 
 #: counted in all, not per individual: the hour of healthy motion is spread over the seeds
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts', 'paper_false_alarms')
-TOTALS = (*ALARMS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
+ISOLATIONS = ('wrong_isolations', 'acquittals')
+TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 DIGITS = 6  # significant; more is noise
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
+BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
+TEMPLATE = 'report.html.jinja'  # beside this file
+
+
+def measure(args: Namespace) -> None:
+    """Measure as the options say and write results, plots and report."""
+    start = time.perf_counter()
+    names, robot = args.names, Robot.load(args.robot)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
+        study = Study(
+            robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder), args.reality
+        )
+        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
+
+            def report(share: float, running: str) -> None:
+                bar.n = share
+                bar.set_description_str(running)
+
+            parts = run(study, names, args.jobs, report)
+        files = [*write(study, parts, args.out), write_report(args.out)]
+    if args.readme:
+        files += update_readme(args.readme, args.out)
+    print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
+    measured = read(args.out)
+    if lost := failures({name: measured[name] for name in names}):
+        raise MusculoskeletalError(f'the rest is written, but this failed: {"; ".join(lost)}')
 
 
 def write(
@@ -91,8 +126,9 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for key, first in (rows[0] if rows else {}).items():
+    for key in dict.fromkeys(key for row in rows for key in row):
         values = [row[key] for row in rows if key in row]
+        first = values[0]
         if isinstance(first, Mapping):
             result[key] = _mean(values)
         elif None in values:
@@ -123,9 +159,9 @@ def table(results: Results) -> list[Cells]:
     """Return the lines of the results table, of the experiments that were run."""
     return [
         row.cells(results[name])
-        for name, experiment in EXPERIMENTS.items()
+        for name in EXPERIMENTS
         if name in results
-        for row in experiment.rows
+        for row in ROWS.get(name, ())
     ]
 
 
@@ -167,6 +203,51 @@ def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
     table_text = readme_table(read(kept))
     readme.write_text(f'{head}{BEGIN}{table_text}{END}{rest.split(END)[1]}', encoding='utf-8')
     return [*files, readme]
+
+
+def write_report(folder: Path) -> Path:
+    """Write report.html from all that is in a folder, of this call or an earlier one."""
+    results = read(folder)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(flat=_flat, cell=_cell, individuals=individuals)
+    page = environment.get_template(TEMPLATE).render(
+        results=results,
+        failures=failures(results),
+        measured={name: result for name, result in results.items() if result['seeds']},
+        experiments=EXPERIMENTS,
+        about=next(iter(results.values()))['about'],
+        table=[line for line in table(results) if line.default != NOTHING],
+        images={
+            f'{file.parent.name}/{file.name}': base64.b64encode(file.read_bytes()).decode('ascii')
+            for file in folder.glob('*/*.png')
+        },
+    )
+    file = folder / 'report.html'
+    file.write_text(page, encoding='utf-8')
+    return file
+
+
+def _flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
+    """Return nested numbers by their path."""
+    rows: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows.update(_flat(value, f'{before}{key}.'))
+        else:
+            rows[f'{before}{key}'] = value
+    return rows
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, list):
+        return ' '.join(map(_cell, value))
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
 if __name__ == '__main__':

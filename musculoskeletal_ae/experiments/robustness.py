@@ -40,7 +40,6 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
-from musculoskeletal_ae.experiments.table import NOTHING, Row
 from musculoskeletal_ae.presets import PRESETS
 
 REALITIES = KIN, FOREIGN
@@ -226,20 +225,4 @@ def ablation(_: Study, rows: Rows) -> Plot:
     )
 
 
-ROWS = tuple(
-    row
-    for reality, name in zip(REALITIES, ('first', 'second'), strict=True)
-    for row in (
-        Row(f'{name} body: estimate before learning [rad]', NOTHING,
-            f'{reality}.paper_before_rad', f'{reality}.before_rad', f'{reality}.oracle_rad'),
-        Row(f'{name} body: estimate after learning [rad]', '0.186',
-            f'{reality}.paper_after_rad', f'{reality}.after_rad', f'{reality}.oracle_rad'),
-        Row(f'{name} body: the frozen learner; bound: informed oracle [rad]', NOTHING,
-            '', f'{reality}.frozen_after_rad', f'{reality}.informed_oracle_rad'),
-        Row(f'{name} body: least squares on the geometric model [rad]', NOTHING,
-            '', f'{reality}.least_squares_rad'),
-        Row(f'{name} body: samples until the error is halved', NOTHING,
-            '', f'{reality}.samples_to_halve', digits=0),
-    )
-)  # fmt: skip
-EXPERIMENT = Experiment(__doc__, measure, (robustness, ablation), 40.0, ROWS)
+EXPERIMENT = Experiment(__doc__, measure, (robustness, ablation), 40.0)

@@ -4,8 +4,8 @@
 An individual's sensor streams and learned networks are made once (`online_learning`) and kept in a
 folder; the other experiments read them there, each in its own process if cores allow.
 
-A new experiment is a file beside this one that ends in `EXPERIMENT = Experiment(__doc__, …)`, and a
-line in `runner.EXPERIMENTS`.
+A new experiment is a file beside this one that ends in `EXPERIMENT = Experiment(__doc__, …)`, its
+name in `NAMES`, and what table.yaml says of it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.experiments.table import Row
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -121,4 +120,3 @@ class Experiment(NamedTuple):
     measure: Callable[[Study, int], Measured]  # of the individual of a seed
     plots: tuple[Callable[[Study, Rows], Plot], ...]  # functions named as the files they draw
     weight: float  # how long it takes beside the others; for order and progress bar only
-    rows: tuple[Row, ...] = ()  # of the results table

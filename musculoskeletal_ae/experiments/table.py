@@ -6,6 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from msgspec import Struct
+
+from musculoskeletal_ae.files import read_table
+
 NOTHING = '–'
 
 
@@ -21,13 +25,13 @@ class Cells(NamedTuple):
     verdict: str  # 'met', by how much the aim is missed, or '' without aim or number
 
 
-class Row(NamedTuple):
+class Row(Struct, frozen=True):
     """One quantity of an experiment; keys are paths into its result.json, parts joined by dots."""
 
     quantity: str  # with its unit
-    printed: str  # in the paper, on Musashi
-    paper: str  # key of the value with preset paper, or ''
     default: str  # key of the value with the preset of the run
+    printed: str = NOTHING  # in the paper, on Musashi
+    paper: str = ''  # key of the value with preset paper
     bound: str = ''  # key of what nothing can beat
     aim: float | None = None  # highest value aimed at; lowest, if `more_is_better`
     digits: int = 3
@@ -53,6 +57,10 @@ class Row(NamedTuple):
                 missed = self.aim - number if self.more_is_better else number - self.aim
                 verdict = 'met' if missed <= 0.0 else f'missed by {missed:.{self.digits}f}'
         return Cells(self.quantity, self.printed, paper, default, bound, aim, verdict)
+
+
+#: by experiment
+ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[Row, ...]])
 
 
 def _at(result: Mapping[str, Any], key: str) -> float | None:

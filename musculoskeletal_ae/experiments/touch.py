@@ -3,26 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
-from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import AFTER, MARK, new_figure, tidy
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension
 
 TOUCH_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
+TRIED = 20  # moments for each collision, at most: it hits an arm that moves
 HEALTHY = 3600.0  # [s] over all individuals
 LEAST, MOST = 10.0, 50.0  # [N]
 LIGHT, FIRM = 15.0, 20.0  # [N] of a hand that moves a floating arm
@@ -55,7 +54,7 @@ class FeelingLoop(ClosedLoop):
         """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
-        self.core.target({n: (t, 0.0) for n, t in zip(self.arm.robot.joints, theta.tolist())})
+        self.target(theta)
         for _ in range(round(MOVE / SAMPLE_TIME)):
             self.feel()
 
@@ -82,8 +81,8 @@ def measure(study: Study, seed: int) -> Measured:
         return max(1, round(share * whole))
 
     pushes = list[Push]()
-    for theta in _holdable(robot, rng, count(POSTURES)):
-        loop.rest(theta)
+    for _ in range(count(POSTURES)):
+        loop.rest(_holdable(robot, rng))
         for _ in range(2):
             pushes.append(_pushed(loop, _force(robot, rng, LEAST, MOST)))
     hits, delays = _collisions(loop, rng, count(COLLISIONS))
@@ -99,13 +98,14 @@ def measure(study: Study, seed: int) -> Measured:
         'wrench_error': float(size.mean()),
         'wrench_error_deg': float(angle.mean()),
         'pushes_free_share': float(free.mean()),
-        'collision_s': float(np.median(delays)),
-        'collisions_soon_share': float(soon.mean()),
         'false_contacts': contacts,
         'healthy_touch_s': seconds,
         'float_drift_rad': float(np.max(drift)),
         'float_moved_m': float(np.mean(moved)),
     }
+    if len(hits):
+        numbers['collision_s'] = float(np.median(delays))
+        numbers['collisions_soon_share'] = float(soon.mean())
     if (firm := hits > 0.5 * (LEAST + MOST)).any():
         numbers['firm_collisions_soon_share'] = float(soon[firm].mean())
     if free.any():
@@ -131,15 +131,10 @@ def _force(robot: Robot, rng: np.random.Generator, least: float, most: float) ->
     return force
 
 
-def _holdable(robot: Robot, rng: np.random.Generator, count: int) -> Iterator[Array]:
-    while count:
-        (theta,) = robot.random_postures(1, rng, -INSIDE)
-        try:
-            holding_tension(robot, theta)
-        except InfeasibleError:
-            continue
-        count -= 1
-        yield theta
+def _holdable(robot: Robot, rng: np.random.Generator) -> Array:
+    postures = (robot.random_postures(1, rng, -INSIDE)[0] for _ in range(TRIES))
+    ((theta, _),) = holdable_postures(robot, postures, 1)
+    return theta
 
 
 def _pushed(loop: FeelingLoop, force: Array) -> Push:
@@ -158,7 +153,9 @@ def _pushed(loop: FeelingLoop, force: Array) -> Push:
 def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Array:
     """Return sizes of pushes of the moving arm [N], and how long until they are noticed [s]."""
     robot, found = loop.arm.robot, list[tuple[float, float]]()
-    while len(found) < count:
+    for _ in range(TRIED * count):
+        if len(found) == count:
+            break
         for _ in range(round(rng.uniform(0.5, 1.0) * APART / SAMPLE_TIME)):
             before = loop.feel(exploring=True)
         if before.contact or np.linalg.norm(loop.arm.velocity) < 0.1:
@@ -169,7 +166,7 @@ def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Arra
         loop.push(np.zeros(3))
         delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
         found.append((float(np.linalg.norm(force)), delay))
-    return np.array(found).T
+    return np.array(found).reshape(-1, 2).T
 
 
 def _healthy(loop: FeelingLoop, seconds: float) -> int:
@@ -185,21 +182,17 @@ def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, f
     """Return how far a floating joint drifts [rad], and how far a hand moves the hand [m]."""
     settings, arm = Settings(first_duration=2.0), study.arm(seed)
     loop = FeelingLoop(arm, study.network(seed), settings, seed)
-    (theta,) = _holdable(study.robot, rng, 1)
-    loop.rest(theta)
+    loop.rest(_holdable(study.robot, rng))
     loop.core.configure(replace(settings, method='float'))
-    for _ in range(round(MOVED / SAMPLE_TIME)):
-        loop.step()
+    loop.wait(MOVED)
     start, drift = arm.theta, 0.0
     for _ in range(round(FLOATING / SAMPLE_TIME)):
         loop.step()
         drift = max(drift, float(np.abs(arm.theta - start).max()))
     before = arm.hand.translation.copy()
     loop.push(_force(study.robot, rng, LIGHT, FIRM))
-    for _ in range(round(MOVED / SAMPLE_TIME)):
-        loop.step()
-    if loop.core.safety.cause:
-        raise MusculoskeletalError(f'floating stopped: {loop.core.safety.cause}')
+    loop.wait(MOVED)
+    loop.check()
     return drift, float(np.linalg.norm(arm.hand.translation - before))
 
 

@@ -31,13 +31,14 @@ import numpy as np
 from musculoskeletal_ae.arrays import Bools, Ints
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.files import read_start
-from musculoskeletal_ae.learning import old_state
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 FILE = 'learner.sqlite'
+OLD = 'samples.log'  # what learners wrote before; not read any more
+LARGEST = 1 << 26  # [bytes] of a state; a full one has a tenth
 TABLES = {
     ('CREATE TABLE sample (number INTEGER PRIMARY KEY, record BLOB NOT NULL)',),
     ('CREATE TABLE network (checksum INTEGER NOT NULL, checkpoint BLOB NOT NULL)',),
@@ -99,7 +100,7 @@ class State:
         self.directory.mkdir(parents=True, exist_ok=True)
         if self._file.exists() and not self._file.is_file():
             raise OSError(f'{self._file} is no regular file')  # one that may never end
-        if self._file.exists() and self._file.stat().st_size > old_state.LARGEST:
+        if self._file.exists() and self._file.stat().st_size > LARGEST:
             raise sqlite3.DatabaseError('larger than any state')
         self._connection = _connect(self._file)
         self._opened = self._file.stat()
@@ -122,24 +123,24 @@ class State:
         Raises:
             StateError: If it can neither be used nor become a backup.
         """
-        old = old_state.files(self.directory)
+        problem, old = '', self.directory / OLD
+        data: bytes | None = None
         try:
-            if self._empty():
-                problem, data = old_state.read(self.directory, self._robot, samples)
-            else:
+            if not self._empty():
                 problem, data = self._read(samples)
+            elif old.exists():
+                problem = f'{old}: of a version before {FILE}, whose samples are not read any more;'
+                problem += ' the network beside it can be given as `checkpoint`'
             mae = None
             if data is not None:
                 try:
                     mae = checkpoints.from_bytes(data, self._robot)
                 except CheckpointError as error:
                     problem = problem or f'the saved network: {error}'
-            if problem and not old:
-                self._put_away(self._files(), problem)
+            if problem:
+                self._put_away([old] if self._empty() else self._files(), problem)
             # With a full disk the learner goes on with what was read, and says so.
             self.keep(samples, None if mae is None else data)
-            if old and not self.trouble:
-                self._put_away(old, problem)
         except OSError as error:
             raise StateError(f'{self.directory}: cannot be used ({error})') from error
         return mae
@@ -161,7 +162,7 @@ class State:
                 raise sqlite3.DatabaseError(said)
         except (sqlite3.Error, TypeError, ValueError) as error:
             problem = f'{self._file}: damaged ({error})'
-            whole = read_start(self._file, old_state.LARGEST)
+            whole = read_start(self._file, LARGEST)
             places = [match.start() for match in re.finditer(re.escape(MARK), whole)]
             sizes = self._sizes(self._robot.muscles)
             records = [whole[place : place + size] for place in places for size in sizes]

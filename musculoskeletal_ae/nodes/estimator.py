@@ -189,7 +189,8 @@ class Estimator(Shell):
         if (jumped := self.plausibility.jumped) is not None:
             self.plausibility.jumped = None
             self.core.jumped(jumped, now)
-        estimate = self.core.step(tension, length, clock.nanoseconds * 1e-9, now)
+        seconds = clock.nanoseconds * 1e-9
+        estimate = self.core.step(tension, length, seconds, now, temperature)
         self._tell_zeros()
         if self.mirror is not None and from_zero is not None:
             mirrored = joint_message(self.robot.muscles, from_zero, clock.to_msg())

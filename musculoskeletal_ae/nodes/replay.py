@@ -23,9 +23,8 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from musculoskeletal_ae.bags.playback import Timeline, lap, window
+from musculoskeletal_ae.bags.playback import LEAD, SHOWN, Timeline, lap, shown, window
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.teaching import LEAD, SHOWN, shown
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve

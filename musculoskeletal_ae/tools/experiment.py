@@ -44,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
     # Ended by whoever started it, it clears up as on Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_status(lambda: load('musculoskeletal_ae.tools.measuring').measure(args))
+    return exit_status(lambda: load('musculoskeletal_ae.experiments.results').measure(args))
 
 
 def _names(text: str) -> tuple[str, ...]:

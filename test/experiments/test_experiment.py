@@ -13,7 +13,7 @@ from html.parser import HTMLParser
 import pytest
 
 from musculoskeletal_ae import experiments
-from musculoskeletal_ae.experiments.report import write_report
+from musculoskeletal_ae.experiments.results import write_report
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.tools import experiment
 

@@ -15,17 +15,19 @@ from musculoskeletal_ae.experiments.study import Measured, Study
 from musculoskeletal_ae.tools import experiment
 
 
-def test_result_json_has_means_over_seeds_but_counts_alarms_in_all(arm26, tmp_path):
+def test_result_json_has_means_of_the_seeds_that_have_them_but_counts_alarms(arm26, tmp_path):
     study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
     rows = {
         0: {'after_rad': 0.1, 'false_alarms': 1, 'first': {'error_rad': 0.2}, 'joint': 'elbow'},
         1: {'after_rad': 0.3, 'false_alarms': 2, 'first': {'error_rad': 0.4}, 'joint': 'elbow'},
     }
+    rows[1]['hand_circle_m'] = 0.01  # 0 found no circle
     content = combined(study, {seed: Measured(row, {}) for seed, row in rows.items()})
     assert content['after_rad'] == 0.2
     assert content['false_alarms'] == 3
     assert content['first']['error_rad'] == pytest.approx(0.3)
     assert content['joint'] == 'elbow'
+    assert content['hand_circle_m'] == 0.01
     assert content['seeds']['1']['after_rad'] == 0.3
 
 

@@ -207,6 +207,15 @@ def test_a_file_that_is_no_database_is_kept_and_not_used(tmp_path, arm26, conten
     assert (tmp_path / 'backup-1' / FILE).read_bytes() == content
 
 
+def test_a_state_of_before_is_kept_and_not_used(tmp_path, arm26):
+    (tmp_path / 'samples.log').write_bytes(b'MAESMPL1')
+    found, mae, not_used = read(tmp_path, arm26)
+    assert (len(found), mae) == (0, None)
+    assert 'not read any more' in not_used
+    assert (tmp_path / 'backup-1' / 'samples.log').read_bytes() == b'MAESMPL1'
+    assert read(tmp_path, arm26)[2] == ''
+
+
 def test_another_robots_state_is_kept_whole_and_not_used(tmp_path, arm26, stage):
     store = written(tmp_path, arm26, stage, 2)
     found, mae, not_used = read(tmp_path, Robot.load('musashi_left_arm'))

@@ -14,6 +14,9 @@ them has to come from elsewhere. With r it is the one in proportion to which c�
 The highest tension of a muscle is the one that, held for a time from now on, brings its winding to
 the highest temperature. Held there, it falls slowly to what can be held for good, so that control
 that plans within it leaves a muscle that warms to those that are cool.
+
+A constant that leaves what it was, once that was known, says that the module has changed: its motor
+drags, its housing is covered, or its tension sensor is wrong.
 """
 
 from __future__ import annotations
@@ -68,30 +71,28 @@ class Heat:
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ as first known
         self._sums: Array = np.zeros((2, count))
         self._passed, self._messages = 0.0, 0
-        self._ahead: list[tuple[Array, Array]] = []  # c₁ without tension [°C], per T² [K/N²]
+        self._ahead: list[tuple[Array, Array]] | None = None  # as `_look_ahead` finds it, if it did
+        #: muscles whose constants are not what they were when they were first known, and how
+        self.changed: dict[int, str] = {}
 
     @property
     def core(self) -> Array:
         """Estimated temperatures of the windings [°C] (M,); NaN where the housing's is unknown."""
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
-    @property
-    def changed(self) -> dict[int, str]:
-        """Muscles whose constants are not what they were when they were first known, and how."""
-        factor = np.exp(self._state[[2, 4]] - self._reference)
-        told = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
-        return {
-            int(m): f'{told[k].format(factor[k, m])} as much as it did'
-            for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
-        }
+    def accept(self) -> None:
+        """Take the modules that have changed as they are now."""
+        muscles = list(self.changed)
+        self._reference[:, muscles] = self._state[[2, 4]][:, muscles]
+        self.changed = {}
 
     def limits(self, highest: float) -> tuple[Array, Array]:
         """Return the tensions [N] (M,) that bring no winding above so many °C within HELD, MOMENT.
 
         Between T_bias and tension.max; an unknown temperature limits nothing.
         """
-        if not self._ahead:
-            return self._tension.max, self._tension.max
+        if self._ahead is None:
+            self._ahead = self._look_ahead()
         found = []
         for free, warming in self._ahead:
             square = np.where(self._state[1] < highest, (highest - free) / warming, 0.0)
@@ -111,14 +112,13 @@ class Heat:
         hidden, self._known = (known != self._known).any(), known
         self._sums += tension * tension, np.where(known, housing, 0.0)
         self._messages, self._passed = self._messages + 1, self._passed + dt
-        if strange.any() or hidden:  # nothing to learn from
-            self._look_ahead()
-        elif self._passed >= EVERY:
+        learns = not (strange.any() or hidden)
+        if learns and self._passed < EVERY:
+            return
+        if learns:
             square, mean = self._sums / self._messages
             self._update(square, mean, min(self._passed, LONGEST))
-            self._look_ahead()
-        else:
-            return
+        self._ahead = None
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
 
     def _update(self, square: Array, housing: Array, dt: float) -> None:
@@ -137,14 +137,21 @@ class Heat:
         logs, unsure = after[[2, 4]], self._covariance[:, [2, 4], [2, 4]].max(axis=1)
         first = (self._age > LEARNED) & (unsure < KNOWN**2) & np.isnan(self._reference[0])
         self._reference = np.where(first, logs, self._reference)
+        factor = np.exp(logs - self._reference)
+        told = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
+        self.changed = {
+            int(m): f'{told[k].format(factor[k, m])} as much as it did'
+            for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
+        }
 
-    def _look_ahead(self) -> None:
-        """Find what windings come to without tension, and how much more with some, by two times."""
+    def _look_ahead(self) -> list[tuple[Array, Array]]:
+        """Return c₁ without tension [°C] and what T² adds [K/N²], (M,) each, HELD and MOMENT on."""
         pulled = np.array([0.0, 1.0])[:, None] * self._tension.limit**2
         state = np.repeat(self._state[:, None], 2, axis=1)
-        self._ahead = []
+        ahead = list[tuple[Array, Array]]()
         for n in range(round(HELD / MOMENT)):
             state = flow(state, pulled, MOMENT)
             if n in (0, round(HELD / MOMENT) - 1):
                 free, warm = state[0] + state[1]
-                self._ahead.insert(0, (free, (warm - free) / self._tension.limit**2))
+                ahead.insert(0, (free, (warm - free) / self._tension.limit**2))
+        return ahead

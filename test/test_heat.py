@@ -5,48 +5,76 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import njit
 
-from musculoskeletal_ae.control.heat import HELD, LEARNED, MOMENT, RATIO, Heat, flow
 from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.heat import HELD, LEARNED, MOMENT, RATIO, Heat, flow
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
 COUNT, TENSION = ROBOT.muscle_count, ROBOT.tension
 HIGHEST = 85.0
+POSTURE = 0.5 * (ROBOT.lower + ROBOT.upper)
+
+
+@njit(cache=True)
+def warm(wound, muscle, command, steps):
+    for _ in range(steps):
+        for m in range(len(muscle.tension)):
+            modules.heat(wound, muscle, command, m)
 
 
 class Motors:
-    """Two-resistor motors, each with constants of its own, that pull as they are told."""
+    """The modules of an emulated arm, which pull as they are told."""
 
-    def __init__(self, seed=0, hold=10):
-        self.rng, self.hold = np.random.default_rng(seed), hold
+    def __init__(self, seed=0, hold=10, most=TENSION.limit):
+        self.rng, self.hold, self.most = np.random.default_rng(seed), hold, most
+        self.arm = EmulatedArm(ROBOT)
         factors = np.exp(self.rng.normal(0.0, modules.HEAT_SPREAD, (5, COUNT)))
         mean = (
             modules.LOSS / TENSION.limit[0] ** 2, modules.WINDING_CAPACITY,
             modules.HOUSING_CAPACITY, modules.WINDING_RESISTANCE, modules.HOUSING_RESISTANCE,
         )  # fmt: skip
-        self.constants = np.array(mean)[:, None] * factors
-        self.winding, self.housing = np.full((2, COUNT), modules.AMBIENT)
+        own = dict(zip(modules.Modules._fields[-5:], np.array(mean)[:, None] * factors))
+        self.wound = self.arm._wound._replace(**own)
         self.heat = Heat(ROBOT)
-        self.errors = []
+        self.errors, self.pulled, self.read = [], TENSION.bias, None
 
     def run(self, seconds, tension=None):
         """Let time pass with given tensions [N], or random ones."""
-        loss, inner, outer, thin, thick = self.constants
+        arm = self.arm
         for n in range(round(seconds)):
             if tension is None and n % self.hold == 0:
-                pulled = self.rng.uniform(TENSION.bias, TENSION.limit)
+                self.pulled = self.rng.uniform(TENSION.bias, self.most)
             elif tension is not None:
-                pulled = tension() if callable(tension) else tension
-            for _ in range(4):
-                through = (self.winding - self.housing) / thin
-                self.winding = self.winding + 0.25 * (loss * pulled**2 - through) / inner
-                lost = (self.housing - modules.AMBIENT) / thick
-                self.housing = self.housing + 0.25 * (through - lost) / outer
-            read = self.housing + self.rng.normal(0.0, 0.1, COUNT)
-            self.heat.step(pulled, read, 1.0)
-            self.errors.append(self.heat.core - self.winding)
+                self.pulled = tension() if callable(tension) else tension
+            arm._muscle.tension[:] = self.pulled
+            warm(self.wound, arm._muscle, arm._command, round(1.0 / modules.STEP))
+            self.read = arm._muscle.housing + self.rng.normal(0.0, 0.1, COUNT)
+            self.told()
+            self.errors.append(self.heat.core - arm.winding)
         return np.abs(self.errors[-round(seconds) :])
+
+    def told(self):
+        """Hand on what was read."""
+        self.heat.step(self.pulled, self.read, 1.0)
+
+
+class Watched(Motors):
+    """The same, watched by the estimator."""
+
+    def __init__(self, mae, **options):
+        super().__init__(**options)
+        self.core, self.now = Estimator(ROBOT), 0.0
+        self.core.use(mae)
+        self.heat = self.core.heat
+
+    def told(self):
+        length = ROBOT.muscle_lengths(POSTURE, self.pulled)
+        self.now += 1.0
+        self.core.step(self.pulled, length, self.now, self.now, self.read)
 
 
 def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
@@ -73,7 +101,8 @@ def test_after_twenty_minutes_the_winding_is_known(seed):
     last = motors.run(300)
     assert last.mean() < 4.0
     assert last.mean() < first.mean()
-    assert last.mean() < 0.5 * (motors.winding - motors.housing).mean()  # what the housing is off
+    through = motors.arm.winding - motors.arm._muscle.housing
+    assert last.mean() < 0.5 * through.mean()  # what the housing is off
     assert motors.heat.changed == {}
 
 
@@ -86,7 +115,7 @@ def test_what_is_held_at_the_limit_reaches_the_highest_temperature_and_no_more()
     hot = limit < TENSION.max
     assert (motors.heat.core <= HIGHEST + 0.5).all()
     assert (motors.heat.core > HIGHEST - 10.0)[hot].all()
-    assert (motors.winding < HIGHEST + held[-1] + 0.5).all()
+    assert (motors.arm.winding < HIGHEST + held[-1] + 0.5).all()
     # Another pulls for it meanwhile, and it may pull again.
     motors.run(300, TENSION.bias)
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
@@ -104,14 +133,33 @@ def test_cool_muscles_are_not_limited_and_a_moment_allows_more_than_long():
     np.testing.assert_array_equal(motors.heat.limits(20.0)[0], TENSION.bias)
 
 
-@pytest.mark.parametrize('constant', [0, 4])  # its loss, its housing's resistance
-def test_a_module_that_changes_is_named_and_no_other(constant):
-    motors = Motors(1)
+@pytest.mark.parametrize('constant', ['loss', 'housing_resistance'])
+def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained, constant):
+    motors = Watched(trained['default'], seed=1)
     motors.run(1.2 * LEARNED)
     assert motors.heat.changed == {}
-    motors.constants[constant, 2] *= 2.2
+    assert motors.core.cause == ''
+    getattr(motors.wound, constant)[2] *= 2.2
     motors.run(600)
     assert set(motors.heat.changed) == {2}
+    assert motors.core.cause.startswith(f'{ROBOT.muscles[2]}: its module ')
+    motors.core.reset()  # it is as it is
+    motors.run(60)
+    assert motors.core.cause == ''
+
+
+def test_a_cool_muscle_is_named_but_not_stopped_for_it(trained):
+    motors = Watched(trained['default'], seed=1, most=0.6 * TENSION.limit)
+    motors.run(1.2 * LEARNED)
+    motors.wound.loss[2] *= 2.2
+    motors.run(600)
+    assert motors.core.cause == ''
+    said, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
+    assert said.level == 'warn'
+    assert said.message.startswith(f'anomaly of a cool muscle: {how}')
+    assert said.values['suspect muscle'] == ROBOT.muscles[2]
+    motors.run(120, TENSION.limit)
+    assert motors.core.cause.startswith(how)
 
 
 def test_hours_of_health_change_no_constant():
