@@ -70,6 +70,7 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     """Return the numbers of a body; errors are divided by √D."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
+    (folder / 'initial.safetensors').unlink(missing_ok=True)  # of a run that was ended; it is timed
     begun = time.process_time()
     nominal = initial(robot, folder)
     row = {'training': time.process_time() - begun}

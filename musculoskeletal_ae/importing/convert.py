@@ -45,6 +45,8 @@ def read_source(file: Path) -> Source:
     if root.tag not in READERS:
         told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')
+    if any('/xacro}' in element.tag for element in root.iter()):
+        raise refuse(file, 'it is a xacro: expand it first, by xacro FILE > arm.urdf')
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)
@@ -76,6 +78,8 @@ def run(args: Namespace) -> int:
     robot, notes, errors = import_robot(args.file, args.out, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
+    for told in robot.description.joint_notes:
+        print(f'coupled: {told}')
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
     print(length_verdict(errors))

@@ -397,7 +397,7 @@ class _Reader:
         values, poses = at
         places, active = [], []
         for body, axes, (name, low, high) in points:
-            joint, pose = self.source.place(body)
+            joint, pose = self.kinematics.placement(body)  # as it was before a cut
             local = np.stack([function(values[name]) for name, function in axes], axis=1)
             world, local = poses[:, joint], local @ pose.rotation.T + pose.translation
             places.append(np.einsum('nij,nj->ni', world[:, :3, :3], local) + world[:, :3, 3])

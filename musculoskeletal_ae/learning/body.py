@@ -85,6 +85,14 @@ class CorrectedBody:
             self._phase.append(rng.uniform(0.0, 2.0 * np.pi, features))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
 
+    def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
+        """Return the body of one group, with the parameters of its muscles."""
+        parameters = [self.parameters[m] for m in muscles]
+        part = CorrectedBody(self.robot.limb(joints, muscles), parameters)
+        part._frequency = [self._frequency[m][:, joints] for m in muscles]
+        part._phase = [self._phase[m] for m in muscles]
+        return part
+
     def elastic(self, m: int) -> SeriesElastic:
         """Return the constants of one muscle, arrays of shape ()."""
         nominal = self.robot.series_elastic

@@ -83,27 +83,27 @@ class _GroupFit:
         spread: list[Array],
         least_noise: float,
     ) -> None:
-        self._body, self._seen, self._joints, self._muscles = body, seen, joints, muscles
+        self._kinematics, self._joints = body.robot.kinematics, joints  # of the whole body
+        self._body, self._seen = body.limb(joints, muscles), seen.limb(joints, muscles)
         self._mean = np.concatenate([mean[m] for m in muscles])
         self._precision = np.concatenate([1.0 / spread[m] ** 2 for m in muscles])
-        ends = np.cumsum([0, *(body.layouts[m].size for m in muscles)])
+        ends = np.cumsum([0, *(layout.size for layout in self._body.layouts)])
         self._columns = [slice(*pair) for pair in pairwise(ends.tolist())]
-        self._least = least_noise
-        self._known = seen.known[:, muscles].astype(float)
+        self._least, seen, robot = least_noise, self._seen, self._body.robot
+        self._known = seen.known.astype(float)
+        self._crossed = robot.routes.crossed
+        of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
+        self._acting = [np.flatnonzero(own) for own in of_muscle]  # parameters, by joint
         # The torque of a muscle that was changed since is not that of the one there is.
-        crossed = self._crossed = body.robot.routes.crossed[np.ix_(muscles, joints)]
-        changed = ~seen.known[:, muscles] & (seen.tension[:, muscles] > 0.0)  # 0 N: isolated
-        self._balanced = ~(changed @ crossed)
-        self._read = np.isfinite(seen.theta[:, joints])
-        self._own = self._read & (seen.spread[:, joints] == 0.0)  # read by a joint sensor
-        spread_y = np.where(self._own, SENSOR, seen.spread[:, joints])
+        changed = ~seen.known & (seen.tension > 0.0)  # 0 N: isolated
+        self._balanced = ~(changed @ self._crossed)
+        self._read = np.isfinite(seen.theta)
+        self._own = self._read & (seen.spread == 0.0)  # read by a joint sensor
+        spread_y = np.where(self._own, SENSOR, seen.spread)
         self._angle_precision = np.where(self._read, 1.0 / np.maximum(spread_y, SMALL) ** 2, 0.0)
-        self._lower = body.robot.lower[joints]
-        self._upper = body.robot.upper[joints]
-        links = 3 * len(body.robot.kinematics.parent)
-        tilt = seen.gravity if seen.gravity.size else np.full((len(seen), links), np.nan)
-        self._tilted = np.isfinite(tilt)
-        self._tilt = np.where(self._tilted, tilt, 0.0)
+        self._lower, self._upper = robot.lower, robot.upper
+        self._tilted = np.isfinite(seen.gravity)
+        self._tilt = np.where(self._tilted, seen.gravity, 0.0)
         self.noise = np.full(len(muscles), FIRST_NOISE)
         self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ZERO_SAMPLES)
         self._zero_precision = self._repeated / ZERO**2
@@ -114,34 +114,34 @@ class _GroupFit:
 
     def rows(self, theta: Array, zero: Array) -> _Rows:
         """Return residuals at θ of all joints (N, D), the body's parameters, and zeros (D,)."""
-        body, seen, joints, muscles = self._body, self._seen, self._joints, self._muscles
-        count, steps = len(theta), DIFFERENCE * np.eye(theta.shape[1])[joints]
-        flat = np.concatenate([theta[None], theta + steps[:, None]]).reshape(-1, theta.shape[1])
-        poses, places = body.poses(flat), len(joints)
-        length = np.empty((count, len(muscles)))
-        slope = np.zeros((count, len(muscles), places))
+        body, seen, joints = self._body, self._seen, self._joints
+        own, (count, places) = theta[:, joints], seen.theta.shape
+        flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
+        flat = flat.reshape(-1, places)
+        poses = body.poses(flat)
+        length, end = np.empty_like(seen.length), np.empty_like(seen.length)
+        slope = np.zeros((*length.shape, places))
         by_body, columns = [], self._columns
         torque_by_body = np.zeros((count, places, columns[-1].stop))
-        end = np.empty_like(length)
-        for i, m in enumerate(muscles):
+        for m in range(length.shape[1]):
             pull, way = seen.tension[:, m], seen.direction[:, m]
-            turns = np.flatnonzero(self._crossed[i])  # the other joints do not move it
+            turns = np.flatnonzero(self._crossed[m])  # the other joints do not move it
             parts = np.append(0, 1 + turns)
             at = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(at, -1)] for part in poses))
             pulls, ways = (np.tile(part, len(parts)) for part in (pull, way))
             l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
-            length[:, i] = seen.length[:, m] - l_m[0]
+            length[:, m] = seen.length[:, m] - l_m[0]
             by_body.append(j_m[0])
-            slope[:, i, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
-            end[:, i] = pull * np.exp(-body.friction(m) * way)
-            block = (j_m[1:] - j_m[0]) * (end[:, i, None] / DIFFERENCE)
-            block[:, :, body.layouts[m].friction] -= way * end[:, i] * slope[:, i, turns].T
-            torque_by_body[:, turns, columns[i]] = block.swapaxes(0, 1)
+            slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
+            end[:, m] = pull * np.exp(-body.friction(m) * way)
+            block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
+            block[:, :, body.layouts[m].friction] -= way * end[:, m] * slope[:, m, turns].T
+            torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
         muscular = end[:, :, None] * slope
-        weight = body.robot.kinematics.holding_torque(theta)[:, joints]
-        down = self._down(poses.rotation[:-1].reshape(1 + places, count, -1, 3, 3))
+        weight = self._kinematics.holding_torque(theta)[:, joints]
+        down = self._down(theta)
         return _Rows(
             length,
             slope,
@@ -149,18 +149,25 @@ class _GroupFit:
             -weight - muscular.sum(axis=1),
             torque_by_body,
             np.median(np.abs(muscular).sum(axis=1), axis=0),
-            np.where(self._read, seen.theta[:, joints] - theta[:, joints] - self._own * zero, 0.0),
+            np.where(self._read, seen.theta - own - self._own * zero, 0.0),
             self._tilted * (self._tilt - down[0]),
             np.moveaxis(down[1:] - down[0], 0, -1) / DIFFERENCE,
-            self._mean - np.concatenate([body.parameters[m] for m in muscles]),
+            self._mean - np.concatenate(body.parameters),
         )
 
-    def _down(self, rotation: Array) -> Array:
-        """Return the direction of gravity in all joints' frames, (..., 3J)."""
-        gravity = self._body.robot.kinematics.model.gravity.linear
-        norm = np.linalg.norm(gravity)
-        down = np.einsum('...jba,b->...ja', rotation, gravity / max(norm, SMALL))
-        return down.reshape(*down.shape[:-2], -1)
+    def _down(self, theta: Array) -> Array:
+        """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
+
+        At θ, then with each joint of the group turned by `DIFFERENCE`; 0 columns without an IMU.
+        """
+        if not self._tilt.size:
+            return np.zeros((1 + len(self._joints), len(theta), 0))
+        gravity = self._kinematics.model.gravity.linear
+        turned = theta + DIFFERENCE * np.eye(theta.shape[1])[self._joints, None]
+        flat = np.concatenate([theta[None], turned]).reshape(-1, theta.shape[1])
+        rotation = self._kinematics.joint_poses(flat).rotation
+        down = np.einsum('njba,b->nja', rotation, gravity / max(np.linalg.norm(gravity), SMALL))
+        return down.reshape(-1, *self._tilt.shape)
 
     # -- weights --------------------------------------------------------------------------------
 
@@ -215,19 +222,11 @@ class _GroupFit:
 
     def system(self, rows: _Rows, theta: Array, zero: Array) -> tuple[Array, ...]:
         """Return the normal equations: of θ, mixed, of w and z; their right sides."""
-        joints, kinematics = self._joints, self._body.robot.kinematics
-        count, places, size = len(theta), len(joints), len(self._mean)
-        stiffness = np.stack([kinematics.gravity_gradient(row) for row in theta])
+        joints, (count, places), size = self._joints, self._seen.theta.shape, len(self._mean)
+        stiffness = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
         stiffness = stiffness[:, joints[:, None], joints]
-        routes, tension = self._body.robot.routes, self._seen.tension[:, self._muscles]
-
-        def turned_routes(angles: Array) -> Array:  # G of the group, whose joints alone turn
-            whole = np.repeat(theta[:, None], places, axis=1)
-            whole[:, :, joints] = angles
-            return routes.muscle_jacobian(whole)[..., self._muscles[:, None], joints]
-
-        bend = muscle_hessian(turned_routes, theta[:, joints])
-        stiffness += np.einsum('nm,nmij->nij', tension, bend)
+        bend = muscle_hessian(self._body.robot.routes.muscle_jacobian, theta[:, joints])
+        stiffness += np.einsum('nm,nmij->nij', self._seen.tension, bend)
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian
         turned, e = rows.gravity_by_posture, self._by_gravity
         inner = np.einsum('nmi,nm,nmj->nij', slope, a, slope)
@@ -246,9 +245,10 @@ class _GroupFit:
         right = np.zeros(size + places)
         mixed = np.zeros((count, places, size + places))
         by_torque = rows.torque_by_body
-        flat = (by_torque * np.sqrt(b)[:, :, None]).reshape(-1, size)
-        outer[:size, :size] = flat.T @ flat
-        right[:size] = flat.T @ (np.sqrt(b) * rows.torque).ravel()
+        for j, acting in enumerate(self._acting):
+            weighted = by_torque[:, j, acting] * np.sqrt(b[:, j, None])
+            outer[np.ix_(acting, acting)] += weighted.T @ weighted
+            right[acting] += weighted.T @ (np.sqrt(b) * rows.torque)[:, j]
         mixed[:, :, :size] = stiffness.swapaxes(1, 2) @ (b[:, :, None] * by_torque)
         self.curvature = []
         for i, (column, by_body) in enumerate(zip(self._columns, rows.by_body)):
@@ -298,30 +298,28 @@ class _GroupFit:
         ]
         return np.array(body) + self.leverage.sum(axis=0)
 
-    def run(self, theta: Array, zero: Array) -> None:
-        """Bring body, θ (N, D) and zeros (D,) of all joints in line, in place."""
+    def run(self, theta: Array, zero: Array) -> list[Array]:
+        """Bring θ (N, D) and zeros (D,) of all joints in line, in place; return the parameters."""
         body, joints = self._body, self._joints
         rows = self.rows(theta, zero[joints])
-        determined = np.zeros(len(self._muscles))
+        determined = np.zeros(len(self.noise))
         for _ in range(ROUNDS):
             self.weigh(rows, theta, determined)
             before = self.cost(rows, theta, zero[joints])
             system = self.system(rows, theta, zero[joints])
-            old = [body.parameters[m] for m in self._muscles], theta.copy(), zero.copy()
+            old = body.parameters, theta.copy(), zero.copy()
             determined = self.determined()
             for damping in DAMPING:
                 change, turn, shift = self.solve(system, damping)
-                for m, at, column in zip(self._muscles, old[0], self._columns):
-                    body.parameters[m] = at + change[column]
+                steps = (change[column] for column in self._columns)
+                body.parameters = [at + step for at, step in zip(old[0], steps)]
                 theta[:, joints] = old[1][:, joints] + turn
                 zero[joints] = old[2][joints] + shift
                 rows = self.rows(theta, zero[joints])
                 if self.cost(rows, theta, zero[joints]) <= before:
                     break
             else:
-                for m, at in zip(self._muscles, old[0]):
-                    body.parameters[m] = at
-                theta[:], zero[:] = old[1:]
+                body.parameters, theta[:], zero[:] = old
                 rows = self.rows(theta, zero[joints])
                 break
             if self.gain < ENOUGH:
@@ -333,6 +331,7 @@ class _GroupFit:
             wide[self._columns[i]] = rows.by_body[i].T
             unknown = np.square(solve_triangular(self.root, wide, trans='T')).sum(axis=0)
             self.noise[i] = np.hypot(self.noise[i], np.sqrt(unknown.mean()))
+        return body.parameters
 
 
 def student(score: Array) -> Array:
@@ -358,7 +357,9 @@ def fit_jointly(
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         fit = _GroupFit(body, seen, joints, muscles, mean, spread, least_noise)
-        fit.run(theta, zero)
+        fitted = fit.run(theta, zero)
+        for m, parameters in zip(muscles, fitted):
+            body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, fit.root))
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.

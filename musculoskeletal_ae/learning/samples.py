@@ -64,6 +64,18 @@ class Observations:
     def __getitem__(self, rows: slice | Ints) -> Observations:
         return Observations(*(values[rows] for values in vars(self).values()))
 
+    def limb(self, joints: Ints, muscles: Ints) -> Observations:
+        """Return what they say of the joints and muscles of one group."""
+        return Observations(
+            self.theta[:, joints],
+            self.tension[:, muscles],
+            self.length[:, muscles],
+            self.direction[:, muscles],
+            self.known[:, muscles],
+            self.spread[:, joints],
+            self.gravity,
+        )
+
     def state(self) -> State:
         """Return (θ, T, l)."""
         return State(self.theta, self.tension, self.length)

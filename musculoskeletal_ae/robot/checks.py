@@ -222,11 +222,20 @@ def _useless_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             )
 
 
+def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
+    """Return the joint that each muscle acts on most, and where it acts the other way, both (M,).
+
+    That is a share of the postures; moment arms (N, M, D).
+    """
+    median, muscles = np.median(moment_arms, axis=0), np.arange(moment_arms.shape[1])
+    main = np.abs(median).argmax(axis=1)
+    against = moment_arms[:, muscles, main] * np.sign(median[muscles, main]) < 0.0
+    return main, against.mean(axis=0)
+
+
 def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Muscles whose main action changes sign over the range."""
-    median = np.median(moment_arms, axis=0)
-    for m, joint in enumerate(np.abs(median).argmax(axis=1)):
-        against = (moment_arms[:, m, joint] * np.sign(median[m, joint]) < 0.0).mean()
+    for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
             yield Finding(
                 'flipping_muscle',

@@ -104,6 +104,17 @@ class RobotDescription:
         return tuple(n for n in self.model.names[1:] if n not in moving | set(self.joints))
 
     @property
+    def joint_notes(self) -> list[str]:
+        """Lines that name the joints which are not in θ: coupled ones, and those held fixed."""
+        lines = [
+            f'{joint} = {c.ratio:g} · {c.master}' + (f' {c.offset:+g}' if c.offset else '')
+            for joint, c in self.couplings.items()
+        ]
+        if held := ', '.join(self.held_joints):
+            lines.append(f'held fixed at 0: {held}')
+        return lines
+
+    @property
     def root_link(self) -> str:
         """Name of the URDF's root link, in whose frame poses and markers are given."""
         return str(body_frames(self.model)[0].name)

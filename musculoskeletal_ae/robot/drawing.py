@@ -59,14 +59,30 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
     return lines
 
 
-def save_picture(lines: Sequence[Line], path: str | Path, title: str = '') -> None:
-    """Draw lines from the front and from the side, in true proportions, and save a PNG."""
+def _within(line: Line, middle: Array, reach: float) -> Line:
+    """Return a line from where it enters a cube to where it leaves it."""
+    ends = line.points[[0, -1]]
+    if line.kind == 'bones':
+        ends = ends[0] + np.linspace(0.0, 1.0, 101)[:, None] * (ends[1] - ends[0])
+        inside = np.flatnonzero((np.abs(ends - middle) <= reach).all(axis=1))
+        return line._replace(points=ends[inside[[0, -1]] if len(inside) else inside])
+    return line
+
+
+def save_picture(
+    lines: Sequence[Line], path: str | Path, title: str = '', whole: bool = True
+) -> None:
+    """Draw lines from the front and from the side, in true proportions, and save a PNG.
+
+    Or what of them is where the muscles are.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 5.0), layout='constrained')
-    every = np.concatenate([line.points for line in lines])
+    every = np.concatenate([line.points for line in lines if whole or line.kind == 'muscles'])
     middle = 0.5 * (every.max(axis=0) + every.min(axis=0))
     reach = 0.5 * np.ptp(every, axis=0).max() + 0.03
+    lines = [part for line in lines if len((part := _within(line, middle, reach)).points)]
     balls = {'solid_capstyle': 'round', 'marker': 'o', 'mec': '0.35', 'mew': 0.5}
     for i, (azimuth, name) in enumerate([(-10.0, 'from the front'), (-80.0, 'from the right')]):
         axes: Any = figure.add_subplot(1, 2, i + 1, projection='3d', proj_type='ortho')

@@ -4,20 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import (
-    RobotDescription,
-    TensionRange,
-    load_description,
-)
+from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
 from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes
+from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.stiffness import muscle_stiffness
 
 
@@ -46,6 +44,24 @@ class Robot:
     def load(cls, robot: str | Path) -> Robot:
         """Read a shipped robot's name or a directory; see `load_description` for errors."""
         return cls(load_description(robot))
+
+    def limb(self, joints: Ints, muscles: Ints) -> Robot:
+        """Return the robot of one group's joints and muscles; the other joints stand at zero."""
+        whole = self.description
+        elastic, tension = (
+            [values[muscles] for values in vars(part).values()]
+            for part in (whole.series_elastic, whole.tension)
+        )
+        description = replace(
+            whole,
+            joints=tuple(self.joints[j] for j in joints),
+            muscles=tuple(self.muscles[m] for m in muscles),
+            routes=tuple(whole.routes[m] for m in muscles),
+            series_elastic=SeriesElastic(*elastic),
+            stiffness=whole.stiffness[muscles],
+            tension=TensionRange(*tension),
+        )
+        return Robot(description)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
         """Return where in T and l the named muscles stand.

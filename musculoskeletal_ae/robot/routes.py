@@ -144,6 +144,8 @@ class Routes:
     @_in_chunks
     def detours(self, theta: Array) -> Array:
         """Return what wrapping adds to straight lines [m]: θ (..., D) gives (..., M)."""
+        if self.objects is None:
+            return np.zeros((len(theta), len(self._sum)))
         return np.subtract(*self._segments(theta)) @ self._sum.T
 
     def relative_lengths(self, theta: Array) -> Array:

@@ -31,19 +31,31 @@ PENALTY = 10.0  # where all is lacking; the size of a change is below 1
 START = 0.2  # spread of x at first
 TRIES = 40  # for each coordinate of a via point
 RESOLUTION = 1e-4  # [m]
+THIN = 0.003  # of a muscle in the picture [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
     """Return d [m] (P, 3), in the links' frames, and what is `lacking` without and with it.
 
-    Arms are tried in so many random postures, other ones than a check with this seed draws.
+    Lacking is also that a muscle changes the sign of its main action which did not before. Arms are
+    tried in so many random postures, other ones than a check with this seed draws.
     """
     import cma
 
     still = np.zeros((len(robot.routes.point), 3))
 
+    def check(change: Array) -> checks.RobotCheck:
+        return checks.check_robot(moved(robot, change), postures, seed + 1)
+
+    flips = np.maximum(checks.main_actions(check(still).moment_arms)[1], FORGIVEN)
+
     def lacks(change: Array) -> float:
-        return lacking(checks.check_robot(moved(robot, change), postures, seed + 1))
+        result = check(change)
+        more = checks.main_actions(result.moment_arms)[1] - flips
+        return lacking(result) + float(np.maximum(more, 0.0).sum())
+
+    if not (before := lacks(still)):
+        return still, 0.0, 0.0
 
     def change_of(x: Array) -> Array:
         x = x.reshape(still.shape)
@@ -65,7 +77,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         for p in np.argsort(np.linalg.norm(change, axis=1)):
             back = np.where(np.arange(len(change))[:, None] == p, 0.0, change)
             change = change if lacks(back) else back
-    return change, lacks(still), lacks(change)
+    return change, before, lacks(change)
 
 
 def moved(robot: Robot, change: Array) -> Robot:
@@ -105,6 +117,13 @@ def write(robot: Robot, change: Array, out: Path) -> None:
         if (here / file).exists():
             shutil.copyfile(here / file, out / file)
     middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
-    was, now = (draw_arm(each, middle, bias) for each in (robot, after))
-    was = [line._replace(colour=(0.85, 0.4, 0.3)) for line in was if line.kind == 'muscles']
-    save_picture([*was, *now], out / 'suggestion.png', 'red: before, green: after')
+    lines = []
+    for was, now in zip(*(draw_arm(each, middle, bias) for each in (robot, after)), strict=True):
+        if was.kind == 'bones':
+            lines.append(now)
+        elif np.array_equal(was.points, now.points):
+            lines.append(now._replace(colour=(0.6, 0.6, 0.7), width=THIN))
+        else:
+            lines += [was._replace(colour=(0.9, 0.2, 0.1), width=THIN), now._replace(width=THIN)]
+    told = 'red: before, green: after, grey: as it was'
+    save_picture(lines, out / 'suggestion.png', told, whole=False)

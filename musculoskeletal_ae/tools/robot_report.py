@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.checks import (
     RobotCheck,
     check_robot,
 )
-from musculoskeletal_ae.robot.description import RobotDescription, shown
+from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.suggestion import suggest, write
@@ -45,7 +45,10 @@ def check(args: Namespace) -> int:
     if not (count and args.suggest):
         return 1 if count else 0
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
-    far = 1e3 * np.linalg.norm(change, axis=1)
+    far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
+    if not before:
+        print('no via point is to blame, nothing is written')
+        return 1
     if after:
         print(f'no sound arm was found within {1e3 * args.reach:g} mm; the best is', end=' ')
         if after >= before:
@@ -53,6 +56,10 @@ def check(args: Namespace) -> int:
             return 1
     write(robot, change, args.out)
     print(f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, up to {far.max():.1f} mm')
+    for m, name in enumerate(robot.muscles):
+        own = routes.muscle == m
+        if (moved := far[np.union1d(routes.first[own], routes.second[own])]).any():
+            print(f'    {name}, point by point: {", ".join(f"{each:.1f}" for each in moved)} mm')
     return check(Namespace(**{**vars(args), 'robot': args.out, 'plot': None, 'suggest': False}))
 
 
@@ -64,7 +71,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     lines = [
         f'{robot.description.directory}',
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',
-        *joint_notes(robot.description),
+        *robot.description.joint_notes,
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
@@ -87,17 +94,6 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             spread = np.percentile(values, [0, 5, 50, 100])
             lines.append(f'{title:<44}' + ''.join(f'{value:9.1f}' for value in spread))
     return '\n'.join(lines)
-
-
-def joint_notes(description: RobotDescription) -> list[str]:
-    """Return lines that name the joints which are not in θ: coupled ones, and those held fixed."""
-    lines = [
-        f'{joint} = {c.ratio:g} · {c.master}' + (f' {c.offset:+g}' if c.offset else '')
-        for joint, c in description.couplings.items()
-    ]
-    if held := ', '.join(description.held_joints):
-        lines.append(f'held fixed at 0: {held}')
-    return lines
 
 
 def moment_arm_table(robot: Robot, result: RobotCheck) -> str:

@@ -91,10 +91,12 @@ def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
 
 
-def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path):
+def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
-    robot = import_robot(file, tmp_path / 'out').robot
+    assert main([str(file), '--out', str(tmp_path / 'out')]) == 0
+    assert 'coupled: wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
+    robot = Robot.load(tmp_path / 'out')
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
@@ -134,6 +136,13 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert 'check_robot: not sound' in told  # nothing holds it open against its weight
 
 
+def test_lengths_of_a_chain_out_of_opensim_are_compared_with_the_whole_model(tmp_path):
+    file = put(tmp_path, 'own.osim', bodies.OSIM)
+    errors = import_robot(file, tmp_path / 'out', base='humerus').errors
+    assert errors.keys() == {'flexor', 'extensor', 'moving'}
+    assert max(errors['flexor'], errors['extensor']) < 1e-6
+
+
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
     whole = import_robot(mjcf, tmp_path / 'whole').robot
     part = import_robot(mjcf, tmp_path / 'part', base='upper').robot
@@ -171,6 +180,9 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
     other = put(tmp_path, 'other.xml', '<html/>')
     assert main([str(other), '--out', str(tmp_path / 'out')]) == 1
     assert 'none of the formats read: mujoco, cardsflow' in capsys.readouterr().err
+    xacro = '<robot xmlns:x="http://www.ros.org/wiki/xacro"><x:arg name="side"/></robot>'
+    assert main([str(put(tmp_path, 'arm.xacro', xacro)), '--out', str(tmp_path / 'out')]) == 1
+    assert 'expand it first, by xacro FILE' in capsys.readouterr().err
     bomb = '<!DOCTYPE x [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><mujoco>&b;</mujoco>'
     assert main([str(put(tmp_path, 'bomb.xml', bomb)), '--out', str(tmp_path / 'out')]) == 1
     assert 'no DOCTYPE is allowed' in capsys.readouterr().err

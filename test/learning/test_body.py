@@ -6,7 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from learning.conftest import drawn_body
 from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
+from musculoskeletal_ae.robot.robot import Robot
 
 
 def rms(body, theta, tension, length):
@@ -18,6 +20,19 @@ def test_without_corrections_it_is_the_geometric_model(arm26):
     theta, tension = arm26.random_postures(50, rng), rng.uniform(0.0, 300.0, (50, 6))
     (length,) = CorrectedBody(arm26).lengths(theta, tension, np.zeros((50, 6)))
     np.testing.assert_allclose(length, arm26.muscle_lengths(theta, tension), atol=1e-12)
+
+
+def test_a_limb_alone_has_its_lengths_in_the_whole_body():
+    robot, rng = Robot.load('musashi_upper_body'), np.random.default_rng(0)
+    body = drawn_body(robot, 3, seed=1, scale=1.0)
+    theta, tension = robot.random_postures(5, rng), rng.uniform(0.0, 300.0, (5, robot.muscle_count))
+    (length,) = body.lengths(theta, tension, 0.0 * tension)
+    for joints, muscles in robot.groups[1:]:
+        limb = body.limb(np.array(joints), np.array(muscles))
+        pull = tension[:, muscles]
+        (alone,) = limb.lengths(theta[:, joints], pull, 0.0 * pull)
+        np.testing.assert_allclose(alone, length[:, muscles], atol=1e-12)
+        assert limb.robot.muscles == tuple(robot.muscles[m] for m in muscles)
 
 
 @pytest.mark.parametrize('m', range(6))

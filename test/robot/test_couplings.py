@@ -13,7 +13,6 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
-from musculoskeletal_ae.tools.robot_report import joint_notes
 
 COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
 
@@ -77,11 +76,11 @@ def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(robot, tmp_path
     coupled_arm(tmp_path)
     plain = Robot.load(tmp_path)
     assert plain.description.held_joints == ('finger',)
-    assert joint_notes(plain.description) == ['held fixed at 0: finger']
+    assert plain.description.joint_notes == ['held fixed at 0: finger']
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text(urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC))
     mimic = Robot.load(tmp_path)
-    assert joint_notes(mimic.description) == ['finger = -0.5 · bend +0.2']
+    assert mimic.description.joint_notes == ['finger = -0.5 · bend +0.2']
     theta = mimic.random_postures(5, np.random.default_rng(0))
     expected = robot.routes.absolute_lengths(theta)
     np.testing.assert_array_equal(mimic.routes.absolute_lengths(theta), expected)

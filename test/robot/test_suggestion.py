@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles
@@ -63,7 +65,9 @@ def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys)
     before = check_robot(Robot.load(arm), 400, seed=9)
     assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # the premise
     assert suggest(arm, out, '--reach', reach) == 0
-    assert 'arm: sound' in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert 'arm: sound' in printed
+    assert 'changes the sign of its main action' not in printed.split(str(out))[1]
     # In postures that neither the search nor the check above has seen.
     assert check_robot(Robot.load(out), 400, seed=9).faults == ()
     distance = np.linalg.norm(points(out) - points(arm), axis=1)
@@ -87,6 +91,15 @@ def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(t
 
 def test_a_sound_arm_is_left_as_it_is(tmp_path):
     assert suggest('arm26', tmp_path / 'better') == 0
+    assert not (tmp_path / 'better').exists()
+
+
+def test_where_no_via_point_is_to_blame_none_is_moved(tmp_path, capsys):
+    arm = copy_robot('arm26', tmp_path / 'arm')
+    urdf = arm / 'robot.urdf'
+    urdf.write_text(re.sub('<inertial>.*?</inertial>', '', urdf.read_text(), flags=re.S))
+    assert suggest(arm, tmp_path / 'better') == 1
+    assert 'no via point is to blame' in capsys.readouterr().out
     assert not (tmp_path / 'better').exists()
 
 
