@@ -61,7 +61,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['bench', 'bench.*', 'test', 'test.*']),
-    package_data={NAME: ['*/*.yaml', '*/*.jinja']},
+    package_data={NAME: ['*.yaml', '*/*.yaml', '*/*.jinja']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

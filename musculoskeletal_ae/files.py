@@ -14,10 +14,12 @@ import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
+import msgspec
 import yaml
 
+T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # [bytes] of a text
@@ -100,6 +102,11 @@ def read_csv(
         head = repr(rows[0][1][:80]) if rows else 'nothing'
         raise refuse(file, f'expected the columns {",".join(columns)}, got {head}')
     return rows[1:]
+
+
+def read_table(code: str, name: str, kind: type[T]) -> T:
+    """Return the table of a YAML file that is beside the code that uses it."""
+    return msgspec.yaml.decode(Path(code).with_name(name).read_bytes(), type=kind)
 
 
 def parse_yaml(text: str) -> Any:

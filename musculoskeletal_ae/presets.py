@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two presets: one record each, the only place where they differ.
+"""The two presets of presets.yaml: one record each, the only place where they differ.
 
 `paper` is what the paper prints (network layout, learning procedure, solvers, constants); `default`
 is the best that this project can measure. Code asks a field of the record, never for a name.
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.files import read_table
 
 if TYPE_CHECKING:  # options are read without numpy
     from musculoskeletal_ae.robot.groups import Group
@@ -76,52 +77,8 @@ class Preset:
         return {group: tuple(self.grown(units, [group]) for units in hidden) for group in of}
 
 
-DEFAULT = Preset(
-    name='default',
-    network=NetworkSettings(hidden=(200, 100), activation='silu', standardise=True, grouped=True),
-    training=TrainingSettings(
-        steps=3000,
-        batch=128,
-        samples=200_000,
-        optimiser='muon',
-        step_size=4e-3,
-        annealed=True,
-        every_mask=True,
-        weights=(1.0, 1.0, 1.0),
-        standard_norms=True,
-        slope_weight=1.0,
-    ),
-    corrected_body=True,
-    least_samples=2,
-    equilibrium=True,
-    whitened=True,
-)
-
-PAPER = Preset(
-    name='paper',
-    # The paper prints the layers but not the activation. tanh is our choice for it: smooth, as
-    # descent through the decoder wants it. The latent layer is linear, so that z is not confined.
-    network=NetworkSettings(hidden=(200, 30), activation='tanh', standardise=False),
-    # 30 epochs and w = (1, 10, 10) are printed. "Number of batches 100" is read as the size of a
-    # mini-batch of 10 000 samples; the step size is Adam's own default.
-    training=TrainingSettings(
-        steps=30 * 100,
-        batch=100,
-        samples=10_000,
-        optimiser='adam',
-        step_size=1e-3,
-        annealed=False,
-        every_mask=False,
-        weights=(1.0, 10.0, 10.0),
-        standard_norms=False,
-    ),
-    corrected_body=False,
-    least_samples=21,  # "from C_thre samples on" is read as: when the count exceeds C_thre = 20
-    equilibrium=False,
-    whitened=False,
-)
-
-PRESETS = {preset.name: preset for preset in (DEFAULT, PAPER)}
+PRESETS = read_table(__file__, 'presets.yaml', dict[str, Preset])
+DEFAULT, PAPER = PRESETS['default'], PRESETS['paper']
 
 
 def preset_named(name: str) -> Preset:

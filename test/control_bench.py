@@ -28,14 +28,15 @@ class Bench:
         self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)
-        self.now, self.theta, self.tension, self.temperature = 100.0, REST, None, COLD
+        self.now, self.dt = 100.0, DT
+        self.theta, self.tension, self.temperature = REST, None, COLD
         self.blind = set()
 
     def step(self, count=1):
         """Return the commands of some steps."""
         sent = []
         for _ in range(count):
-            self.now += DT
+            self.now += self.dt
             if 'muscles' not in self.blind:
                 length, tension = rest_readings(ROBOT, self.theta, self.tension)
                 self.core.muscles(Muscles(length, tension, self.temperature), self.now)

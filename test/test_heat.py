@@ -154,7 +154,7 @@ def test_a_cool_muscle_is_named_but_not_stopped_for_it(trained):
     motors.wound.loss[2] *= 2.2
     motors.run(600)
     assert motors.core.cause == ''
-    said, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module warms'
+    said, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
     assert said.level == 'warn'
     assert said.message.startswith(f'anomaly of a cool muscle: {how}')
     assert said.values['suspect muscle'] == ROBOT.muscles[2]

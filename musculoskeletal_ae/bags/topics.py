@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.files import read_table
 
 
 class Topic(NamedTuple):
@@ -18,48 +19,10 @@ class Topic(NamedTuple):
     sent: bool = False  # by hardware, vision, user or controller: not computed from the rest
 
 
-_ARRAY = 'std_msgs/msg/Float64MultiArray'
-_JOINTS = 'sensor_msgs/msg/JointState'
-_WRENCH = 'geometry_msgs/msg/WrenchStamped'
-_POSE = 'geometry_msgs/msg/PoseStamped'
-_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
-_MARKERS = 'visualization_msgs/msg/MarkerArray'
-
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
 DEFAULT, ALL = 'default', 'all'  # selections of topics
 
-TOPICS = {
-    'joint_states': Topic(_JOINTS, sent=True),
-    'muscle_states': Topic(_ARRAY, sent=True),
-    'muscle_length_command': Topic(_ARRAY, sent=True),
-    'muscle_tension_command': Topic(_ARRAY, sent=True),
-    'target_joint_states': Topic(_JOINTS, sent=True),
-    'joint_trajectory': Topic(_TRAJECTORY, sent=True),
-    'target_pose': Topic(_POSE, sent=True),
-    'target_twist': Topic('geometry_msgs/msg/TwistStamped', sent=True),
-    'controller_state': Topic(_TRAJECTORY),
-    'estimated_joint_states': Topic(_JOINTS),
-    'estimated_joint_covariance': Topic(_ARRAY),
-    'estimated_muscle_states': Topic(_ARRAY),
-    'estimated_external_wrench': Topic(_WRENCH),
-    'muscle_length_zeros': Topic(_ARRAY, latched=True),
-    'anomaly': Topic('std_msgs/msg/Float64'),
-    'anomaly_detected': Topic('std_msgs/msg/Bool', latched=True),
-    'isolated_muscles': Topic('std_msgs/msg/String', latched=True),
-    'mae_checkpoint': Topic('std_msgs/msg/UInt8MultiArray', latched=True),
-    'marker_pose': Topic(_POSE, sent=True),
-    'vision_joint_states': Topic(_JOINTS),
-    'sim/joint_states': Topic(_JOINTS),
-    'sim/muscle_states': Topic(_ARRAY),
-    'sim/external_wrench': Topic(_WRENCH, sent=True),
-    'hardware_emulator/external_wrench': Topic(_WRENCH),
-    'sim/fixed_joint_states': Topic(_JOINTS, sent=True),
-    'sim/markers': Topic(_MARKERS),
-    'hardware_emulator/markers': Topic(_MARKERS),
-    'robot_description': Topic('std_msgs/msg/String', latched=True, sent=True),
-    DIAGNOSTICS: Topic('diagnostic_msgs/msg/DiagnosticArray'),
-}
-
+TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
 
 

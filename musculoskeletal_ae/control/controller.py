@@ -144,7 +144,7 @@ class Controller:
         if settings.method != before.method and not self.posture.exploring:
             self._starts, self._follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
-            self.posture.start()
+            (self.motion.plan_anew if self._follows else self.posture.start)()
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
@@ -416,7 +416,8 @@ class Controller:
     def report(self, now: float) -> Report:
         """Say what control is doing and what is in its way."""
         chosen, posture, robot = self.settings, self.posture, self._robot
-        solution, missing = posture.solution, np.zeros(0)
+        solution = self.motion.solution if self._follows else posture.solution
+        missing = np.zeros(0)
         values, warnings = {'method': chosen.method, 'preset': chosen.preset}, []
         if self.clamped:
             values['target clamped at'] = ', '.join(self.clamped)

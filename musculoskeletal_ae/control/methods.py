@@ -194,7 +194,13 @@ class StiffnessModel(NamedTuple):
 
 
 def stiffness_command(
-    robot: Robot, mae: Mae, theta: Array, torque: Array, desired: Array, limit: Array | float
+    robot: Robot,
+    mae: Mae,
+    theta: Array,
+    torque: Array,
+    desired: Array,
+    limit: Array | float,
+    near: Array | None = None,
 ) -> Solution:
     """Return the command of `stiffness`: joint stiffness as near as possible to the desired one.
 
@@ -207,7 +213,8 @@ def stiffness_command(
     only. K is nearly linear in T: a few quadratic programmes around the last solution suffice.
 
     Desired are diagonal entries [N·m/rad] (D,); 0 for as it comes, and what lies beyond the
-    reachable range of its joint is taken as the end of that range. Others as for `proposed`.
+    reachable range of its joint is taken as the end of that range. Others as for `proposed`. Near
+    the T [N] (M,) of a moment ago a single round does.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
@@ -216,10 +223,12 @@ def stiffness_command(
         tension, missing = least_tension(jacobian, torque, low, high)
         if not missing.any():
             break
+    rounds = SOLVES if near is None else 1
+    tension = tension if near is None else near
     model = StiffnessModel.read(robot, mae, theta, tension)
     # Where every muscle is needed for the torque nothing is left to choose.
     lowest = highest = np.diag(model.joint_stiffness(tension))
-    for _ in range(SOLVES):
+    for _ in range(rounds):
         programme = TensionProgramme(model.jacobian, torque, low, high)
         try:
             start = programme.nearest(tension)

@@ -16,6 +16,9 @@ command has to lead by λ dl/dt, and a wire that is pulled out at dl/dt resists 
 
 A trajectory that winches cannot follow is slowed as a whole before it starts (`slowness`). After
 its end G and T stay as they are, and the feedback at rest (`posture.RestFeedback`) goes on from c.
+
+Method `stiffness`: argmin ‖T − T_K‖² instead, with T_K of `methods.stiffness_command` for the θ and
+τ of a moment later, and no feedback, under which a chosen stiffness would not last.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ import math
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import msc_compensation
+from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
 from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFeedback
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
@@ -48,7 +51,8 @@ TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
 LACKING = 0.05  # [N·m] of torque
 LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
-LARGEST_LAG = 0.1  # [s]
+LARGEST_LAG, SPAN = 0.1, 0.0095  # [s]; over which l tells how fast it winds, above its noise
+AHEAD = 0.2  # [s] to the moment of T_K, and between two of them
 
 
 class Winches:
@@ -62,6 +66,7 @@ class Winches:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._products, self._squares = 0.0, LAGS
+        self._since = self._last = 0.0
         self._length: Array | None = None
 
     @property
@@ -71,10 +76,15 @@ class Winches:
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
         """Take l [m], T [N] (M,), `dt` [s] after the ones before, and what was commanded then."""
-        before, self._length = self._length, length
-        if before is None or dt <= 0.0:
+        # Medians of three messages tell how it was one message ago.
+        self._since, self._last = self._since + self._last, dt
+        if self._length is not None and self._since < SPAN:
             return
-        speed = (length - before) / dt
+        before, since = self._length, self._since
+        self._length, self._since = length, 0.0
+        if before is None:
+            return
+        speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
         telling = (np.abs(speed) > WINDING) & (length > command)
         self._products -= float(lacking[telling] @ speed[telling])
@@ -82,7 +92,7 @@ class Winches:
 
     def forget(self) -> None:
         """Begin anew after a pause; λ stays."""
-        self._length = None
+        self._length, self._since = None, 0.0
 
 
 class MotionControl:
@@ -103,6 +113,8 @@ class MotionControl:
         self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
         self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
         self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
+        self.solution: Solution | None = None  # the last that T_K goes to
+        self._near: Array = robot.tension.bias  # T_K [N], (M,)
         self.start()
 
     # -- what is asked --------------------------------------------------------------------------
@@ -113,7 +125,7 @@ class MotionControl:
         touch = getattr(mae, 'touch', None)
         known = np.full(self._robot.muscle_count, FRICTION) if touch is None else touch.friction
         self._friction = known
-        self._plan_anew()
+        self.plan_anew()
 
     def start(self) -> None:
         """Go on from what something else commanded."""
@@ -122,6 +134,7 @@ class MotionControl:
         self._tension: Array = self._robot.tension.bias.copy()
         self._pull: Array = self._tension
         self._sliding: Array = np.zeros(self._robot.muscle_count)
+        self.solution, self._solved = None, 0.0  # how long ago [s]
         self._feedback.reset()
         self.winches.forget()
 
@@ -137,15 +150,15 @@ class MotionControl:
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
         if self._resting is not None:  # on the way, one goes over to the next by itself
-            self._plan_anew()
+            self.plan_anew()
 
     def exert(self, effort: Array) -> None:
         """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
         if (effort != self.effort).any():
             self.effort = effort
-            self._plan_anew()
+            self.plan_anew()
 
-    def _plan_anew(self) -> None:
+    def plan_anew(self) -> None:
         """Go over from the last command to another without a jump; at rest, settle again."""
         if self._resting is not None and self.trajectory is not None:
             self.time = min(self.time, self.trajectory.duration)
@@ -184,7 +197,10 @@ class MotionControl:
         """
         mae, trajectory = self._mae, self.trajectory
         assert mae is not None and trajectory is not None
-        self.winches.step(muscles.length, muscles.tension, sent, dt)
+        if self.moving:
+            self.winches.step(muscles.length, muscles.tension, sent, dt)
+        else:  # noise alone says nothing of λ
+            self.winches.forget()
         self.time += dt
         if self.next is not None:
             self.next = self.next[0], self.next[1] - dt
@@ -193,17 +209,18 @@ class MotionControl:
                 self._begin(trajectory, -self.next[1])
         if np.abs(limit - self._limit).max() > REPLAN:
             self._limit = limit
-            self._plan_anew()
+            self.plan_anew()
         if self._resting is None:
             self.desired = trajectory.sample(self.time)
         self.error = self.desired.theta - theta
         feedback = self._feedback
         if self.time < trajectory.duration + SETTLING:
-            step = INTEGRAL * dt * self.error
+            error = np.zeros_like(theta) if self._stiff else self.error
+            step = INTEGRAL * dt * error
             feedback.correction = np.clip(feedback.correction + step, -CORRECTION, CORRECTION)
             feedback.moving()
             # Bounded too: an estimate that is wrong at once must not take the arm along.
-            shift = PROPORTIONAL * np.clip(self.error, -CORRECTION, CORRECTION)
+            shift = PROPORTIONAL * np.clip(error, -CORRECTION, CORRECTION)
             self._shift = feedback.correction + shift
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
@@ -226,12 +243,36 @@ class MotionControl:
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
         low = robot.tension.bias + robot.stiffness * lag * np.maximum(speed, 0.0)
         loss = np.exp(self._friction * self._sliding)
+        near = self._stiffening(mae, limit, dt) if self._stiff else 0.0
         self._tension, self.missing_torque = least_tension(
-            jacobian, torque, np.minimum(low, limit) / loss, limit / loss
+            jacobian, torque, np.minimum(low, limit) / loss, limit / loss, near
         )
         self._pull = self._tension * loss
         length = mae.lengths(at.theta + self._shift, self._tension)
         return length + msc_compensation(robot, self._pull) + lag * speed
+
+    @property
+    def _stiff(self) -> bool:
+        return self.settings.method == 'stiffness'
+
+    def _stiffening(self, mae: Mae, limit: Array, dt: float) -> Array:
+        """Return T_K [N] (M,), as fast as it may change by what the plan leaves of the winches."""
+        robot, trajectory, before = self._robot, self.trajectory, self.solution
+        assert trajectory is not None
+        self._solved += dt
+        if before is None or self._solved >= AHEAD:
+            at, self._solved = trajectory.sample(self.time + AHEAD), 0.0
+            torque = robot.kinematics.inverse_dynamics(*at) + self.effort
+            desired = np.array(self.settings.desired_stiffness(robot.joint_count))
+            near = None if before is None else self._near
+            after = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            self._near = after.tension if near is None else near
+            self.solution = after
+        assert self.solution is not None
+        # Half, since the elastic unit stretches as well.
+        most = 0.5 * (1.0 - SHARE) * self.settings.rate_limit * robot.stiffness * dt
+        self._near = self._near + np.clip(self.solution.tension - self._near, -most, most)
+        return self._near
 
     def _held(self, mae: Mae, tension: Array, limit: Array, dt: float) -> Array:
         """Return l_target [m] (M,) at rest, for which nothing is solved that does not change."""
@@ -242,7 +283,7 @@ class MotionControl:
             length = mae.lengths(theta, self._tension) + msc_compensation(self._robot, self._pull)
             self._resting = length, mae.muscle_jacobian(theta, self._tension)
         length, jacobian = self._resting
-        gain = self.settings.feedback_gain
+        gain = 0.0 if self._stiff else self.settings.feedback_gain
         feedback.step(self.error, jacobian, tension, limit, gain, dt)
         self._shift = feedback.correction
         return length + feedback.shift(jacobian)

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from msgspec import yaml
 
+from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.robot.robot import Robot
 
 #: what is judged of each muscle: messages and their rate, rows and places in the array, units, the
@@ -17,9 +16,7 @@ CHECKS = ('rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency')
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
 #: check, what was seen, what to change, by what is wrong
-FAULTS = yaml.decode(
-    Path(__file__).with_name('faults.yaml').read_bytes(), type=dict[str, tuple[str, str, str]]
-)
+FAULTS = read_table(__file__, 'faults.yaml', dict[str, tuple[str, str, str]])
 
 
 class Fault(NamedTuple):

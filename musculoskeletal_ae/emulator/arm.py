@@ -19,16 +19,10 @@ ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chose
 class EmulatedArm(Arm):
     """Rigid bodies by pinocchio, muscles by `mechanics`, modules and faults by `modules`."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        seed: int = 0,
-        individual: Individual | None = None,
-        command_timeout: float = 0.5,
-    ) -> None:
+    def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
         """Build an individual of a robot at rest, modules safe; `seed` is of its noise, too."""
         self.individual = individual or Individual(robot, seed)
-        super().__init__(robot, seed, self.individual.length_bias, command_timeout)
+        super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
         self._model.armature = np.full(self._model.nv, ARMATURE)

@@ -53,38 +53,22 @@ class Individual:
         muscles = robot.muscle_count
         kin = robot.kinematics
         self._kinematics = kin
-        self.tree = Tree(
-            kin.parent.astype(np.int64),
-            kin.placement_rotation,
-            kin.placement_translation,
-            kin.local_axis,
-            kin.prismatic,
-        )
+        placements = kin.placement_rotation, kin.placement_translation
+        self.tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
         nominal = robot.routes
-        shift = rng.normal(0.0, spread.attachment, nominal.point.shape)
-        self.routes = WrappedRoutes(
-            nominal.joint.astype(np.int64),
-            nominal.point + shift,
-            nominal.first.astype(np.int64),
-            nominal.second.astype(np.int64),
-            nominal.muscle.astype(np.int64),
-            _objects(robot, nominal.point + shift, spread.wrap, seed, rng),
-        )
+        point = nominal.point + rng.normal(0.0, spread.attachment, nominal.point.shape)
+        segments = nominal.first, nominal.second, nominal.muscle
+        objects = _objects(robot, point, spread.wrap, seed, rng)
+        self.routes = WrappedRoutes(nominal.joint, point, *segments, objects)
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
-        nominal_elastic = robot.series_elastic
-        self.elastic = SeriesElastic(
-            nominal_elastic.force * factor[0],
-            nominal_elastic.rate * factor[1],
-            nominal_elastic.wire_stretch * factor[2],
-        )
+        constants = zip(vars(robot.series_elastic).values(), factor, strict=True)
+        self.elastic = SeriesElastic(*(each * off for each, off in constants))
         #: of muscles (M,) and joints [N·m], (D,) in the order of θ
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
         pulls = np.abs(nominal.muscle_jacobian(theta)) * robot.tension.bias[:, None]
         load = np.abs(kin.holding_torque(theta)).max(axis=0) + pulls.sum(axis=1).max(axis=0)
-        self.joint_friction: Array = (
-            spread.joint_friction * load * rng.uniform(0.5, 1.5, robot.joint_count)
-        )
+        self.joint_friction: Array = spread.joint_friction * load * rng.uniform(0.5, 1.5, len(load))
         #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
@@ -135,10 +119,7 @@ def _objects(
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
         if objects.radius[s] > 0.0:
-            turn, origin = (
-                poses.rotation[:, objects.joint[s]],
-                poses.translation[:, objects.joint[s]],
-            )
+            turn, origin = (part[:, objects.joint[s]] for part in poses[:2])
             away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]
             axis = (turn @ objects.axis[s])[:, None]
             away -= (away * axis).sum(axis=-1, keepdims=True) * axis

@@ -163,15 +163,10 @@ class Arm(ABC):
     _rates: Array
     _order: Ints
 
-    def __init__(
-        self, robot: Robot, seed: int, length_bias: Array, command_timeout: float = 0.5
-    ) -> None:
-        """Build the modules, whose length sensors are off by `length_bias` [m] (M,).
-
-        Without a command for `command_timeout` [s] they go safe.
-        """
+    def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
+        """Build the modules, whose length sensors are off by `length_bias` [m] (M,)."""
         self.robot, self._length_bias = robot, length_bias
-        self.command_timeout = command_timeout
+        self.command_timeout = 0.5  # [s] without a command until the modules go safe
         self._rng = np.random.default_rng([seed, 0x5E45])
         self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))

@@ -10,8 +10,12 @@ arXiv 2407.08050). Healthy statistics come from the real arm; those of the geome
 call most healthy postures anomalous, so without calibrated ones nothing is latched from d.
 
 What the network restores is worse in postures that nothing was calibrated in, so the threshold
-widens with the distance to the nearest that was (`unfamiliar`). A muscle that is cut pulls nothing,
-there as anywhere: while one is slack, nothing widens.
+widens with the distance to the nearest that was (`unfamiliar`); and in proportion to a tension
+beyond T_limit, of which networks are shown little. A muscle that is cut pulls nothing, there as
+anywhere: while one is slack, nothing widens.
+
+d says that something is wrong, but it is shared by muscles. The suspect is the one without which
+the rest is most likely.
 
 Physics needs no statistics: a module holds at least T_bias, so a muscle whose tension stays near
 zero while much is commanded has no wire, or a slack one. Slack is wound in by a slow winch, and no
@@ -48,6 +52,7 @@ DEAD_TIME = 0.5  # [s] a muscle has to stay without tension
 #: in newtons and as a share of it, since tension sensors differ in gain
 STANDS, JAM_TIME, JAM, JAM_SHARE = 0.001, 1.0, 50.0, 0.3  # [m], [s], [N]
 #: from NEAR on, a share of the joint ranges, the threshold grows with the distance, WIDEST times
+#: at most, as it does with the highest tension, from T_limit on
 NEAR, WIDEST = 0.25, 3.0
 
 
@@ -58,7 +63,6 @@ class Verdict(NamedTuple):
     distance: float  # d, in healthy standard deviations; NaN without statistics
     suspect: int  # index of the most suspect muscle
     cause: str  # why this message completes a detection, or ''
-    sure: bool = False  # that it is the suspect: by physics, not by what the network restores
 
 
 class AnomalyDetector:
@@ -89,7 +93,7 @@ class AnomalyDetector:
         if mae.anomaly is not None:
             self._whiten: Array = np.linalg.inv(np.linalg.cholesky(mae.anomaly.covariance))
             self._spread = np.sqrt(np.diag(mae.anomaly.covariance))
-        self._statistics, self._farthest = mae.anomaly, np.inf
+        self._mae, self._statistics, self._farthest = mae, mae.anomaly, np.inf
         if mae.anomaly is not None and mae.anomaly.calibrated:
             name = DISTANCE if self.whitened else NORM
             self._farthest = mae.anomaly.thresholds.get(name, np.inf)
@@ -124,17 +128,20 @@ class AnomalyDetector:
         score = share[:muscles] ** 2 + share[muscles:] ** 2
         dead = self._dead(state.theta, tension, length, dt)
         if dead is not None and self.whitened:
-            return Verdict(size, distance, dead, 'no tension where the command demands it', True)
+            return Verdict(size, distance, dead, 'no tension where the command demands it')
         jammed = self._jam(tension, length, dt)
         if jammed is not None and self.whitened and self.judges:
-            return Verdict(size, distance, jammed, 'its winch stands, whatever is commanded', True)
+            return Verdict(size, distance, jammed, 'its winch stands, whatever is commanded')
         # A muscle without tension is the one, whatever the others' residuals make of it.
-        slack = tension < SLACK * self._robot.tension.bias
+        slack = self._robot.used & (tension < SLACK * self._robot.tension.bias)
         suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
         waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any() and self.whitened)
         cause = ''
         if self.judges:
-            cause = self._beyond_threshold(size, distance, state.theta, slack, waits)
+            cause = self._beyond_threshold(size, distance, state.theta, tension, slack, waits)
+        # Where one is cut, another may be slack for a moment.
+        if cause and self._beyond == IN_A_ROW and self.calibrated and slack.sum() != 1:
+            suspect = self._unlikeliest(tension, length, slack if slack.any() else self._robot.used)
         return Verdict(size, distance, suspect, cause)
 
     def unfamiliar(self, theta: Array) -> float:
@@ -145,14 +152,18 @@ class AnomalyDetector:
         share = (known - theta) / (self._robot.upper - self._robot.lower)
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
-    def limit(self, theta: Array) -> float:
-        """Return the d, or A, that no healthy arm reaches at θ [rad] (D,), ∞ if unknown."""
-        wider = np.clip(self.unfamiliar(theta), 1.0, WIDEST) if self.whitened else 1.0
-        return self._farthest * float(wider)
+    def limit(self, theta: Array, tension: Array) -> float:
+        """Return the d, or A, that no healthy arm reaches at θ [rad] (D,) and T [N] (M,), or ∞."""
+        if not self.whitened:
+            return self._farthest
+        used = self._robot.used
+        tense = float((tension[used] / self._robot.tension.limit[used]).max(initial=0.0))
+        return self._farthest * float(np.clip(max(self.unfamiliar(theta), tense), 1.0, WIDEST))
 
     def _beyond_threshold(
-        self, anomaly: float, distance: float, theta: Array, slack: Bools, waits: bool
-    ) -> str:
+        self, anomaly: float, distance: float, theta: Array, tension: Array, slack: Bools,
+        waits: bool,
+    ) -> str:  # fmt: skip
         limit, value, what, where = self.settings.anomaly_threshold, anomaly, 'A', ''
         if limit <= 0.0:
             if not self.calibrated:
@@ -160,12 +171,23 @@ class AnomalyDetector:
             limit = self._farthest
             if self.whitened:
                 value, what = distance, 'd'
-            if value > limit and not slack.any() and (wider := self.limit(theta)) > limit:
-                limit, where = wider, ' in an unfamiliar posture'
+            if value > limit and not slack.any() and (wider := self.limit(theta, tension)) > limit:
+                limit, where = wider, ', wider in an unfamiliar posture or beyond tension.limit,'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''
-        return f'{what} = {value:.3g} above {limit:.3g} in {IN_A_ROW} messages running{where}'
+        return f'{what} = {value:.3g} above {limit:.3g}{where} in {IN_A_ROW} messages running'
+
+    def _unlikeliest(self, tension: Array, length: Array, among: Bools) -> int:
+        """Return the muscle without which the rest is most likely."""
+        isolated, distance = self._robot.isolated, np.full(len(among), np.inf)
+        for muscle in np.flatnonzero(among).tolist():
+            less = self._mae.without((*isolated, muscle))
+            assert less.anomaly is not None
+            error = residuals(less.estimate(tension, length), tension, length, less.isolated)
+            centred = error - less.anomaly.mean
+            distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
+        return int(distance.argmin())
 
     def _demand(self, length: Array, command: Array) -> Array:
         pulled: Array = np.maximum(0.0, self._robot.stiffness * (length - command))

@@ -34,7 +34,6 @@ from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.plausibility import SLACK
 from musculoskeletal_ae.report import Report
@@ -183,38 +182,21 @@ class Estimator:
         still = self._stands_still(self.mae, tension, length, dt)
         if still is not None and not verdict.cause:
             why = 'a sensor stands still while the arm moves'
-            verdict = verdict._replace(suspect=still, cause=why, sure=True)
+            verdict = verdict._replace(suspect=still, cause=why)
         for m, how in self.heat.changed.items():
             if self.heat.core[m] > COOL and not verdict.cause:
-                verdict = verdict._replace(suspect=m, cause=f'its module {how}', sure=True)
+                verdict = verdict._replace(suspect=m, cause=f'its module {how}')
         detected = bool(verdict.cause) and not self.cause
         if detected:
-            suspect = self._suspected(self.mae, verdict, tension, length)
-            self._suspect = self._robot.muscles[suspect]
+            self._suspect = self._robot.muscles[verdict.suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
-            self._begin_verification(suspect, now)
+            self._begin_verification(verdict.suspect, now)
         before, self._touch = self._touch, None
         if self.zeros.known:
             pulled = tension * self._robot.used
             self._touch = touch = self._external.step(state.theta, pulled, length, dt)
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
-
-    def _suspected(self, mae: Mae, verdict: Verdict, tension: Array, length: Array) -> int:
-        """Return the muscle without which the rest is most likely."""
-        robot = self._robot
-        # Where one is cut, another may be slack for a moment.
-        slack = robot.used & (tension < SLACK * robot.tension.bias)
-        if verdict.sure or slack.sum() == 1 or not self.detector.calibrated:
-            return verdict.suspect
-        isolated, distance = robot.isolated, np.full(robot.muscle_count, np.inf)
-        for muscle in np.flatnonzero(slack if slack.any() else robot.used).tolist():
-            less = mae.without((*isolated, muscle))
-            assert less.anomaly is not None
-            error = residuals(less.estimate(tension, length), tension, length, less.isolated)
-            centred = error - less.anomaly.mean
-            distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
-        return int(distance.argmin())
 
     def _stands_still(self, mae: Mae, tension: Array, length: Array, dt: float) -> int | None:
         """Return the muscle of a sensor that says the same though the others say that it moves."""
@@ -360,7 +342,9 @@ class Estimator:
             }
             if self.detector.calibrated:
                 letter = 'd' if self.detector.whitened else 'A'
-                values[f'{letter} limit'] = f'{self.detector.limit(self._theta):.3g}'
+                assert self._read is not None
+                limit = self.detector.limit(self._theta, self._read[1])
+                values[f'{letter} limit'] = f'{limit:.3g}'
         if (touch := self._touch) is not None:
             force = f'{np.linalg.norm(touch.force):.0f} N at the hand'
             known = force if touch.contact else 'none'

@@ -44,14 +44,10 @@ def measure(study: Study, seed: int) -> Measured:
     # Where something was trained: within the joint's limits, and the tensions of the samples.
     inside = (robot.lower[joint] <= SWEEP) & (robot.upper[joint] >= SWEEP)
     low, high = (seen.min(), seen.max()) if seen.size else (0.0, robot.tension.limit.max())
+    held, still = (tension >= low) & (tension <= high), np.zeros((POINTS, robot.joint_count))
     sweeps = {
         'angle': (np.degrees(SWEEP), inside, swept, np.zeros((len(SWEEP), robot.muscle_count))),
-        'tension': (
-            tension,
-            (tension >= low) & (tension <= high),
-            np.zeros((POINTS, robot.joint_count)),
-            stretched,
-        ),
+        'tension': (tension, held, still, stretched),
     }
     traces: dict[str, Any] = {}
     numbers: dict[str, Any] = {'joint': robot.joints[joint]}
@@ -70,14 +66,12 @@ def measure(study: Study, seed: int) -> Measured:
         learner, loop = beginner(study, arm := worn_arm(robot, seed), seed, study.preset)
         held_out = study.stream(seed, 'held_out')
         follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
-        x, trained, curves = traces['tension']
-        points = list(sweeps['tension'][2:])
         changed = {
-            'before': curves['before'],
-            'after': learner.mae.lengths(*points),
-            'true': arm.individual.muscle_lengths(*points),
+            'before': traces['tension'][2]['before'],
+            'after': learner.mae.lengths(still, stretched),
+            'true': arm.individual.muscle_lengths(still, stretched),
         }
-        traces['worn'] = x, trained, changed
+        traces['worn'] = tension, held, changed
     return Measured(numbers, traces)
 
 

@@ -59,11 +59,9 @@ def measure(study: Study, seed: int) -> Measured:
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[elbow(robot)] = flexed(robot)
     command = _command(robot, networks['after'], theta)
-    traces: dict[str, Any] = {'arm': _pushed(study.arm(seed), command)}
-    traces |= {
-        when: _simulated(Simulation(robot, mae, study.preset), robot, command)
-        for when, mae in networks.items()
-    }
+    traces = {'arm': _pushed(study.arm(seed), command)}
+    for when, mae in networks.items():
+        traces[when] = _simulated(Simulation(robot, mae, study.preset), robot, command)
     numbers: dict[str, Any] = {
         'flexed_joint': robot.joints[elbow(robot)],
         'flexed_rad': float(theta[elbow(robot)]),

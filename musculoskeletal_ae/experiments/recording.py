@@ -106,10 +106,8 @@ class ClosedLoop:
         Raises:
             MusculoskeletalError: If the controller stopped on the way.
         """
-        joints = zip(self.arm.robot.joints, theta.tolist(), strict=True)
-        self.core.target({name: (angle, 0.0) for name, angle in joints})
-        for _ in range(round(duration / SAMPLE_TIME)):
-            self.step()
+        self.target(theta)
+        self.wait(duration)
         self.check()
 
     def check(self) -> None:
@@ -117,26 +115,26 @@ class ClosedLoop:
         if self.core.safety.cause:
             raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
 
+    def target(self, theta: Array) -> None:
+        """Let θ [rad] (D,) be the target."""
+        self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
+
+    def wait(self, duration: float) -> None:
+        """Let time pass [s]."""
+        for _ in range(round(duration / SAMPLE_TIME)):
+            self.step()
+
 
 def record(
-    arm: Arm,
-    mae: Mae,
-    stream: int | Iterable[Step],
-    duration: float,
-    script: Script | None = None,
+    arm: Arm, mae: Mae, stream: int | Iterable[Step], duration: float, script: Script | None = None
 ) -> Recording:
-    """Drive an arm through the exploration's three steps, as one fixed list of commands.
+    """Drive an arm on through the exploration's three steps, as one fixed list of commands.
 
     Each command is `first`'s. `second` needs the tension of the moment, which a fixed list cannot
     know: the least tension that holds the posture on the geometric model stands in for it. While a
     muscle is switched off all are commanded tensions: its own is 0 N, the others' as MSC has them.
-
-    Args:
-        arm: Is moved on from the state it is in.
-        mae: Computes the commands.
-        stream: Random seed of the postures, or the steps themselves.
-        duration: How long [s], rounded up to whole steps of the exploration.
-        script: What happens to the arm on the way.
+    The stream is the random seed of the postures, or the steps themselves; the duration [s] is
+    rounded up to whole steps.
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts where the arm is, so that it does not jump.

@@ -22,11 +22,7 @@ from scipy.stats import chi2
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import (
-    SAMPLE_TIME,
-    Recording,
-    estimation_error,
-)
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, estimation_error
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
@@ -68,16 +64,13 @@ def measure(study: Study, seed: int) -> Measured:
     }
     stream = study.stream(seed, 'exploring')
     length, tension = stream.length, stream.tension
-    numbers = {'before_rad': estimation_error(study.network(None, 'default'), held_out)}
     # The one that explored was taught by all joint sensors.
-    networks = {'all': study.network(seed, 'default')}
-    for name, (source, see) in ways.items():
-        networks[name] = _taught(study, seed, source, see, stream)
-    for name, mae in networks.items():
-        numbers[f'{name}_rad'] = estimation_error(mae, held_out)
-        if mae.covariance is not None and name in ('all', 'none'):
-            key = 'ellipsoid_share' if name == 'all' else 'none_ellipsoid_share'
-            numbers[key] = ellipsoid_share(mae, held_out)
+    networks = {'before': study.network(None, 'default'), 'all': study.network(seed, 'default')}
+    networks |= {name: _taught(study, seed, *way, stream) for name, way in ways.items()}
+    numbers = {f'{name}_rad': estimation_error(mae, held_out) for name, mae in networks.items()}
+    for name, key in ('all', 'ellipsoid_share'), ('none', 'none_ellipsoid_share'):
+        if networks[name].covariance is not None:
+            numbers[key] = ellipsoid_share(networks[name], held_out)
     return Measured(numbers, {})
 
 

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from msgspec import Struct, yaml
+from msgspec import Struct
+
+from musculoskeletal_ae.files import read_table
 
 NOTHING = '–'
 
@@ -59,9 +60,7 @@ class Row(Struct, frozen=True):
 
 
 #: by experiment
-ROWS = yaml.decode(
-    Path(__file__).with_name('table.yaml').read_bytes(), type=dict[str, tuple[Row, ...]]
-)
+ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[Row, ...]])
 
 
 def _at(result: Mapping[str, Any], key: str) -> float | None:

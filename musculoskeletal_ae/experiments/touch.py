@@ -54,7 +54,7 @@ class FeelingLoop(ClosedLoop):
         """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
-        self.core.target({n: (t, 0.0) for n, t in zip(self.arm.robot.joints, theta.tolist())})
+        self.target(theta)
         for _ in range(round(MOVE / SAMPLE_TIME)):
             self.feel()
 
@@ -184,16 +184,14 @@ def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, f
     loop = FeelingLoop(arm, study.network(seed), settings, seed)
     loop.rest(_holdable(study.robot, rng))
     loop.core.configure(replace(settings, method='float'))
-    for _ in range(round(MOVED / SAMPLE_TIME)):
-        loop.step()
+    loop.wait(MOVED)
     start, drift = arm.theta, 0.0
     for _ in range(round(FLOATING / SAMPLE_TIME)):
         loop.step()
         drift = max(drift, float(np.abs(arm.theta - start).max()))
     before = arm.hand.translation.copy()
     loop.push(_force(study.robot, rng, LIGHT, FIRM))
-    for _ in range(round(MOVED / SAMPLE_TIME)):
-        loop.step()
+    loop.wait(MOVED)
     loop.check()
     return drift, float(np.linalg.norm(arm.hand.translation - before))
 

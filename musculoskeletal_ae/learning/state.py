@@ -93,7 +93,7 @@ class State:
         return self._file.stat().st_size == 0
 
     def _files(self) -> list[Path]:
-        names = FILE, f'{FILE}-journal', OLD
+        names = FILE, f'{FILE}-journal'
         return [file for name in names if (file := self.directory / name).exists()]
 
     def _open(self) -> None:
@@ -138,7 +138,7 @@ class State:
                 except CheckpointError as error:
                     problem = problem or f'the saved network: {error}'
             if problem:
-                self._put_away(self._files(), problem)
+                self._put_away([old] if self._empty() else self._files(), problem)
             # With a full disk the learner goes on with what was read, and says so.
             self.keep(samples, None if mae is None else data)
         except OSError as error:

@@ -9,14 +9,13 @@ object is made, so one estimate is six small matrix products and nothing else. T
 single precision: a large body's weights then fit into a core's cache, and 1e-6 of a network's
 spread is far below its error. Arrays of double precision go in and come out.
 
-Isolated muscles say nothing: what their sensors read has no influence. Their place in ② is taken by
-what the others make likely, found in two steps:
+Isolated muscles say nothing: what their sensors read has no influence. θ is what the others make
+likely, and T and l are those of ② with the lengths in the place of theirs that belong to it:
 
-    θ  = argmin ‖l − ①(θ, T)‖² + (σ/s)² ‖θ − θ̄‖²      l of the others; θ̄, s: mean and spread of θ
-    l' = ①(θ, T) of the isolated,  θ = ②(T, l')        PASSES times
+    θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T)      l of the others; θ̄, s: mean and spread
 
-(the network's own inverse finds what the lengths alone determine, and then ② weighs them as it has
-learned to).
+Σ is that of the healthy lengths' residuals, which ② leaves. Those lack what a wrong θ explains,
+but generalised least squares come to the same with it or without, whichever rows are left.
 """
 
 from __future__ import annotations
@@ -31,15 +30,16 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints, Singles
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
-from musculoskeletal_ae.mae.units import Mask, State, scale_vector, visible
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask, State, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
 
 # Without isolated muscles:
-NEWTON_STEPS, PASSES = 5, 2
-LENGTH_SPREAD = 0.003  # σ [m]
+NEWTON_STEPS, SETTLED = 10, 1e-4  # at most; [rad] of the last one
+#: σ of a length [m] beyond its healthy residuals, and where those are not known
+LENGTH_NOISE, LENGTH_SPREAD = 0.0003, 0.003
 
 
 class BlockDiagonal:
@@ -312,24 +312,34 @@ class Mae:
             return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
         tension, length, lost = tension.copy(), length.copy(), list(self.isolated)
         joints, muscles = len(self.joints), len(self.muscles)
-        scale = scale_vector(joints, muscles)
-        mean, small = self.mean / scale, np.square(LENGTH_SPREAD / self.std[:joints])
-        tension[..., lost] = mean[joints:-muscles][lost]
+        mean = self.mean / scale_vector(joints, muscles)
+        tension[..., lost], length[..., lost] = mean[joints:-muscles][lost], 0.0
         theta = np.broadcast_to(mean[:joints], (*length.shape[:-1], joints))
-        known = np.ones(muscles)
-        known[lost] = 0.0
+        prior = np.diag(1.0 / np.square(self.std[:joints]))
         for _ in range(NEWTON_STEPS):
-            left = np.where(known, length - self.lengths(theta, tension), 0.0)
-            jacobian = self.muscle_jacobian(theta, tension) * known[:, None]
-            across = jacobian.swapaxes(-1, -2)
-            push = (across @ left[..., None])[..., 0] + small * (mean[:joints] - theta)
-            turn = np.linalg.solve(across @ jacobian + np.diag(small), push[..., None])[..., 0]
+            likely, jacobian = self._lengths_and_jacobian(theta, tension)
+            pull = jacobian.swapaxes(-1, -2) @ self._length_weight
+            push = pull @ (length - likely)[..., None] + prior @ (mean[:joints] - theta)[..., None]
+            turn = np.linalg.solve(pull @ jacobian + prior, push)[..., 0]
             theta = theta + turn
-        for _ in range(PASSES):
-            length[..., lost] = self.lengths(theta, tension)[..., lost]
-            state = self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
-            theta = state.theta
-        return state
+            if np.abs(turn).max() < SETTLED:
+                break
+        length[..., lost] = self.lengths(theta, tension)[..., lost]
+        state = self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
+        return state._replace(theta=theta)
+
+    @cached_property
+    def _length_weight(self) -> Array:
+        """Σ⁻¹ of the lengths [1/m²], (M, M); 0 of isolated muscles."""
+        muscles = len(self.muscles)
+        used = np.delete(np.arange(muscles), self.isolated)
+        rows, weight = np.ix_(used, used), np.zeros((muscles, muscles))
+        if self.anomaly is None:
+            weight[used, used] = LENGTH_SPREAD**-2
+        else:
+            seen = self.anomaly.covariance[muscles:, muscles:][rows] / LENGTH_SCALE**2
+            weight[rows] = np.linalg.inv(seen + LENGTH_NOISE**2 * np.eye(len(used)))
+        return weight
 
     def without(self, isolated: Iterable[int]) -> Mae:
         """Return the same network with these muscles isolated, and no others.
@@ -366,20 +376,24 @@ class Mae:
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
+        return self._lengths_and_jacobian(theta, tension)[1]
+
+    def _lengths_and_jacobian(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         x = np.concatenate((theta, tension), axis=-1)
         # Each joint by itself, but of all groups at once: those do not meet.
         turn = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
         for group in self.groups:
             turn[np.arange(len(group.joints)), group.joints] = 1.0
         z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
-        slopes = self._leave_length.tangent(z, tangent)[1].swapaxes(-1, -2)
+        length, slopes = self._leave_length.tangent(z, tangent)
+        slopes = slopes.swapaxes(-1, -2)
         if len(self.groups) == 1:
-            return slopes
+            return length, slopes
         result = np.zeros((*x.shape[:-1], len(self.muscles), len(self.joints)))
         for joints, muscles in self.groups:
             rows, columns = np.ix_(muscles, joints)
             result[..., rows, columns] = slopes[..., muscles, : len(joints)]
-        return result
+        return length, result
 
     def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
         """Return G as the paper takes it, by forward difference of ① (it does not print Δθ)."""

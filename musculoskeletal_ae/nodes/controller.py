@@ -219,7 +219,9 @@ class Controller(Shell):
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
         stopped = [report.message] if self.core.safety.cause else []
-        stiffness = [f'{k}: {v}' for k, v in report.values.items() if k.startswith('joint stiff')]
+        changing = self.core.follows and self.core.motion.moving
+        held = {} if changing else report.values
+        stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
         for line in stopped + stiffness:
             if line not in self.logged:
                 log = self.get_logger().warning if line in stopped else self.get_logger().info

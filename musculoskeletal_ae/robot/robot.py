@@ -11,11 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import (
-    RobotDescription,
-    TensionRange,
-    load_description,
-)
+from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
 from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.routes import Routes

@@ -88,16 +88,21 @@ def holding_tension(
 
 
 def least_tension(
-    muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
+    muscle_jacobian: Array,
+    torque: Array,
+    low: Array | float,
+    high: Array | float,
+    desired: Array | float = 0.0,
 ) -> Exertion:
     """Return the least tensions that produce a torque, or else what comes nearest to it.
 
-    Hard where it can be, soft where the limits do not allow it. Arguments as for
-    `TensionProgramme`; the error is raised only if an entry is not finite.
+    Hard where it can be, and then the nearest to a desired T [N], (M,); soft where the limits do
+    not allow it. Arguments as for `TensionProgramme`; the error is raised only if an entry is not
+    finite.
     """
     programme = TensionProgramme(muscle_jacobian, torque, low, high)
     try:
-        return Exertion(programme.nearest(0.0), np.zeros(len(torque)))
+        return Exertion(programme.nearest(desired), np.zeros(len(torque)))
     except InfeasibleError:
         return programme.compromise()
 

@@ -79,6 +79,7 @@ def train(args: Namespace) -> None:
 
 
 def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
+    """Learn from recordings in their order, those held out judged only; print errors."""
     # Read before the network is trained, which takes longer than finding a bag unusable.
     recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
     if args.checkpoint:
@@ -87,7 +88,17 @@ def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
         print(f'training the network of {robot.description.directory.name} to start from')
         mae = initial_mae(robot, args.preset, args.seed, steps=steps).mae
     learner = Learner(robot, mae, args.preset, args.seed)
-    train_from_bags(learner, recordings, args.hold_out)
+    before = {path: error(mae, pairs) for path, pairs in recordings.items()}
+    for path, pairs in recordings.items():
+        if path not in args.hold_out:
+            total = round(pairs.time[-1] - pairs.time[0], 1)
+            with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
+                learn(learner, pairs, bar.update)
+    print(f'{len(learner.samples)} samples, {learner.updates} updates')
+    for path, pairs in recordings.items():
+        kind = 'held out' if path in args.hold_out else 'learned from'
+        after = error(learner.mae, pairs)
+        print(f'{path} ({kind}): {before[path]:.4f} → {after:.4f} rad against its joint sensors')
     return learner
 
 
@@ -136,21 +147,6 @@ def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
     estimate = mae.estimate(recording.tension, recording.length).theta
     return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
-
-
-def train_from_bags(learner: Learner, recordings: dict[Path, Pairs], held_out: list[Path]) -> None:
-    """Learn from recordings in their order, those held out judged only; print errors."""
-    before = {path: error(learner.mae, pairs) for path, pairs in recordings.items()}
-    for path, pairs in recordings.items():
-        if path not in held_out:
-            total = round(pairs.time[-1] - pairs.time[0], 1)
-            with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
-                learn(learner, pairs, bar.update)
-    print(f'{len(learner.samples)} samples, {learner.updates} updates')
-    for path, pairs in recordings.items():
-        kind = 'held out' if path in held_out else 'learned from'
-        after = error(learner.mae, pairs)
-        print(f'{path} ({kind}): {before[path]:.4f} → {after:.4f} rad against its joint sensors')
 
 
 def table(errors: list[PairError], title: str) -> str:

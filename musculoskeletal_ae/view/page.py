@@ -16,13 +16,14 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from html import escape
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import trimesh
 import viser
+from jinja2 import Environment, FileSystemLoader
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Ints
@@ -44,19 +45,8 @@ LOCAL = ('localhost', '127.0.0.1', '::1')
 PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
 MOST_PAYLOAD = 5.0  # [kg]
 HOT = 80.0  # [°C] at the right end of a bar
-LEGEND = (
-    '<div style="font-size:11px;padding:6px 10px">{}<br>T_bias <span style="display:inline-block;'
-    'width:90px;height:8px;background:linear-gradient(90deg,rgb{},rgb{})"></span> T_limit<br>'
-    '✂ cut &nbsp; ? suspect &nbsp; ⊘ isolated</div>'
-).format(
-    ''.join(f'<span style="color:rgb{rgb}">●</span> {arm} &nbsp; ' for arm, rgb in ARMS.items()),
-    *(tuple(end.tolist()) for end in body.ENDS),
-)
-ALARM = (
-    '<div style="background:#b00020;color:#fff;font-weight:700;padding:6px 8px;border-radius:6px;'
-    'margin-bottom:4px">{}</div>'
-)
-BAR = '<td style="width:{}%;background:linear-gradient(90deg,{} {:.0f}%,#e8e8e8 0)">'
+ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
 
 
 class Page:
@@ -178,7 +168,7 @@ class Page:
                 for title, (lines, _) in CURVES.items()
             ]
             self._bars = gui.add_html('')
-            gui.add_html(LEGEND)
+            gui.add_html(str(HTML.legend(ARMS, [tuple(end.tolist()) for end in body.ENDS])))
         panel.dock_left()
         panel.set_width(350)
         with gui.add_folder('Show'):
@@ -229,10 +219,8 @@ class Page:
 
         Those are error [rad], A, d and its limit at a time [s], NaN where it is not known.
         """
-        told = ALARM.format(escape(alarm)) if alarm else ''
-        told += ''.join(f'<div>{escape(line)}</div>' for line in lines)
-        self._status.content = f'<div style="font-size:13px;padding:0 10px">{told}</div>'
-        self._bars.content = self._bar_chart(*states)
+        self._status.content = str(HTML.status(alarm, lines))
+        self._bars.content = str(HTML.bars(self._muscles(*states)))
         self._curves.append([now, *values])
         while self._curves[0][0] < now - HISTORY:
             self._curves.popleft()
@@ -244,23 +232,19 @@ class Page:
             for plot, (_, columns) in zip(self._plots, CURVES.values()):
                 plot.data = (table[:, 0] - now, *table[:, columns].T)
 
-    def _bar_chart(self, tension: Array, temperature: Array) -> str:
-        rows, rgb = [], body.colours(self._robot, tension, self._kinds).tolist()
-        full = 100.0 * np.clip(tension / self._robot.tension.limit, 0.0, 1.0)
-        hot = 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0)
-        for m, (name, kind) in enumerate(zip(self._robot.muscles, self._kinds.tolist())):
-            warm = f'{temperature[m]:.0f} °C' if np.isfinite(temperature[m]) else '–'
-            pull, name = f'{tension[m]:.0f} N', escape(name)
-            title = f'{name}: {pull}, {warm}, {Kind(kind).name.lower()}'
-            rows.append(
-                f'<tr title="{title}" style="font-weight:{700 if kind else 400}">'
-                f'<td>{MARKS[kind]}{name}</td>{BAR.format(40, f"rgb{(*rgb[m],)}", full[m])}</td>'
-                f'<td>{pull}</td>{BAR.format(14, "#8c6d1f", hot[m])}</td><td>{warm}</td></tr>'
-            )
-        return (
-            '<table style="font-size:11px;line-height:1;width:100%;white-space:nowrap;'
-            f'border-spacing:6px 2px;border-collapse:separate">{"".join(rows)}</table>'
-        )
+    def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
+        """Return what the bars show of each muscle."""
+        columns = {
+            'rgb': map(tuple, body.colours(self._robot, tension, self._kinds).tolist()),
+            'share': 100.0 * np.clip(tension / self._robot.tension.limit, 0.0, 1.0),
+            'heat': 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0),
+            'name': self._robot.muscles,
+            'mark': [MARKS[kind] for kind in self._kinds],
+            'kind': [Kind(kind).name.lower() for kind in self._kinds],
+            'pull': [f'{each:.0f} N' for each in tension],
+            'warm': [f'{each:.0f} °C' if np.isfinite(each) else '–' for each in temperature],
+        }
+        return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
     def notify(self, text: str, good: bool) -> None:
         """Show every visitor what became of a request."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Following trajectories, without an arm: sensor data is made up, time is counted by the test."""
+"""Following trajectories, without an arm: sensor data is made up, time is counted by the test.
+
+Where the arm matters it is an emulated one.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
+from exact_mae import ExactMae
 
+from bench.control_nominal import nominal_arm
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.hand import Hand
+from musculoskeletal_ae.control.methods import StiffnessModel
 from musculoskeletal_ae.control.motion import SETTLING, Winches, slowness
-from musculoskeletal_ae.control.safety import LENGTH
+from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 
 STILL = np.zeros((1, 2))
@@ -52,9 +60,17 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
 
 
-def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(bench, monkeypatch):
-    bench.core.trajectory(points(OTHER))
-    moved(bench, round((1.0 + SETTLING) / DT) + 60)
+@pytest.mark.parametrize(('dt', 'ramp'), [(DT, False), (0.002, False), (DT, True)])
+def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(
+    bench, dt, ramp, monkeypatch
+):
+    bench.dt = dt
+    if ramp:
+        bench.configure(first_duration=1.0)
+        bench.target(OTHER)
+    else:
+        bench.core.trajectory(points(OTHER))
+    moved(bench, round((1.6 + SETTLING) / dt))
     solved = []
 
     def refused(*_):
@@ -62,11 +78,12 @@ def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(bench, 
 
     monkeypatch.setattr(bench.mae, 'lengths', refused, raising=False)
     monkeypatch.setattr(bench.mae, 'muscle_jacobian', refused, raising=False)
+    monkeypatch.setattr(bench.core.motion.winches, 'step', refused)  # noise would be taken for λ
     from musculoskeletal_ae.control import posture
 
     real = posture.least_tension
     monkeypatch.setattr(posture, 'least_tension', lambda *a: solved.append(1) or real(*a))
-    bench.step(100)
+    bench.step(round(1.0 / dt))
     assert not bench.core.safety.cause
     assert 5 <= len(solved) <= 12
 
@@ -161,17 +178,83 @@ def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench
     assert 'clamped' in bench.report().message
 
 
-def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands():
+@pytest.mark.parametrize('dt', [DT, 0.002])
+def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands(dt):
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
-    for _ in range(300):
-        speed = rng.uniform(-0.2, 0.2, ROBOT.muscle_count)
-        tension = rng.uniform(60.0, 120.0, ROBOT.muscle_count)
-        length = length + speed * DT
+    for n in range(round(3.0 / dt)):
+        if n % round(0.1 / dt) == 0:
+            speed = rng.uniform(-0.2, 0.2, ROBOT.muscle_count)
+            tension = rng.uniform(60.0, 120.0, ROBOT.muscle_count)
+        length = length + speed * dt
         command = length - (tension - ROBOT.tension.bias) / ROBOT.stiffness + lag * speed
         noise = rng.normal(0.0, 1e-4, ROBOT.muscle_count)
-        winches.step(length + noise, tension, command, DT)
+        winches.step(length + noise, tension, command, dt)
     assert winches.lag == pytest.approx(lag, rel=0.15)
+
+
+def driven(arm, intervals=(10,), push=0.0, **chosen):
+    """Return by how much an emulated arm is off the desired θ [rad] in a motion of 1 s, (N, 2).
+
+    Messages come after some of these times [ms]; the hand is pushed by a force [N].
+    """
+    core, rng = Controller(ROBOT, Settings(rate_limit=0.3, **chosen)), np.random.default_rng(0)
+    core.use(ExactMae(ROBOT))
+    arm.reset(REST)
+    now, off = 0.0, []
+    while not off or core.motion.moving:
+        theta, *read = arm.sense()
+        core.muscles(Muscles(*read), now)
+        core.estimated(theta, now)
+        if core.motion.trajectory is None:
+            core.trajectory(points(REST, 0.5))
+        elif now > 0.6 and not off:
+            core.trajectory(points(OTHER))
+            arm.set_wrench(np.array([push, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        arm.command_length(core.step(now).value)
+        if now > 0.6:
+            off.append(core.motion.desired.theta - arm.theta)
+        interval = 0.001 * rng.choice(intervals)
+        arm.step(interval)
+        now += interval
+    assert not core.safety.cause
+    return np.array(off)
+
+
+def test_a_motion_is_followed_as_well_by_500_messages_a_second_and_by_irregular_ones():
+    arms = [EmulatedArm(ROBOT, seed) for seed in range(3)]
+
+    def error(*intervals):
+        return np.array([np.linalg.norm(driven(arm, intervals), axis=1).mean() for arm in arms])
+
+    usual = error(10)
+    for intervals in ((2,), (1, 2, 4, 8, 15, 25)):
+        assert error(*intervals).mean() < usual.mean() + usual.std()
+
+
+def test_with_method_stiffness_the_arm_gives_way_in_motion_and_comes_along():
+    arm, turned = nominal_arm(ROBOT), {}
+    for method in ('proposed', 'stiffness'):
+        free, pushed = (driven(arm, push=push, method=method) for push in (0.0, 6.0))
+        assert np.linalg.norm(free, axis=1).mean() < 0.05
+        turned[method] = np.linalg.norm(pushed - free, axis=1)[len(free) // 2 :].mean()
+    assert turned['stiffness'] > 1.5 * turned['proposed']
+
+
+def test_a_desired_stiffness_is_kept_on_the_way_and_at_its_end(bench):
+    motion, sent = bench.core.motion, []
+    bench.configure(method='stiffness', joint_stiffness=(1000.0, 0.0))
+    bench.core.trajectory(points(OTHER))
+    for steps, desired in ((50, 1000.0), (40, 1000.0), (200, 1000.0), (100, 1.0)):
+        bench.configure(joint_stiffness=(desired, 0.0))
+        sent += moved(bench, steps)
+        model = StiffnessModel.read(ROBOT, bench.mae, motion.desired.theta, motion._tension)
+        planned = model.joint_stiffness(motion._tension)[0, 0]
+        _, lowest, highest = motion.solution.stiffness
+        end = (highest if desired > 1.0 else lowest)[0]
+        assert abs(planned - end) < 0.3 * (highest - lowest)[0]
+    assert 'desired 1.00 clamped' in bench.report().values['joint stiffness shoulder']
+    assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():

@@ -130,12 +130,20 @@ def test_what_the_arm_s_own_motion_shortens_is_no_slack_wound_in(robot, mae, jud
 
 
 @pytest.mark.parametrize(
-    ('away', 'cut', 'found'), [(0.0, 0, True), (0.5, 0, False), (0.5, 1, True)]
+    ('away', 'most', 'cut', 'found'),
+    [
+        (0.0, 0.5, 0, True),
+        (0.5, 0.5, 0, False),
+        (0.5, 0.5, 1, True),
+        (0.0, 1.5, 0, False),
+        (0.0, 1.5, 1, True),
+    ],
 )
 def test_far_from_what_was_calibrated_less_is_sure_but_not_of_a_slack_muscle(
-    robot, calibrated, judge, healthy, away, cut, found
+    robot, calibrated, judge, healthy, away, most, cut, found
 ):
-    message = healthy._replace(tension=healthy.tension * (1.0 - cut * np.eye(6)[2]))
+    tension = np.where(np.arange(6) == 0, most * robot.tension.limit, healthy.tension)
+    message = healthy._replace(tension=tension * (1.0 - cut * np.eye(6)[2]))
     state = calibrated.estimate(*message)
     distance = judge(calibrated)[1](message)[0].distance
     known = state.theta[None] + away * (robot.upper - robot.lower)

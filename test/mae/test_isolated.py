@@ -62,6 +62,17 @@ def test_the_others_tell_the_posture(trained, states):
     assert at.shape == mae.without((1,)).encode(Mask.THETA_TENSION, theta, tension).shape
 
 
+def test_a_joint_at_its_end_is_not_taken_for_one_in_the_middle(trained):
+    mae, tension = trained['default'], np.full((4, 6), 60.0)
+    ends = np.array([ROBOT.lower, ROBOT.upper])
+    theta = np.array([ends[[i, j], [0, 1]] for i in (0, 1) for j in (0, 1)])
+    length = ROBOT.muscle_lengths(theta, tension)
+    healthy = np.abs(mae.estimate(tension, length).theta - theta).mean()
+    for lost in range(6):
+        off = np.abs(mae.without((lost,)).estimate(tension, length).theta - theta)
+        assert off.mean() < healthy
+
+
 def test_healthy_statistics_are_those_of_the_others(trained):
     mae = trained['default']
     mae = replace(mae, anomaly=replace(mae.anomaly, calibrated=True))
