@@ -5,6 +5,7 @@ python -m bench.learning_changes [--robot …] [--seeds 0,1] [--quick]
 
 - camera: what `joint_source: marker` learns of the same motion as `sensor`; a marker on the hand at
   33 Hz, with a camera's noise, and inverse kinematics started from the estimate.
+- slow: what a learner learns that takes slow motion for rest, too, by its parameters (`SLOW`).
 - offset: one length sensor shifts by 10 mm after ten minutes of learning.
 - replaced: one muscle's elastic unit, wire, cable and sensors become another individual's.
 
@@ -35,6 +36,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
@@ -42,6 +44,7 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
+SLOW = Settings(rest_time=0.2, rest_joint_rate=0.5, rest_length_rate=0.05)
 EVERY = 3  # messages between two pictures of the camera: 33 Hz
 OFFSET = 0.010  # [m]
 #: of motion after the change, after which the error is read [minutes]
@@ -129,10 +132,15 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     watched = zip(*before.exploring, strict=True)
     follow(watcher, watched, before.held_out, camera(robot, before.exploring, seed))
     by_camera = estimation_error(watcher.mae, before.held_out)
+    slow = Learner(robot, mae, seed=seed, settings=SLOW)
+    follow(slow, zip(*before.exploring, strict=True), before.held_out)
+    in_motion = estimation_error(slow.mae, before.held_out)
     initial = estimation_error(mae, before.held_out)
     head = f'individual {seed}, {minutes:g} min: error before {initial:.4f} rad, after: '
     ratio = by_camera / by_sensor
     lines = [f'{head}sensor {by_sensor:.4f}, marker {by_camera:.4f} rad, × {ratio:.2f}']
+    counts = f'{len(slow.samples)} samples, {len(learner.samples)} of rests only'
+    lines.append(f'  slow motion, too: {in_motion:.4f} rad from {counts}')
     shifted = EmulatedArm(robot, seed, individual)
     shifted.set_length_offset(OFFSET * np.eye(robot.muscle_count)[muscle])
     other = replaced(robot, individual, muscle, Individual(robot, seed + 1000))
