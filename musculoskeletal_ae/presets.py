@@ -54,8 +54,9 @@ class Preset:
 
     The numbers of `default` are those of an arm of 5 joints and 10 muscles. In proportion to
     the D + M of a larger group its layers grow (by the root of it the error of θ does, from 0.0030
-    to 0.0045 rad a joint at 17 × 40), and by the largest group of a body the mini-batches of
-    initial training. An update has as many for any body: it is to be short.
+    to 0.0045 rad a joint at 17 × 40), and by its power of 1.5 in the largest group of a body the
+    mini-batches of initial training (in proportion, ② is worse at 17 × 40 than at 5 × 10; so it is
+    a tenth better). An update has as many for any body: it is to be short.
     """
 
     name: str
@@ -66,10 +67,14 @@ class Preset:
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
     whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 
-    def grown(self, number: int, groups: Iterable[Group]) -> int:
-        """Return a number of steps, or of units of a group's layer, as it is for given groups."""
-        largest = max(sum(map(len, group)) for group in groups)
-        return round(number * max(1.0, largest / REFERENCE)) if self.network.grouped else number
+    def grown(self, number: int, groups: Iterable[Group], power: float = 1.0) -> int:
+        """Return a number of units of a group's layer, or of steps, as it is for given groups."""
+        times = max(1.0, max(sum(map(len, group)) for group in groups) / REFERENCE)
+        return round(number * times**power) if self.network.grouped else number
+
+    def steps(self, groups: Iterable[Group]) -> int:
+        """Return the mini-batches of initial training for given groups."""
+        return self.grown(self.training.steps, groups, 1.5)
 
     def blocks(self, groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
         """Return the groups that have a block of the network each, with its hidden layers."""

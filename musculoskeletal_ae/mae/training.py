@@ -212,7 +212,7 @@ def initial_mae(
     Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
     """
     chosen = preset_named(preset)
-    count = chosen.grown(chosen.training.steps, robot.groups) if steps is None else steps
+    count = chosen.steps(robot.groups) if steps is None else steps
     settings = replace(chosen.training, steps=count)
     rng = np.random.default_rng(seed)
     samples = training_states(robot, preset, settings.samples, rng).scaled()

@@ -49,7 +49,7 @@ def train(args: Namespace) -> None:
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
     robot = Robot.load(args.robot)
     preset = PRESETS[args.preset]
-    steps = preset.grown(preset.training.steps, robot.groups) // (10 if args.quick else 1)
+    steps = preset.steps(robot.groups) // (10 if args.quick else 1)
     if args.from_bag:
         checkpoint.save(_learned(robot, args, steps).mae, args.out)
         print(f'checkpoint: {args.out}')

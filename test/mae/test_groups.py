@@ -77,6 +77,7 @@ def test_layers_and_steps_grow_with_a_group_beyond_that_of_the_arm_and_never_in_
     assert list(blocks.values()) == [(200, 100), (200, 100), (280, 140)]
     assert DEFAULT.grown(3000, (arm, small)) == 3000
     assert DEFAULT.grown(3000, (arm, large, small)) == 4200
+    assert DEFAULT.steps((arm, large, small)) == round(3000 * 1.4**1.5)
     assert PAPER.grown(3000, (large,)) == 3000
     assert not PAPER.blocks((arm, large))
 
