@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The corrected body: the geometric model with other constants, plus a smooth rest; and its fit.
 
-    l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o + ψ(θ)ᵀ v
+    l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
 
 Attachments p are off by millimetres (δ), elastic constants c by some per cent (κ), the length
 sensor by its zero (o), wires wrap round bones that the straight lines do not know (ψ, random
 Fourier features over the joints that the muscle crosses), and a wire that slides reads a tension
 that differs from the one at its elastic unit (μ: friction of the route, s: direction of the last
-sliding, +1 wound in, −1 paid out). All parameters zero is the geometric model itself.
+sliding, +1 wound in, −1 paid out). Wires creep, by r from one sample to the next: a sample after
+which a others came says what the length was then. All parameters zero is the geometric model.
 
 The fit to samples is maximum a posteriori and robust, together with the samples' postures
 (`postures`), from where the last fit ended. The prior spreads s are physical: how far a hand places
@@ -42,16 +43,16 @@ LARGEST_LOG = 1.5
 
 
 class Layout:
-    """Where the parameters of one muscle are: δ (three per route point), κ, μ, o, v."""
+    """Where the parameters of one muscle are: δ (three per route point), κ, μ, o, r, v."""
 
     def __init__(self, points: Ints, features: int) -> None:
         end = 3 * len(points)
         self.points = points  # its route points
         self.attachment = slice(0, end)  # δ [m]
         self.elastic = slice(end, end + 3)  # κ: log of force, rate, wire_stretch over nominal ones
-        self.friction, self.offset = end + 3, end + 4  # μ; o [m]
-        self.size = end + 5 + features
-        self.rest = slice(end + 5, self.size)  # v [m]
+        self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
+        self.size = end + 6 + features
+        self.rest = slice(end + 6, self.size)  # v [m]
 
 
 class Poses(NamedTuple):
@@ -107,6 +108,11 @@ class CorrectedBody:
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
+    def crept(self, age: Array) -> Array:
+        """Return by how much lengths have grown since samples of an age (N,) [m], (N, M)."""
+        rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
+        return age[:, None] * np.array(rates)
+
     def poses(self, theta: Array) -> Poses:
         """Return the joint poses of θ (N, D) and, in the last place, of θ = 0."""
         theta, robot = np.vstack([theta, np.zeros(theta.shape[1])]), self.robot
@@ -149,8 +155,9 @@ class CorrectedBody:
         return result
 
     def linearised(
-        self, poses: Poses, theta: Array, tension: Array, direction: Array, m: int
-    ) -> tuple[Array, Array]:
+        self, poses: Poses, theta: Array, tension: Array, direction: Array, m: int,
+        age: Array | float = 0.0,
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
         θ [rad] (N, D) comes with its `poses`; T_i [N] and s_i are the muscle's own, shape (N,).
@@ -171,6 +178,7 @@ class CorrectedBody:
         smooth = self._smooth(theta, m)
         length = absolute - at_zero - elastic.elongation(absolute, end)
         length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
+        length -= age * parameters[layout.creep]
         slope = 1.0 - elastic.length_slope(end)
         jacobian = np.empty((len(theta), layout.size))
         jacobian[:, layout.attachment] = slope[:, None] * by_point[:-1] - by_point[-1]
@@ -183,7 +191,7 @@ class CorrectedBody:
             axis=1,
         )
         jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * direction
-        jacobian[:, layout.offset] = 1.0
+        jacobian[:, layout.offset], jacobian[:, layout.creep] = 1.0, -np.asarray(age)
         jacobian[:, layout.rest] = smooth
         return length, jacobian
 
@@ -206,6 +214,7 @@ class Prior:
     friction: float = 0.05  # relative tension loss along the route, around its mean
     friction_mean: float = 0.05
     offset: float = 0.001  # zero of the length sensor [m]
+    creep: float = 1e-5  # of a wire, from one sample to the next [m]
     smooth: float = 0.002  # the smooth rest [m]
 
     def spread(self, layout: Layout) -> Array:
@@ -214,7 +223,7 @@ class Prior:
         spread[layout.attachment] = self.attachment
         spread[layout.elastic] = self.elastic
         spread[layout.friction] = self.friction
-        spread[layout.offset] = self.offset
+        spread[layout.offset], spread[layout.creep] = self.offset, self.creep
         spread[layout.rest] = self.smooth
         return spread
 
@@ -290,7 +299,7 @@ def _fit_muscle(
     def linearised(parameters: Array) -> tuple[Array, Array]:
         body.parameters[m] = parameters
         tension, direction = seen.tension[:, m], seen.direction[:, m]
-        length, jacobian = body.linearised(poses, seen.theta, tension, direction, m)
+        length, jacobian = body.linearised(poses, seen.theta, tension, direction, m, seen.age)
         return seen.length[:, m] - length, jacobian
 
     def cost() -> float:

@@ -129,8 +129,8 @@ class _GroupFit:
             parts = np.append(0, 1 + turns)
             at = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(at, -1)] for part in poses))
-            pulls, ways = (np.tile(part, len(parts)) for part in (pull, way))
-            l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m)
+            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, seen.age))
+            l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m, age)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
             length[:, m] = seen.length[:, m] - l_m[0]
             by_body.append(j_m[0])
@@ -365,4 +365,4 @@ def fit_jointly(
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
     read = np.where(np.isnan(seen.theta), theta, seen.theta - zero * (seen.spread == 0.0))
     (length,) = body.lengths(read, seen.tension, seen.direction)
-    return seen.length - length, noise, weight, theta, root
+    return seen.length + body.crept(seen.age) - length, noise, weight, theta, root

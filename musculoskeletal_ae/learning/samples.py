@@ -50,6 +50,8 @@ class Observations:
     spread: Array = field(default_factory=lambda: NOTHING)  # see `Sample`, (N, D)
     #: (N, 3J), or (N, 0): no IMU anywhere
     gravity: Array = field(default_factory=lambda: NOTHING)
+    #: how many samples came after each, (N,)
+    age: Array = field(default_factory=lambda: NOTHING)
 
     def __post_init__(self) -> None:
         """Fill in what was left out."""
@@ -57,6 +59,8 @@ class Observations:
             object.__setattr__(self, 'spread', np.zeros_like(self.theta))
         if self.gravity.size == 0:
             object.__setattr__(self, 'gravity', np.zeros((len(self.theta), 0)))
+        if self.age.size == 0:
+            object.__setattr__(self, 'age', np.zeros(len(self.theta)))
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -132,8 +136,8 @@ class SampleStore:
         *columns, spreads, gravities = zip(*self.samples, strict=True)
         theta, tension, length, direction = map(np.array, columns)
         spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
-        known = np.array(self.known)
-        return Observations(theta, tension, length, direction, known, spread, gravity)
+        known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
+        return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
     def _scaled(self, sample: Sample) -> Array:
         joint, tension = self._settings.new_joint_distance, self._settings.new_tension_distance

@@ -238,7 +238,7 @@ class BodyUpdater(Updater):
         real = seen[rows]
         still = np.zeros_like(real.direction)
         with_friction, without = self.body.lengths(real.theta, real.tension, real.direction, still)
-        length = real.length + without - with_friction
+        length = real.length + self.body.crept(real.age) + without - with_friction
         data.seen[: len(rows)] = real.state().scaled()
         data.true[: len(rows)] = real.state()._replace(length=length).scaled()
 
