@@ -50,7 +50,7 @@ class Observations:
     spread: Array = field(default_factory=lambda: NOTHING)  # see `Sample`, (N, D)
     #: (N, 3J), or (N, 0): no IMU anywhere
     gravity: Array = field(default_factory=lambda: NOTHING)
-    #: how many samples came after each, (N,)
+    #: how many samples came after each, (N,); 0 in the first hours, in which no wire creeps far
     age: Array = field(default_factory=lambda: NOTHING)
 
     def __post_init__(self) -> None:
@@ -78,6 +78,7 @@ class Observations:
             self.known[:, muscles],
             self.spread[:, joints],
             self.gravity,
+            self.age,
         )
 
     def state(self) -> State:
@@ -137,6 +138,8 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns)
         spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
+        if self.accepted <= self.capacity:
+            age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
     def _scaled(self, sample: Sample) -> Array:

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
 from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -73,6 +76,21 @@ def test_bad_samples_do_not_poison_the_fit(arm26, stage):
     states = stage.states(300)
     assert rms(poisoned, *states) < 1.5 * rms(clean, *states)
     assert (fit.weight[::10] < 0.1).all()
+
+
+def test_wires_that_creep_are_followed(arm26, stage):
+    store, creep = SampleStore(capacity=100), 1e-5 * np.array([1.0, 1.0, 1.0, -1.0, 0.5, 0.0])
+    for n in range(500):
+        sample = stage.sample()
+        store.add(sample._replace(length=sample.length + n * creep))
+    seen, (theta, tension, length) = store.observations(), stage.states(300)
+    body, unaware = CorrectedBody(arm26), CorrectedBody(arm26)
+    fit_body(body, seen)
+    fit_body(unaware, replace(seen, age=np.zeros(len(seen))))
+    rates = [p[at.creep] for p, at in zip(body.parameters, body.layouts, strict=True)]
+    np.testing.assert_allclose(rates, creep, atol=2e-6)
+    now = theta, tension, length + 500 * creep
+    assert rms(body, *now) < 0.75 * rms(unaware, *now)
 
 
 def test_samples_that_say_nothing_change_nothing(arm26, stage):
