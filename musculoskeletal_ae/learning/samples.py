@@ -50,7 +50,7 @@ class Observations:
     spread: Array = field(default_factory=lambda: NOTHING)  # see `Sample`, (N, D)
     #: (N, 3J), or (N, 0): no IMU anywhere
     gravity: Array = field(default_factory=lambda: NOTHING)
-    #: how many samples came after each, (N,); 0 in the first hours, in which no wire creeps far
+    #: how many samples came after each, (N,); 0 where no creep of wires can be told
     age: Array = field(default_factory=lambda: NOTHING)
 
     def __post_init__(self) -> None:
@@ -138,7 +138,9 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns)
         spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
-        if self.accepted <= self.capacity:
+        # Without angles, wires that creep look like postures that drift.
+        read = np.isfinite(theta).all(axis=1).mean()
+        if self.accepted <= self.capacity // 2 or read < 0.5:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 

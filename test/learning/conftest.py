@@ -28,13 +28,11 @@ def initial(trained):
 
 
 def drawn_body(robot, features: int, seed: int, scale: float) -> CorrectedBody:
-    """Return a body drawn from the prior, wrapping and all."""
+    """Return a body drawn from the prior, wrapping and all; it does not creep."""
     body, rng = CorrectedBody(robot, seed=features), np.random.default_rng(seed)
     for m, layout in enumerate(body.layouts):
-        spread = Prior().spread(layout)
-        body.parameters[m] = Prior().mean(layout) + scale * spread * rng.standard_normal(
-            layout.size
-        )
+        draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
+        body.parameters[m] = Prior().mean(layout) + scale * Prior().spread(layout) * draw
     return body
 
 
