@@ -257,21 +257,20 @@ class MotionControl:
 
     def _stiffening(self, mae: Mae, limit: Array, dt: float) -> Array:
         """Return T_K [N] (M,), as fast as it may change by what the plan leaves of the winches."""
-        robot, trajectory, before = self._robot, self.trajectory, self.solution
+        robot, trajectory, solution = self._robot, self.trajectory, self.solution
         assert trajectory is not None
         self._solved += dt
-        if before is None or self._solved >= AHEAD:
+        if solution is None or self._solved >= AHEAD:
             at, self._solved = trajectory.sample(self.time + AHEAD), 0.0
             torque = robot.kinematics.inverse_dynamics(*at) + self.effort
             desired = np.array(self.settings.desired_stiffness(robot.joint_count))
-            near = None if before is None else self._near
-            after = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
-            self._near = after.tension if near is None else near
-            self.solution = after
-        assert self.solution is not None
+            near = None if solution is None else self._near
+            solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            self._near = solution.tension if near is None else near
+            self.solution = solution
         # Half, since the elastic unit stretches as well.
         most = 0.5 * (1.0 - SHARE) * self.settings.rate_limit * robot.stiffness * dt
-        self._near = self._near + np.clip(self.solution.tension - self._near, -most, most)
+        self._near = self._near + np.clip(solution.tension - self._near, -most, most)
         return self._near
 
     def _held(self, mae: Mae, tension: Array, limit: Array, dt: float) -> Array:

@@ -113,19 +113,19 @@ def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> C
 def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: float) -> Followed:
     """Move between two postures [rad] (D,) in a time [s]."""
     core, arm = loop.core, loop.arm
-    names, planned = arm.robot.joints, Trajectory.to(Setpoint.resting(start), goal, duration)
+    planned = Trajectory.to(Setpoint.resting(start), goal, duration)
     if method == OURS:
         core.trajectory(planned.points)
         assert core.motion.trajectory is not None
         planned = core.motion.trajectory
     elif method != 'tension':
-        core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
+        loop.target(goal)
     theta, tension = [], []
     count = round(planned.duration / SAMPLE_TIME)
     desired = planned.sample(SAMPLE_TIME + times(count + round(REST / SAMPLE_TIME)))
-    for at in desired.theta.tolist():
+    for at in desired.theta:
         if method == 'tension':
-            core.target({name: (angle, 0.0) for name, angle in zip(names, at)})
+            loop.target(at)
         loop.step()
         theta.append(arm.theta)
         tension.append(np.linalg.norm(arm.tension))
@@ -138,8 +138,8 @@ def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: f
 
 def settling(loop: ClosedLoop, goal: Array) -> float:
     """Return how long it takes from a target [rad] (D,) until the arm stays near it [s]."""
-    names, last = loop.arm.robot.joints, 0
-    loop.core.target({name: (angle, 0.0) for name, angle in zip(names, goal.tolist())})
+    last = 0
+    loop.target(goal)
     for n in range(round(WATCHED / SAMPLE_TIME)):
         loop.step()
         last = n + 1 if np.linalg.norm(loop.arm.theta - goal) > WITHIN else last
@@ -201,8 +201,7 @@ def circle(
     """Go round once; return where the hand was to be and where it was [m], each (N, 3)."""
     loop.go(start, STARTING)
     loop.core.pose(place(0.0), False, -1.0)
-    for _ in range(round(1.5 / SAMPLE_TIME)):
-        loop.step()
+    loop.wait(1.5)
     wanted, true = [], []
     for n in range(round(LAP / SAMPLE_TIME)):
         if n % EVERY == 0:

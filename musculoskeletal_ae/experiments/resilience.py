@@ -145,7 +145,7 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
     ended: list[float | None] = []
     for theta in held[:TARGETS]:
         try:
-            loop.core.target({n: (a, 0.0) for n, a in zip(robot.joints, theta.tolist())})
+            loop.target(theta)
             rested, before = 0, loop.arm.theta
             for _ in range(GOING):
                 if rested == SETTLING:

@@ -20,6 +20,8 @@ from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
 
 CAPACITY = 400
+#: creep of wires is told from this share of a store on, if as many samples come with all angles
+CREEPING = 0.5
 NOTHING: Array = np.zeros(0)
 #: length that counts as a joint angle where none was read, per radian: a usual moment arm [m]
 MOMENT_ARM = 0.04
@@ -140,7 +142,7 @@ class SampleStore:
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
         # Without angles, wires that creep look like postures that drift.
         read = np.isfinite(theta).all(axis=1).mean()
-        if self.accepted <= self.capacity // 2 or read < 0.5:
+        if self.accepted <= CREEPING * self.capacity or read < CREEPING:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 

@@ -61,12 +61,12 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
 def _within(line: Line, middle: Array, reach: float) -> Line:
     """Return a line from where it enters a cube to where it leaves it."""
-    ends = line.points[[0, -1]]
-    if line.kind == 'bones':
-        ends = ends[0] + np.linspace(0.0, 1.0, 101)[:, None] * (ends[1] - ends[0])
-        inside = np.flatnonzero((np.abs(ends - middle) <= reach).all(axis=1))
-        return line._replace(points=ends[inside[[0, -1]] if len(inside) else inside])
-    return line
+    if line.kind != 'bones':
+        return line
+    start, end = line.points[[0, -1]]
+    points = start + np.linspace(0.0, 1.0, 101)[:, None] * (end - start)
+    inside = np.flatnonzero((np.abs(points - middle) <= reach).all(axis=1))
+    return line._replace(points=points[inside[[0, -1]] if len(inside) else inside])
 
 
 def save_picture(
