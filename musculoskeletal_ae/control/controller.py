@@ -448,6 +448,8 @@ class Controller:
             warnings.append('the target needs more torque than the muscles have')
         if self.short:
             warnings.append(f'out of reach: {self.short}')
+        if self._follows and self.motion.fallen:
+            warnings.append(self._lying())
         if self._left_out:
             values['isolated muscles'] = self._left_out
         if not self.safety.zeroed:
@@ -476,6 +478,15 @@ class Controller:
         if warnings:
             return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
         return Report('ok', doing, values)
+
+    def _lying(self) -> str:
+        """Return how far from its target an arm rests that fell, and what keeps it there."""
+        mae, estimate, off = self._mae, self._estimate, self.motion.error
+        assert mae is not None and estimate is not None  # it has moved
+        joint = int(np.abs(off).argmax())
+        told = f'fallen: {self._robot.joints[joint]} rests {abs(off[joint]):.2f} rad off its target'
+        lacks = reach.lacking(self._robot, mae, estimate)
+        return f'{told}, where the muscles lack {lacks}; lift it by hand' if lacks else told
 
     # -- time -----------------------------------------------------------------------------------
 

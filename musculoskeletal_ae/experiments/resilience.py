@@ -10,7 +10,8 @@ isolate`, on the exploring arm: every muscle is cut in turn, and it is right if 
 other, is isolated as broken within 10 s. After that `proposed` goes to random postures that the
 true body can hold without the muscle, a minute at most until it rests (which share of all that it
 holds with it is "held"; where that is none, the muscle has no targets and counts in all else);
-"known" is how many of those the learned body knows to hold, the others are refused. Every length
+"known" is how many of those the learned body knows to hold, the others are refused; "trapped", at
+how many of them the arm lay on a stop where the rest cannot hold it. Every length
 and tension sensor dies in turn (reads 0): the error counts from the isolation on, or from the fault
 if there is none. Five hours of healthy exploration, over all individuals, with 3.6 kg grasped and
 released each minute and a push of 10 to 30 N for a second every ten: isolations there are wrong.
@@ -20,12 +21,13 @@ from __future__ import annotations
 
 import copy
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import TRIES
+from musculoskeletal_ae.control.motion import FALLEN
 from musculoskeletal_ae.control.safety import Command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
@@ -123,11 +125,23 @@ def broken(arm: Arm, mae: Mae, seed: int, muscle: int, fault: str) -> tuple[Guar
     return loop, np.concatenate([*errors, loop.run(AFTERWARDS)])
 
 
-def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, list[float | None]]:
-    """Return the share of postures that the true body still holds without a muscle.
+class Reached(NamedTuple):
+    """What is left without a muscle.
 
-    And, of some of those, the distance at which `proposed` ends [rad], None where it refuses.
+    Attributes:
+        share: Of the postures that the true body holds, those that it still holds.
+        distances: At which `proposed` ends from some of those [rad], None where it refuses.
+        trapped: Those of an arm that fell to where the true body's other muscles cannot hold it:
+            it lies on a stop, from which they cannot lift it either.
     """
+
+    share: float
+    distances: list[float | None]
+    trapped: list[float]
+
+
+def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> Reached:
+    """Measure what an arm can still hold and go to without a muscle."""
     robot, held, count = loop.arm.robot, [], 0
     without = copy.copy(robot)
     without.isolate([muscle])
@@ -142,7 +156,7 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
             continue
         if count >= 100 and len(held) >= TARGETS:
             break
-    ended: list[float | None] = []
+    ended, trapped = list[float | None](), list[float]()
     for theta in held[:TARGETS]:
         try:
             loop.target(theta)
@@ -154,10 +168,16 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> tuple[float, 
                 still = np.abs(loop.arm.theta - before).max() < STILL
                 rested = rested + 1 if still and not loop.core.motion.moving else 0
                 before = loop.arm.theta
-            ended.append(float(np.linalg.norm(loop.arm.theta - theta)))
+            distance = float(np.linalg.norm(before - theta))
+            ended.append(distance)
+            if np.abs(before - theta).max() > FALLEN:
+                slope = loop.arm.individual.muscle_jacobian(before[None])[0]
+                holding_tension(without, before, jacobian=slope)
         except MessageError:
             ended.append(None)
-    return len(held) / max(count, 1), ended
+        except InfeasibleError:
+            trapped.append(distance)
+    return Reached(len(held) / max(count, 1), ended, trapped)
 
 
 def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[str]:
@@ -185,15 +205,17 @@ def measure(study: Study, seed: int) -> Measured:
     muscles = range(robot.muscle_count)
     one = [estimation_error(mae.without([m]), stream, stride) for m in muscles]
     two = [estimation_error(mae.without(pair), stream, stride) for pair in combinations(muscles, 2)]
-    right, ended, shares, dead, cuts = [], [], [], [], {}
+    right, ended, shares, dead, trapped, cuts = [], [], [], [], [], {}
     for m in rng.permutation(robot.muscle_count)[:1].tolist() if study.quick else muscles:
         loop, _ = broken(study.arm(seed), mae, seed, m, '')
         isolated, why = loop.found[0] if loop.found else ((), 'nothing')
         right.append(isolated == (m,))
-        share, distances = reach(loop, m, rng)
-        shares.append(share)
-        ended += distances
-        cuts[robot.muscles[m]] = {'found': why, 'held_share': share, 'estimate_rad': one[m]}
+        reached = reach(loop, m, rng)
+        shares.append(reached.share)
+        ended += reached.distances
+        trapped += reached.trapped
+        cut = {'found': why, 'held_share': reached.share, 'estimate_rad': one[m]}
+        cuts[robot.muscles[m]] = cut
         for sensor in ('length', 'tension'):
             loop, errors = broken(study.arm(seed), mae, seed, m, sensor)
             dead.append(float(errors.mean()))
@@ -211,13 +233,17 @@ def measure(study: Study, seed: int) -> Measured:
         'right_isolations_share': float(np.mean(right)),
         'held_share': float(np.mean(shares)),
         'known_share': len(arrived) / max(len(ended), 1),
+        'trapped': len(trapped),
         'dead_sensor_rad': float(np.mean(dead)),
         'wrong_isolations': sum(one.endswith('isolated') for one in found),
         'acquittals': sum(not one.endswith('isolated') for one in found),
         'healthy_s': duration,
         'muscles': cuts,
     }
-    numbers |= {'proposed_one_isolated_rad': float(np.mean(arrived))} if arrived else {}
+    if arrived:
+        numbers['proposed_one_isolated_rad'] = float(np.mean(arrived))
+    if free := len(arrived) - len(trapped):
+        numbers['proposed_not_trapped_rad'] = (sum(arrived) - sum(trapped)) / free
     return Measured(numbers, {'one': one, 'two': two, 'healthy': whole})
 
 

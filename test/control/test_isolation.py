@@ -23,6 +23,8 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 LOST = 0
 USED = np.arange(ROBOT.muscle_count) != LOST
+ROBOT_WITHOUT = copy.copy(ROBOT)
+ROBOT_WITHOUT.isolate([LOST])
 
 
 def held(theta, torque=0.0):
@@ -123,6 +125,18 @@ def test_an_arm_that_falls_on_its_way_goes_there_again_a_few_times():
                 ways.append(last)
             np.testing.assert_array_equal(last.end, THERE)
         assert len(ways) == 1 + times
+
+
+def test_what_keeps_a_fallen_arm_where_it_lies_is_told():
+    bench = Bench(target_duration=0.2)
+    bench.core.isolate([LOST])
+    bench.theta = NOT_THERE
+    bench.step()
+    bench.target(THERE)
+    for _ in range(150):
+        bench.step(100)
+    told = lacking(ROBOT_WITHOUT, bench.mae, NOT_THERE)
+    assert told and f'the muscles lack {told}; lift it by hand' in bench.report().message
 
 
 def test_a_way_leads_round_what_is_not_held():
