@@ -64,6 +64,7 @@ class Preset:
     training: TrainingSettings  # initial training
     corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
     least_samples: int  # from how many samples on it learns online
+    gated: bool  # the learner tries what it learned by `estimation.gate`; as printed it does not
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
     whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 

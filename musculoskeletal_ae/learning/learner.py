@@ -258,7 +258,7 @@ class Learner:
         self._statistics_hold |= is_calibrated(mae)
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
-        if self._passes(mae):
+        if not self.training.preset.gated or self._passes(mae):
             self._use(self._numbered(mae))
 
     def _passes(self, mae: Mae) -> bool:
