@@ -7,6 +7,9 @@ Messages, moving and resting, are kept in a reservoir, a uniform draw from all t
 new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
 friction gives d heavy tails, and on a part of the messages that Σ did not see. Glitches of
 a sensor are no part of that: a few messages at most, far beyond all the rest, are left out.
+
+Where joint sensors read all angles, the network learns from every second message, too (`update`);
+the others, which it has never seen, tell how good its estimates are.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
@@ -40,6 +43,7 @@ DIAGONAL_SHARE = 0.1
 #: this share of the messages is left out at most, and what is so many times beyond all others
 GLITCHES, GLITCH = 0.002, 3.0
 POSTURES = 200  # that tell where it was calibrated
+RECENT = 3600.0  # healthy time [s] in which messages are learned from: wires creep and bed in
 
 
 class Healthy(NamedTuple):
@@ -48,6 +52,9 @@ class Healthy(NamedTuple):
     messages: NDArray[np.float32]  # (T, l), (N, 2M)
     time: float  # that they were drawn from [s]
     rests: int  # how many different ones there were within
+    #: recent ones, moving or resting, with all angles: those that are learned, and those that judge
+    learned: Observations | None = None
+    judging: Observations | None = None
 
 
 class Reservoir:
@@ -62,23 +69,27 @@ class Reservoir:
     ) -> None:
         """Start empty; rests differ as samples do."""
         self._rng = np.random.default_rng([seed, 0x4E])
-        self._kept = np.empty((capacity, 2 * muscles), dtype=np.float32)
-        self._rests = SampleStore(settings)
+        self._muscles, self._capacity = muscles, capacity
+        self._kept: list[NDArray[np.float32]] = []
         self._seen, self._since = 0, 0.0
         self.time = 0.0  # healthy time seen [s]
+        self._rests = SampleStore(settings)
 
-    def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Take a message."""
+    def step(self, reading: Sample, dt: float) -> None:
+        """Take a message, with θ where joint sensors read it."""
         self._since += dt
         if self._since < SPACING - 1e-9:
             return
         self.time += min(self._since, 2.0 * SPACING)
         self._since = 0.0
-        capacity = len(self._kept)
-        place = self._seen if self._seen < capacity else int(self._rng.integers(self._seen + 1))
-        if place < capacity:
-            self._kept[place] = np.concatenate([tension, length])
         self._seen += 1
+        full = len(self._kept) == self._capacity
+        place = int(self._rng.integers(self._seen)) if full else len(self._kept)
+        if place < self._capacity:
+            theta = reading.theta if reading.spread.size == 0 else np.nan * reading.theta
+            muscles, when = reading[1:4], [self._rests.accepted, self.time]
+            row = np.concatenate([*muscles, theta, when], dtype=np.float32)
+            self._kept[place : place + 1] = [row]
 
     def rest(self, rest: Sample) -> None:
         """Count a rest if it differs from those before."""
@@ -87,13 +98,26 @@ class Reservoir:
 
     def clear(self) -> None:
         """Forget all, as when the body has changed."""
+        self._kept.clear()
         self._seen, self._since, self.time = 0, 0.0, 0.0
         self._rests.clear()
 
     def healthy(self) -> Healthy:
         """Return what was seen."""
-        messages = self._kept[: min(self._seen, len(self._kept))].copy()
-        return Healthy(messages, self.time, len(self._rests))
+        m, count = self._muscles, len(self._rests)
+        if not self._kept:
+            return Healthy(np.empty((0, 2 * m), np.float32), self.time, count)
+        rows = np.array(self._kept)
+        columns = np.split(rows.astype(float), [m, 2 * m, 3 * m, -2, -1], axis=1)
+        tension, length, direction, theta, number, time = columns
+        recent = time[:, 0] > self.time - RECENT
+        # 0 N: it was isolated then, or slack.
+        whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
+        known, age = np.ones(tension.shape, dtype=bool), self._rests.accepted - number[:, 0]
+        seen = Observations(theta, tension, length, direction, known, age=age)
+        place, second = np.flatnonzero(whole), np.arange(len(rows))[whole] % 2
+        parts = seen[place[second == 0]], seen[place[second == 1]]
+        return Healthy(rows[:, : 2 * m], self.time, count, *parts)
 
 
 def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:

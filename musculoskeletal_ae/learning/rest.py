@@ -156,8 +156,7 @@ class Waiting(NamedTuple):
 
     time: float
     dt: float
-    tension: Array
-    length: Array
+    reading: Sample
     rest: Sample | None
 
 
@@ -223,11 +222,11 @@ class RestCollector:
             if rest is not None:
                 self.rejected['anomaly'] += 1
             return []
-        self._waiting.append(Waiting(self._time, dt, tension, length, rest))
+        self._waiting.append(Waiting(self._time, dt, reading, rest))
         rests = []
         while self._waiting and self._time - self._waiting[0].time >= MARGIN:
             passed = self._waiting.popleft()
-            self._healthy.step(passed.tension, passed.length, passed.dt)
+            self._healthy.step(passed.reading, passed.dt)
             if passed.rest is not None:
                 rests.append(passed.rest)
         return rests

@@ -4,7 +4,9 @@
 Preset `default` finds out the body from the samples, then lets the network learn that:
 
 1. Fit the corrected body to the samples (`body`).
-2. Draw synthetic samples of it, and put real ones in the place of a tenth of them.
+2. Draw synthetic samples of it, and put real ones in the place of some: rests, and messages of the
+   moving arm, of which there are many more and which say what rests do not (how wires slide, what
+   the body cannot say).
 3. Train the network on them for a bounded number of steps.
 4. Take the residuals' statistics of healthy messages (`calibration`).
 
@@ -89,6 +91,10 @@ class Updater(ABC):
         if fit is not None and self.body is not None:
             rng, tension = np.random.default_rng(self._seed), job.seen.tension
             covariance = estimate_covariance(mae, self.body, fit, tension, rng)
+            judging = job.healthy.judging
+            if judging is not None and len(judging) >= MANY:
+                off = mae.estimate(judging.tension, judging.length).theta - judging.theta
+                covariance = holding(covariance, off)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
@@ -159,6 +165,9 @@ class PaperUpdater(Updater):
 # -- preset default -------------------------------------------------------------------------------
 
 REAL_SHARE = 0.1
+#: share of synthetic samples that many messages of the moving arm take the place of; half of that,
+#: when there are so many
+MOVING_SHARE, MANY = 0.6, 200
 #: how often a synthetic sample is used before it is forgotten
 USES = 3
 #: a real sample that fits the body worse than this weight is not shown to the network
@@ -203,6 +212,8 @@ class BodyUpdater(Updater):
         count = max(BATCH, job.steps * BATCH // USES)
         data = synthetic_samples(body, fit.noise, count, self._rng, seen)
         self._mix_in_real(data, replace(seen, theta=fit.theta), fit)
+        if job.healthy.learned is not None:
+            self._mix_in_moving(data, job.healthy.learned, fit.noise)
         loss_now = self._trainer.train(data, job.steps)
         return Update(
             self._published(self._trainer.network, 'default', self._trainer.steps, job, fit),
@@ -230,17 +241,28 @@ class BodyUpdater(Updater):
         return CorrectedBody(self._robot, seed=self._seed)
 
     def _mix_in_real(self, data: TrainingData, seen: Observations, fit: Fit) -> None:
-        """Put real samples, freed of friction as the body knows it, in the place of some."""
+        """Put real samples in the place of some."""
         trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
-        if len(trusted) == 0:
+        self._put(data, seen[trusted], slice(int(REAL_SHARE * len(data.seen))))
+
+    def _mix_in_moving(self, data: TrainingData, seen: Observations, noise: Array) -> None:
+        """Put messages in the place of some, but none that contradict the body."""
+        (length,) = self.body.lengths(seen.theta, seen.tension, seen.direction)
+        off = np.abs(seen.length + self.body.crept(seen.age) - length)
+        sound = np.flatnonzero((off <= np.maximum(OUTLIER * noise, LEAST_CHANGE)).all(axis=1))
+        share = MOVING_SHARE * len(sound) / (len(sound) + MANY)
+        self._put(data, seen[sound], slice(len(data.seen) - int(share * len(data.seen)), None))
+
+    def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
+        """Put some of what was measured there, freed of friction as the body knows it."""
+        if len(real) == 0:
             return
-        rows = trusted[self._rng.integers(len(trusted), size=int(REAL_SHARE * len(data.seen)))]
-        real = seen[rows]
+        real = real[self._rng.integers(len(real), size=len(data.seen[places]))]
         still = np.zeros_like(real.direction)
         with_friction, without = self.body.lengths(real.theta, real.tension, real.direction, still)
         length = real.length + self.body.crept(real.age) + without - with_friction
-        data.seen[: len(rows)] = real.state().scaled()
-        data.true[: len(rows)] = real.state()._replace(length=length).scaled()
+        data.seen[places] = real.state().scaled()
+        data.true[places] = real.state()._replace(length=length).scaled()
 
 
 def contradicted_muscles(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
@@ -323,8 +345,7 @@ def estimate_covariance(
     What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
     taken as linear in it), and what the network says of such bodies' lengths, at postures and
     tensions [N] (N, M) of the samples, is compared with where they are. Errors have heavier tails
-    than a normal distribution: the covariance is scaled so that its ellipsoid of 95 % holds as many
-    of them.
+    than a normal distribution (`holding`).
     """
     bodies = np.repeat(np.arange(BODIES), EACH)
     theta = fit.theta[rng.integers(len(fit.theta), size=len(bodies))]
@@ -339,9 +360,14 @@ def estimate_covariance(
             length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
     error = mae.estimate(tension, length).theta - theta
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
+    return holding(0.5 * (covariance + covariance.T), error)
+
+
+def holding(covariance: Array, error: Array) -> Array:
+    """Return a covariance scaled so that its ellipsoid of 95 % holds as many errors, (N, D)."""
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    covariance *= np.quantile(distance, INSIDE) / chi2.ppf(INSIDE, error.shape[1])
-    return 0.5 * (covariance + covariance.T)
+    scaled: Array = covariance * np.quantile(distance, INSIDE) / chi2.ppf(INSIDE, error.shape[1])
+    return scaled
 
 
 def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

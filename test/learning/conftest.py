@@ -81,9 +81,9 @@ def stage(other_body) -> Stage:
     return Stage(other_body)
 
 
-def job(store, messages=None, time=0.0, steps=60, hold=True, rests=100):
+def job(store, messages=None, time=0.0, steps=60, hold=True, rests=100, **parts):
     empty = np.empty((0, 12), dtype=np.float32)
-    healthy = Healthy(empty if messages is None else messages, time, rests)
+    healthy = Healthy(empty if messages is None else messages, time, rests, **parts)
     return Job(store.observations(), healthy, hold, steps)
 
 

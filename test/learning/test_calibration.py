@@ -11,11 +11,13 @@ from musculoskeletal_ae.learning.calibration import (
     GLITCHES,
     LEAST_SAMPLES,
     LEAST_TIME,
+    RECENT,
     Healthy,
     Reservoir,
     calibrate,
     distances,
 )
+from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae.residuals import residuals
 
 from .conftest import Stage, job
@@ -79,8 +81,52 @@ def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(lea
 def test_the_reservoir_is_a_uniform_draw_of_bounded_size():
     reservoir = Reservoir(1, capacity=200)
     for n in range(4000):
-        reservoir.step(np.array([float(n)]), np.zeros(1), 0.1)
+        reservoir.step(Sample(np.zeros(1), np.array([float(n)]), np.zeros(1), np.zeros(1)), 0.1)
     kept = reservoir.healthy().messages[:, 0]
     assert len(kept) == 200
     assert abs(kept.mean() - 2000.0) < 400.0
     assert reservoir.time == pytest.approx(400.0)
+
+
+def reading(n, theta=0.0, tension=50.0, **others):
+    return Sample(np.full(2, theta), np.full(3, tension), np.full(3, n), np.zeros(3), **others)
+
+
+def test_every_second_message_is_learned_and_the_others_judge():
+    reservoir = Reservoir(3)
+    for n in range(10):
+        reservoir.step(reading(float(n), theta=0.1 * n), 0.1)
+    seen = reservoir.healthy()
+    np.testing.assert_array_equal(seen.learned.length[:, 0], [0, 2, 4, 6, 8])
+    np.testing.assert_array_equal(seen.judging.length[:, 0], [1, 3, 5, 7, 9])
+    np.testing.assert_allclose(seen.judging.theta, 0.1 * seen.judging.length[:, :2], rtol=1e-6)
+    assert seen.learned.known.all()
+
+
+@pytest.mark.parametrize(
+    'unfit',
+    [
+        {'theta': np.nan},  # not read
+        {'tension': 0.0},  # isolated, or slack
+        {'spread': np.full(2, 0.01)},  # a camera's
+    ],
+)
+def test_messages_that_do_not_tell_the_posture_are_not_learned(unfit):
+    reservoir = Reservoir(3)
+    for n in range(10):
+        reservoir.step(reading(float(n), **(unfit if n < 6 else {})), 0.1)
+    seen = reservoir.healthy()
+    assert len(seen.messages) == 10
+    np.testing.assert_array_equal(seen.learned.length[:, 0], [6, 8])
+
+
+def test_messages_of_long_ago_are_not_learned_and_of_others_is_known_how_old_they_are():
+    reservoir = Reservoir(3, capacity=20_000)
+    for n in range(4):
+        reservoir.step(reading(float(n)), 0.1)
+        reservoir.rest(reading(float(n), theta=n))
+    seen = reservoir.healthy().learned
+    np.testing.assert_array_equal(seen.age, [4, 2])
+    while reservoir.time < RECENT + 0.05:
+        reservoir.step(reading(0.0, theta=np.nan), 0.2)
+    np.testing.assert_array_equal(reservoir.healthy().learned.length[:, 0], [2.0])

@@ -43,6 +43,53 @@ def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
     assert error(update.mae, *states) < 1.2 * before
 
 
+class Giving(Stage):
+    """An arm whose points give way, which no corrected body can describe."""
+
+    def sample(self):
+        sample = super().sample()
+        give = 0.006 * np.sin(4.0 * sample.theta[0]) * (sample.tension - 115.0) / 85.0
+        return sample._replace(length=sample.length + give)
+
+
+def test_messages_of_the_moving_arm_tell_what_the_body_cannot_say(arm26, initial, other_body):
+    def learned(**parts):
+        updater = BodyUpdater(arm26, initial)
+        for _ in range(4):
+            update = updater.update(job(store, steps=300, **parts))
+        return error(update.mae, seen.theta, seen.tension, seen.length)
+
+    stage = Giving(other_body)
+    store, (seen, messages) = stage.store(30), (stage.store(400).observations() for _ in range(2))
+    assert learned(learned=messages) < 0.8 * learned()
+
+
+def test_messages_that_contradict_the_body_are_not_learned(arm26, initial, stage):
+    def learned(**parts):
+        update = BodyUpdater(arm26, initial).update(job(store, steps=10, **parts))
+        return update.mae.encoder[0][0]
+
+    store, wrong = stage.store(30), stage.store(300).observations()
+    wrong.theta[:, 0] += 0.3  # as read by a joint sensor that slipped
+    np.testing.assert_array_equal(learned(learned=wrong), learned())
+
+
+def test_the_ellipsoid_holds_as_many_of_the_messages_that_judge(arm26, initial, stage):
+    judging, fresh = stage.store(1000).observations(), stage.store(1000).observations()
+    for seen in (judging, fresh):
+        seen.length[:] += 0.003 * stage.rng.standard_normal(seen.length.shape)
+
+    def inside(**parts):
+        mae = BodyUpdater(arm26, initial).update(job(store, steps=100, **parts)).mae
+        off = mae.estimate(fresh.tension, fresh.length).theta - fresh.theta
+        distance = np.einsum('ni,ni->n', off, np.linalg.solve(mae.covariance, off.T).T)
+        return (distance <= chi2.ppf(0.95, 2)).mean()
+
+    store = stage.store(30)
+    assert inside() < 0.9
+    assert inside(judging=judging) == pytest.approx(0.95, abs=0.03)
+
+
 def test_a_changed_muscle_is_noticed_unasked(arm26, initial, stage):
     updater, store = BodyUpdater(arm26, initial), stage.store(20)
     assert updater.update(job(store, steps=1)).changed == ()
