@@ -43,7 +43,8 @@ DIAGONAL_SHARE = 0.1
 #: this share of the messages is left out at most, and what is so many times beyond all others
 GLITCHES, GLITCH = 0.002, 3.0
 POSTURES = 200  # that tell where it was calibrated
-RECENT = 3600.0  # healthy time [s] in which messages are learned from: wires creep and bed in
+#: healthy time [s] and rests within which messages are learned from: wires creep and bed in
+RECENT, RECENT_RESTS = 3600.0, 200
 
 
 class Healthy(NamedTuple):
@@ -110,10 +111,11 @@ class Reservoir:
         rows = np.array(self._kept)
         columns = np.split(rows.astype(float), [m, 2 * m, 3 * m, -2, -1], axis=1)
         tension, length, direction, theta, number, time = columns
-        recent = time[:, 0] > self.time - RECENT
+        age = self._rests.accepted - number[:, 0]
+        recent = (time[:, 0] > self.time - RECENT) & (age < RECENT_RESTS)
         # 0 N: it was isolated then, or slack.
         whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
-        known, age = np.ones(tension.shape, dtype=bool), self._rests.accepted - number[:, 0]
+        known = np.ones(tension.shape, dtype=bool)
         seen = Observations(theta, tension, length, direction, known, age=age)
         place, second = np.flatnonzero(whole), np.arange(len(rows))[whole] % 2
         parts = seen[place[second == 0]], seen[place[second == 1]]
