@@ -167,7 +167,7 @@ class PaperUpdater(Updater):
 REAL_SHARE = 0.1
 #: share of synthetic samples that many messages of the moving arm take the place of; half of that,
 #: when there are so many
-MOVING_SHARE, MANY = 0.6, 200
+MOVING_SHARE, MANY = 0.3, 200
 #: how often a synthetic sample is used before it is forgotten
 USES = 3
 #: a real sample that fits the body worse than this weight is not shown to the network
