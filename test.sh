@@ -21,7 +21,7 @@ say 'mypy'
 
 # A graph of our own: not the network's, and not that of another run on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
-export ROS_DOMAIN_ID=$(($$ % 50 * 2 + 1)) # and the next, for the second process
+export ROS_DOMAIN_ID=$(($$ % 33 * 3 + 1)) # and the next two: each process of pytest has its own
 export ROS_LOG_DIR=$repository/log/test
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"

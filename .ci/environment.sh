@@ -352,6 +352,9 @@ environment_setup() { # [test|view]
   export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
   # The wheels are an installation of ROS like any other.
   [ "$ros" = wheels ] && export AMENT_PREFIX_PATH=$venv
+  # Where a node was killed, Fast DDS may leave shared memory through which its successor on the same
+  # ports hears nothing (eProsima/Fast-DDS 4737, 5053, 5469). On one machine UDP costs no more.
+  export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
   install_packages "$@"
   [ "${1-}" != test ] || install_chromium
   build_package
