@@ -84,13 +84,16 @@ class CheckDriver:
             verdict.notes.append('nobody publishes joint_states, from which the learner learns')
         return verdict
 
-    def wind(self, verdict: Verdict) -> None:
-        """Wind each muscle in a little."""
+    def alone(self) -> None:
+        """Refuse to go on where something else moves the arm."""
         if self.node.count_publishers(COMMAND):
             raise MusculoskeletalError(
                 f'{self.command} is published by another node: stop the controller before anything '
                 'else moves the arm'
             )
+
+    def wind(self, verdict: Verdict) -> None:
+        """Wind each muscle in a little."""
         muscles = self.robot.muscle_indices(self.options.muscles or [])
         kind = load('musculoskeletal_ae.driver.winding').Winding
         winding = kind(verdict, muscles, self.options.tension)
@@ -137,6 +140,8 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         if not (options.wait and faults):
             break
         _say('nothing may move before the driver is changed; listening on')
+    if options.move:
+        driver.alone()
     if options.move and verdict.wrong - {'zero'}:
         _say('not moved: what is wrong already comes first')
     elif options.move:
