@@ -3,7 +3,8 @@
 
 Preset `default` finds out the body from the samples, then lets the network learn that:
 
-1. Fit the corrected body to the samples (`body`).
+1. Fit the corrected body to the samples (`body`), and move the network by what lengths changed by
+   everywhere: zeros, and wires that creep, need no training, and no average of weights lags behind.
 2. Draw synthetic samples of it, and put real ones in the place of some: rests, and messages of the
    moving arm, of which there are many more and which say what rests do not (how wires slide, what
    the body cannot say).
@@ -40,7 +41,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
-from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, State
 from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -168,6 +169,7 @@ REAL_SHARE = 0.1
 #: share of synthetic samples that many messages of the moving arm take the place of; half of that,
 #: when there are so many
 MOVING_SHARE, MANY = 0.3, 200
+PROBES = 200  # postures that the mean of a body's lengths is taken over
 #: how often a synthetic sample is used before it is forgotten
 USES = 3
 #: a real sample that fits the body worse than this weight is not shown to the network
@@ -193,6 +195,9 @@ class BodyUpdater(Updater):
             fit_to_network(self.body, mae, seed)
             self._prior_mean = list(self.body.parameters)
         self._prior_mean_confirmed = False
+        rng = np.random.default_rng([seed, 0x3E])
+        self._probe = robot.random_postures(PROBES, rng), _tensions(robot, PROBES, rng)
+        self._known = self._mean_length()  # of the body that the network knows [m], (M,)
         self._trainer = Trainer(from_mae(mae), seed, learned_steps(mae))
         self._rng = np.random.default_rng([seed, 0xD2])
         self._statistics_held = True
@@ -202,6 +207,8 @@ class BodyUpdater(Updater):
         body = self.body = self._body_to_go_on_from(seen)
         guess = self._mae.estimate(seen.tension, seen.length).theta
         fit = fit_body(body, seen, self._prior_mean, guess)
+        known, self._known = self._known, self._mean_length()
+        self._trainer.move(self._known - known)
         contradicted = contradicted_muscles(seen, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
         # the robust weights leave such samples out until they are the rule.
@@ -239,6 +246,11 @@ class BodyUpdater(Updater):
         self._prior_mean = None
         self._trainer.restart()
         return CorrectedBody(self._robot, seed=self._seed)
+
+    def _mean_length(self) -> Array:
+        """Return l [m] (M,) of the body, averaged over always the same postures and tensions."""
+        (length,) = self.body.lengths(*self._probe, np.zeros_like(self._probe[1]))
+        return length.mean(axis=0)
 
     def _mix_in_real(self, data: TrainingData, seen: Observations, fit: Fit) -> None:
         """Put real samples in the place of some."""
@@ -421,6 +433,11 @@ class Trainer:
                 self._average()
                 losses.append(value.item())
         return float(np.mean(losses[len(losses) // 2 :]))
+
+    def move(self, length: Array) -> None:
+        """Go on as the network of an arm whose lengths are all longer by so much [m], (M,)."""
+        for network in (self.network, self._restless):
+            network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
         """Take large steps again and average few: the body has changed."""

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.training import Training
 from musculoskeletal_ae.learning.update import (
     BodyUpdater,
@@ -29,6 +30,16 @@ def test_twenty_samples_halve_the_error(learned, initial):
     mae, _, _, stage = learned
     states = stage.states(1000)
     assert error(mae, *states) < 0.5 * error(initial, *states)
+
+
+def test_what_a_wire_is_longer_by_everywhere_needs_no_training(arm26, initial):
+    longer = CorrectedBody(arm26)
+    for parameters, layout in zip(longer.parameters, longer.layouts, strict=True):
+        parameters[layout.offset] = 0.008
+    stage = Stage(longer)
+    states = stage.states(1000)
+    update = BodyUpdater(arm26, initial).update(job(stage.store(30), steps=1))
+    assert error(update.mae, *states) < 0.5 * error(initial, *states)
 
 
 def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
