@@ -9,6 +9,7 @@ the series-elastic class (`test/test_house.py`).
 from __future__ import annotations
 
 import copy
+import math
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ GUIDES_EVERY = 5  # steps
 HISTORY = 64  # steps that sensors may be late
 HOUR = 3600.0  # [s]
 BEDDING_TIME = 2.0 * HOUR  # [s]
+NUDGE = 1e-7  # [rad]
 SLIP_TIME = 5.0 * HOUR  # [s] between two slips of a wire on its spool
 
 
@@ -215,6 +217,10 @@ class ForeignArm(Arm):
         if self.broken:
             return
         mujoco.mj_step1(model, data)
+        if not math.isfinite(data.ten_length.sum()):
+            # MuJoCo's wrapping can be NaN where a wire just touches; beside that it is not.
+            data.qpos += NUDGE
+            mujoco.mj_step1(model, data)
         self._steps += 1
         if self._steps % GUIDES_EVERY == 0:
             guides_step(self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP)

@@ -85,6 +85,7 @@ class CorrectedBody:
             self._frequency.append(frequency * crossed / (WIDTH * span))
             self._phase.append(rng.uniform(0.0, 2.0 * np.pi, features))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
+        self.zero = np.zeros(robot.joint_count)  # of the joint sensors, where a fit starts [rad]
 
     def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
         """Return the body of one group, with the parameters of its muscles."""

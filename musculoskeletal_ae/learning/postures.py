@@ -347,11 +347,12 @@ def fit_jointly(
     spread: list[Array],
     least_noise: float,
 ) -> tuple[Array, Array, Array, Array, list[tuple[Ints, Array]]]:
-    """Fit body (in place), postures from `start` [rad] (N, D), and zeros of joint sensors.
+    """Fit body and zeros of joint sensors (in place), and postures from `start` [rad] (N, D).
 
     Returns what `Fit` holds.
     """
-    theta, zero = start.copy(), np.zeros(start.shape[1])
+    own, zero = np.isfinite(seen.theta) & (seen.spread == 0.0), body.zero
+    theta = start - own * zero
     weight = np.zeros_like(seen.length)
     noise, root = np.empty(seen.length.shape[1]), []
     for group in body.robot.groups:
@@ -363,6 +364,6 @@ def fit_jointly(
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, fit.root))
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
-    read = np.where(np.isnan(seen.theta), theta, seen.theta - zero * (seen.spread == 0.0))
+    read = np.where(np.isnan(seen.theta), theta, seen.theta - own * zero)
     (length,) = body.lengths(read, seen.tension, seen.direction)
     return seen.length + body.crept(seen.age) - length, noise, weight, theta, root

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import bodies
+import mujoco
 import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
@@ -176,6 +177,21 @@ def test_each_joint_rubs_by_its_own_load():
     weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
     assert np.all(friction > 0.01 * weight)
     assert friction[4] < 0.5 * friction[:2].min()  # the yaw of the elbow carries little
+
+
+def test_wrapping_that_is_nan_for_a_moment_breaks_no_arm(robot, monkeypatch):
+    arm, real, steps = ForeignArm(robot), mujoco.mj_step1, []
+
+    def nan_once(model, data):
+        real(model, data)
+        steps.append(model)
+        if len(steps) == 5:
+            data.ten_length[0] = np.nan
+
+    monkeypatch.setattr(mujoco, 'mj_step1', nan_once)
+    arm.step(0.02)
+    assert len(steps) > 5
+    assert not arm.broken
 
 
 def test_a_users_model_plays_the_robot(imported):
