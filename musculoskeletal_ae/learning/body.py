@@ -272,6 +272,8 @@ def fit_body(
     means, spreads = [], []
     for m, layout in enumerate(body.layouts):
         known, mean, spread = seen.known[:, m], PRIOR.mean(layout), PRIOR.spread(layout)
+        # The zero that is expected to be near 0 is that from before all creep.
+        spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * seen.age.max(initial=0.0))
         if prior_mean is not None:
             mean = prior_mean[m]
         before = ~known & (seen.tension[:, m] > 0.0)  # 0 N: it was isolated then
