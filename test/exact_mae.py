@@ -13,6 +13,7 @@ class ExactMae:
 
     def __init__(self, robot: Any) -> None:
         self.robot = robot
+        self.friction = np.zeros(robot.muscle_count)
         self.offset = 0.0  # [m] on every length, to tell two networks apart
         self.fail: Exception | None = None
 

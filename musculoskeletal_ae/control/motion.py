@@ -33,7 +33,7 @@ from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFee
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
-from musculoskeletal_ae.learning.rest import REVERSAL
+from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.rest import FrictionDirection
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
@@ -59,7 +59,6 @@ class ExternalTorque:
     def use(self, mae: Mae) -> None:
         """Take a network, and what it says of friction and of a healthy arm's residual."""
         self._mae, touch = mae, mae.touch
-        self._friction = np.zeros(self._robot.muscle_count) if touch is None else touch.friction
         self.calibrated = touch is not None and touch.calibrated
         self._turned = np.full(self._robot.joint_count, np.inf)  # where G was taken
         self._weight = np.ones(self._robot.joint_count)
@@ -78,7 +77,7 @@ class ExternalTorque:
         kinematics, joints = self._robot.kinematics, len(theta)
         if not np.abs(theta - self._turned).max() <= TURNED:  # not a number, too
             self._jacobian, self._turned = self._mae.muscle_jacobian(theta, tension), theta
-        end_tension = tension * np.exp(-self._friction * self._direction.step(length, dt))
+        end_tension = tension * np.exp(-self._mae.friction * self._direction.step(length, dt))
         now: Array = np.concatenate((theta, end_tension @ self._jacobian))
         if self._value is None:
             self._value, self._rate = now, np.zeros_like(now)

@@ -12,13 +12,13 @@ messages therefore wait that long before they count.
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
@@ -107,39 +107,6 @@ def _unmoved(halves: list[Array], allowed: float) -> bool:
         if len(half) > 1
     )
     return bool((difference <= allowed + SURE * np.sqrt(error)).all())
-
-
-# -- friction -------------------------------------------------------------------------------------
-
-REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
-SMOOTHING = 0.05  # [s], so that the sensor's noise does not slide the wire
-
-
-class FrictionDirection:
-    """Which way each wire slid last, from muscle lengths alone.
-
-        r ← clip(r, l − b, l + b),   s = (r − l)/b
-
-    (the stop operator of hysteresis theory). Friction along a wire acts against its last sliding,
-    so that T at the motor is T at the elastic unit times e^{μ s}: more if it was wound in (s = 1).
-    """
-
-    def __init__(self) -> None:
-        self._length: Array | None = None
-
-    def step(self, length: Array, dt: float) -> Array:
-        """Take l [m] (M,), `dt` [s] after the one before; return s (M,)."""
-        if self._length is None:
-            self._length, self._reference = length.copy(), length.copy()
-        share = 1.0 - math.exp(-dt / SMOOTHING)
-        self._length = self._length + share * (length - self._length)
-        low, high = self._length - REVERSAL, self._length + REVERSAL
-        self._reference = np.minimum(np.maximum(self._reference, low), high)
-        return (self._reference - self._length) / REVERSAL
-
-    def reset(self) -> None:
-        """Forget, as after a jump of the clock."""
-        self._length = None
 
 
 # -- what may be learned --------------------------------------------------------------------------

@@ -341,6 +341,11 @@ class Mae:
             weight[rows] = np.linalg.inv(seen + LENGTH_NOISE**2 * np.eye(len(used)))
         return weight
 
+    @property
+    def friction(self) -> Array:
+        """Return μ of each wire (M,): 0 until a body was learned."""
+        return np.zeros(len(self.muscles)) if self.touch is None else self.touch.friction
+
     def without(self, isolated: Iterable[int]) -> Mae:
         """Return the same network with these muscles isolated, and no others.
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One step of N simulated arms, preset `default`: the network's equilibrium, approached smoothly.
 
-    l = f_decode,l(①(θ, T))                                     the learned body
+    l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            the learned body, and its friction
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     MSC, part of the simulated arm
-    B θ̇ = −(g(θ) − JᵀF + Gᵀ T),  G = ∂l/∂θ at (θ, T)            between the joint limits
+    B θ̇ = −(g(θ) − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
 The paper descends on a sum of norms (section "Simulation"); its weights let ‖T‖ outweigh torque and
 length, so that the arm settles elsewhere. Here both are equations, and what is searched is the
@@ -11,8 +11,10 @@ sheet z = ①(θ, T) of the latent space, where they have D+M unknowns for D+M e
 the posture of rest. (Solved for z itself, with decoded θ and T instead of exact ones, the root is
 no nearer to the body's and each step dearer.) The arm creeps towards it through a viscous medium B,
 by linearly implicit Euler steps: Newton steps on those equations with B/h on the diagonal. B stands
-for what joints and geared modules resist, so that speeds look right; it has no say in where the arm
-comes to rest. A joint limit is a hard stop that gives whatever torque it takes.
+for what joints and geared modules resist, so that speeds look right: more where muscles have longer
+levers. It has no say in where the arm comes to rest. A joint limit is a hard stop that gives
+whatever torque it takes. Friction along the wires (`friction`) has a say: the arm rests elsewhere
+after winding in than after paying out.
 """
 
 from __future__ import annotations
@@ -23,15 +25,20 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.friction import REVERSAL, slid
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias
 PAID_OUT = np.inf  # [m]
-VISCOSITY = 1.5  # [N·m·s/rad], B; motions then last as long as the emulated arm's (0.7 … 5 tried)
+#: B as a multiple of Σ_i |∂l_i/∂θ| [N·s/rad]; motions then last as long as the emulated arm's (8 to
+#: 20 is as good)
+VISCOSITY, LEVER_POSTURES = 12.0, 100
+LEAST_VISCOSITY = 0.1  # [N·m·s/rad], of a joint that no muscle crosses
 JOINT_SPEED = 5.0  # [rad/s] or [m/s]; bounds a step, and with it every fault of a network
 MODULE_SPEED = 0.25  # [m/s] at which modules wind, chosen as in the emulator
+ROUNDS = 3  # at most, until it is known which wires' friction turns round in a step
 POSTURES_PER_COEFFICIENT = 10  # of the cubic that gives slopes
 
 
@@ -43,6 +50,7 @@ class ArmState(NamedTuple):
     length: Array  # l_sim [m], (N, M)
     followed: Array  # the command as far as the modules have followed it [m], (N, M)
     holding: Array  # torque of a stop, or of whoever holds a joint, on it [N·m], (N, D)
+    slid: Array  # s: which way each wire slid last, in [−1, 1], (N, M)
 
 
 class QuasiStatics:
@@ -52,6 +60,9 @@ class QuasiStatics:
         self._robot, self._mae = robot, mae
         self._load, self._slopes = Load(robot.kinematics), Slopes(robot, mae)
         self._eye = np.eye(robot.joint_count)
+        postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
+        levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
+        self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY) * self._eye
 
     def step(
         self,
@@ -68,35 +79,54 @@ class QuasiStatics:
         """
         robot, theta, tension = self._robot, state.theta, state.tension
         stiffness, limits = robot.stiffness, robot.tension
-        length, pullback = self._mae.lengths_with_pullback(theta, tension)
+        passed = np.exp(-self._mae.friction * state.slid)  # from the motor to the elastic unit
+        end = passed * tension
+        length, pullback = self._mae.lengths_with_pullback(theta, end)
         span = (limits.max - limits.bias) / stiffness
         followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
-        # MSC and the elastic unit in series: at rest posture T moves to `desired`, and with the
-        # posture by `soft` K G Δθ.
         absolute = robot.routes.length_at_zero + length
-        compliance = robot.series_elastic.compliance(absolute, tension)
-        soft = 1.0 / (1.0 + stiffness * compliance)
+        compliance = robot.series_elastic.compliance(absolute, end)
+        by_motor = passed * compliance
         command_tension = limits.bias + stiffness * (length - followed)
-        desired = tension + soft * (command_tension - tension)
-        # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth Newton).
-        settled = np.minimum(np.maximum(desired, limits.bias), limits.max)
-        spring = stiffness * soft * (desired == settled)
-        jacobian, curvature = self._slopes(theta, tension)
+        jacobian, curvature = self._slopes(theta, end)
         load, load_slope = self._load(theta, wrench)
-        pull = ((settled - tension)[:, None, :] @ jacobian)[:, 0]
-        push = -(load + pullback(tension) + pull)
-        matrix = (jacobian * spring[..., None]).swapaxes(1, 2) @ jacobian
-        matrix += curvature + load_slope + (VISCOSITY / h) * self._eye
-        turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
-        arrived = np.minimum(np.maximum(theta + turned, robot.lower), robot.upper)
-        stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
-        after = desired + stiffness * soft * stretch
-        after = np.minimum(np.maximum(after, limits.bias), limits.max)
-        length = length + stretch - compliance * (after - tension)
+        # Where a wire slides, friction is like a stiff spring until it has turned round.
+        torque = load + pullback(end)
+        rubbing = self._mae.friction * end
+        turning, free = state.slid, np.abs(state.slid) < 1.0
+        for _ in range(ROUNDS):
+            rub = rubbing * free / REVERSAL
+            lost = rubbing * ~free * (turning - state.slid)
+            # MSC, friction and the elastic unit in series: at rest posture T moves to `desired`,
+            # and with the posture by `soft` K G Δθ.
+            give = 1.0 + compliance * rub
+            soft = 1.0 / (give + stiffness * by_motor)
+            slack = compliance * lost - by_motor * (command_tension - tension)
+            desired = command_tension + stiffness * soft * slack
+            # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
+            # Newton).
+            settled = np.minimum(np.maximum(desired, limits.bias), limits.max)
+            moved = (compliance * lost - by_motor * (settled - tension)) / give
+            change = passed * (settled - tension) + rub * moved - lost
+            spring = np.where(desired == settled, (passed * stiffness + rub) * soft, rub / give)
+            push = -(torque + (change[:, None, :] @ jacobian)[:, 0])
+            matrix = (jacobian * spring[..., None]).swapaxes(1, 2) @ jacobian
+            matrix += curvature + load_slope + self._viscosity / h
+            turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
+            arrived = np.minimum(np.maximum(theta + turned, robot.lower), robot.upper)
+            stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
+            after = desired + stiffness * soft * stretch
+            after = np.minimum(np.maximum(after, limits.bias), limits.max)
+            moved = (stretch + compliance * lost - by_motor * (after - tension)) / give
+            turning, before = slid(state.slid, moved), free
+            free = np.abs(turning) < 1.0
+            if (free == before).all() or not rubbing.any():
+                break
         held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
         if fixed is not None:
             held |= np.isfinite(fixed)
-        return ArmState(arrived, after, length, followed, np.where(held, -push, 0.0))
+        holding = np.where(held, -push, 0.0)
+        return ArmState(arrived, after, length + moved, followed, holding, turning)
 
     def _turn(
         self, theta: Array, push: Array, matrix: Array, most: float, fixed: Array | None

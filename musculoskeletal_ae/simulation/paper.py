@@ -53,7 +53,7 @@ class PaperDescent:
         forced = np.full_like(state.theta, np.nan) if fixed is None else fixed
         arms = zip(state.theta, state.tension, length, load, forced, strict=True)
         theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
-        return ArmState(theta, tension, reached, length, np.zeros_like(theta))
+        return ArmState(theta, tension, reached, length, np.zeros_like(theta), state.slid)
 
     def _descend(
         self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array

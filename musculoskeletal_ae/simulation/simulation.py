@@ -72,7 +72,8 @@ class Simulation:
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)
         length = self.mae.lengths(theta, tension)
-        self.state = ArmState(theta, tension, length, length, np.zeros_like(theta))
+        nothing, not_slid = np.zeros_like(theta), np.zeros_like(tension)
+        self.state = ArmState(theta, tension, length, length, nothing, not_slid)
 
     def step(self, dt: float) -> ArmState:
         """Let time pass [s]; return the arms."""

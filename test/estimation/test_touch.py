@@ -23,7 +23,8 @@ SPREAD = np.full(5, 0.2)
 
 def observer(friction=0.0, spread=SPREAD, time=LEAST_MOTION, robot=ARM):
     mae = ExactMae(robot)
-    mae.touch = TouchStatistics(np.full(robot.muscle_count, friction), spread, time)
+    mae.friction = np.full(robot.muscle_count, friction)
+    mae.touch = TouchStatistics(mae.friction, spread, time)
     result = ExternalTorque(robot)
     result.use(mae)
     return result

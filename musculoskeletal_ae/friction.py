@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Friction along the wires: which way each slid last decides what it takes of the tension.
+
+    T = T_end e^{μ s},   s ← clip(s − Δl/b, −1, 1)
+
+T is the motor's, T_end the elastic unit's; s = 1 if the wire was wound in last: T is more then (the
+stop operator of hysteresis theory).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+
+REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
+SMOOTHING = 0.05  # [s], so that the sensor's noise does not slide the wire
+
+
+def slid(direction: Array, moved: Array) -> Array:
+    """Return s (..., M) after lengths have changed by `moved` [m] (..., M)."""
+    after: Array = np.minimum(np.maximum(direction - moved / REVERSAL, -1.0), 1.0)
+    return after
+
+
+class FrictionDirection:
+    """Which way each wire slid last, from muscle lengths alone."""
+
+    def __init__(self) -> None:
+        self._length: Array | None = None
+
+    def step(self, length: Array, dt: float) -> Array:
+        """Take l [m] (M,), `dt` [s] after the one before; return s (M,)."""
+        if self._length is None:
+            self._length, self._direction = length.copy(), np.zeros_like(length)
+        moved = (1.0 - math.exp(-dt / SMOOTHING)) * (length - self._length)
+        self._length = self._length + moved
+        self._direction = slid(self._direction, moved)
+        return self._direction
+
+    def reset(self) -> None:
+        """Forget, as after a jump of the clock."""
+        self._length = None

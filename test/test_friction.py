@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.friction import FrictionDirection
+
+DT = 0.01
+
+
+def test_friction_acts_against_the_last_sliding_and_ignores_noise():
+    friction, rng = FrictionDirection(), np.random.default_rng(0)
+    length = 0.0
+    for speed, expected in ((-0.02, 1.0), (0.0, 1.0), (0.02, -1.0), (0.0, -1.0)):
+        for _ in range(100):
+            length += speed * DT
+            direction = friction.step(np.array([length]) + 1e-4 * rng.standard_normal(1), DT)
+        assert direction[0] * expected > 0.6
+
+
+@given(st.lists(st.floats(-0.1, 0.1), min_size=1, max_size=50))
+def test_the_direction_of_friction_stays_within_one(lengths):
+    friction = FrictionDirection()
+    for length in lengths:
+        assert np.abs(friction.step(np.array([length]), DT)).max() <= 1.0 + 1e-9
