@@ -51,7 +51,7 @@ def measure(study: Study, seed: int) -> Measured:
             arm.set_payload(0.0)
             loop.explore()
         if n % STRIDE == 0:
-            error.append(loop.core.heat.core - arm.winding)
+            error.append(loop.core.watch.heat.core - arm.winding)
             inner.append(arm.winding)
     errors, core = np.array(error), np.array(inner)
     judged = np.abs(errors[round(share * LEARNING / SAMPLE_TIME / STRIDE) :])
@@ -59,7 +59,7 @@ def measure(study: Study, seed: int) -> Measured:
         'core_error_k': float(judged.mean()),
         'core_error_worst_k': float(judged.max()),
         'hottest_winding_c': float(core.max()),
-        'heat_alarms': len(loop.core.heat.changed),
+        'heat_alarms': len(loop.core.watch.heat.changed),
         'stops': loop.stops,
     }
     return Measured(numbers, {'error': errors, 'core': core})

@@ -28,6 +28,7 @@ MODULES = {
     'mae/training.py': ['initial_mae'],
     'estimation/estimator.py': ['Estimator', 'Estimate'],
     'control/controller.py': ['Controller'],
+    'control/watch.py': ['Watch'],
     'control/settings.py': ['Settings'],
     'control/trajectory.py': ['Trajectory', 'Points', 'Setpoint'],
     'control/motion.py': ['MotionControl'],

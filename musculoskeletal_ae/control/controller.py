@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control as a whole: targets in, safe commands out, and why the arm must not move.
+"""Control as a whole: targets in, safe commands out.
 
     target     ─→ posture (lengths) or torque (tensions) ─┐
     trajectory ─→ motion (lengths) ───────────────────────┴─→ safety ─→ command
@@ -9,23 +9,19 @@ here is the controller's own: its isolated muscles are those of which it was tol
 isolated while there is an anomaly is the suspect: the stopped arm winds it in a little, and goes on
 when the anomaly is over.
 
-A stop latches on missing or implausible sensor data, an anomaly, an unfit checkpoint, overload,
-overheating, a fault of control's own, or on request (doc/interface.md, stop and resume). `reset`
-clears it once no cause is left; then the last target, which may be a trajectory's end, is resumed
-by a ramp from where the arm is. Exploration is not resumed. Data that is late, but back before
-the stop pays out, is no reason to latch: after RESUME of it the arm goes on by itself, exploring or
-not.
+A stop latches on what `watch` finds, an unfit checkpoint, a fault of control's own, or on request
+(doc/interface.md, stop and resume). `reset` clears it once no cause is left; then the last target,
+which may be a trajectory's end, is resumed by a ramp from where the arm is. Exploration is not
+resumed. Data that is late, but back before the stop pays out, is no reason to latch: after RESUME
+of it the arm goes on by itself, exploring or not.
 
-`now` is a steady clock [s], on which ages run; `time` is that of the messages, by which commands
-change. Where the messages' clock is slow, as of a slow simulator, ages may be larger by as much, up
-to SLOWEST; a fast one makes no age shorter. The controller's own pauses make nothing old.
+`now` is a steady clock [s], `time` that of the messages.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections import deque
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
@@ -42,41 +38,21 @@ from musculoskeletal_ae.control.posture import PostureControl
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.watch import Watch
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
-from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
-OWN_PAUSE = 0.3  # [s] between two steps; what is longer counts for no age
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
-SLOWEST = 0.05  # of real time
-PACE_SPAN = 1.0  # [s] over which the messages' clock is compared
-OVERHEATED = 20.0  # [°C] above temperature_limit
-OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
 NOTABLE = 0.05  # [N·m] of missing torque
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
 APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
 ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
-
-
-class Pace:
-    """How fast the messages' clock goes beside the steady one: 1 in real time."""
-
-    def __init__(self) -> None:
-        self.value = 1.0
-
-    def step(self, passed: float, since: float) -> None:
-        """Take how far both clocks went on [s]."""
-        share = 1.0 - math.exp(-since / PACE_SPAN)
-        if since > 0.0 and 0.0 <= passed < LONGEST_STEP + 10.0 * since:  # no jump
-            self.value += share * (passed / since - self.value)
 
 
 class Controller:
@@ -95,33 +71,18 @@ class Controller:
         self.short = ''  # what the last target was out of reach by
         self.floating = FloatControl(robot, self.settings)
         self.safety = SafetyFilter(robot, self.settings)
-        self.heat = Heat(robot)
-        #: tensions that heat allows each muscle for long, and for a moment [N], (M,)
-        self.limit: Array = np.full(robot.muscle_count, robot.tension.max)
-        self._most = self.limit
+        self.watch = Watch(robot, self.settings)
         self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
         self._mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = Exploration(robot, seed)
         self.gentle = GentleMotion(robot, seed)
-        self._plausibility = Plausibility(robot)
-        self._temperatures: deque[Array] = deque(maxlen=5)
         self._estimate: Array | None = None
-        self._muscles_at = self._estimate_at = self.stepped_at = -math.inf
         self.sent_at = 0.0  # when the last command went out; its user says so
-        self._time = math.nan
-        self._fresh = self._asleep = 0.0  # [s] of data since it was late; of own pauses
-        self.pace = Pace()
-        self.intruder = ''  # who else sends muscle_states
-        self._overheated = False
-        limits = robot.tension
-        #: tensions [N] that are too high for long, and for more than a moment
-        self._overloads = np.array([limits.limit, 0.5 * (limits.limit + limits.max)])
-        #: since when each muscle pulls above each of them
-        self._tense_since: Array = np.full((2, robot.muscle_count), math.inf)
-        self._anomaly = self._explored = False
-        # whether a suspect is verified; whether the arm is to go on by itself, and may
-        self._verifies = self._resumes = self._may_resume = False
+        self._fresh = 0.0  # [s] of data since it was late
+        # whether it explored at an anomaly; whether a suspect is verified; whether the arm is to go
+        # on by itself, and may
+        self._explored = self._verifies = self._resumes = self._may_resume = False
         self._isolated_at, self._anomaly_at = (-1, -math.inf), math.inf
         # Whether the next command starts a method anew, from how the muscles pull then.
         self._starts = True
@@ -137,8 +98,7 @@ class Controller:
         stiffness = settings.desired_stiffness(joints)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
-        self.motion.settings = settings
-        self.floating.settings = settings
+        self.motion.settings = self.floating.settings = self.watch.settings = settings
         if settings.method == 'float':
             self.explore(False)
         if settings.method != before.method and not self.posture.exploring:
@@ -148,36 +108,26 @@ class Controller:
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
-        self._mae = mae
+        self._mae, self.watch.checkpoint = mae, True
         self.posture.use(mae)
         self.motion.use(mae)
 
     def muscles(self, muscles: Muscles, now: float) -> None:
         """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
-        length, tension, temperature = muscles
-        # While zeros are unknown a guess may make any length of them, and any posture.
-        known = length if self.safety.zeroed else None
-        self._plausibility.check_muscles(tension, known, temperature, now)
-        awake = now - self._asleep
-        since = awake - self._muscles_at if self._muscles_at > -math.inf else 0.0
-        self._muscles_at = awake
-        # NaN is not known, and no reason for anything.
-        self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
-        self.heat.step(tension, np.median(np.array(self._temperatures), axis=0), since)
-        over = self.safety.muscles(muscles).tension > self._overloads
-        self._tense_since = np.where(over, np.minimum(self._tense_since, awake), math.inf)
+        self.watch.muscles(muscles, self.safety.zeroed, now)
+        self.watch.pulled(self.safety.muscles(muscles).tension, now)
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
         if not self.safety.zeroed:
             theta = np.clip(theta, self._robot.lower, self._robot.upper)
-        self._plausibility.check_estimate(theta, now)
-        self._estimate, self._estimate_at = theta, now - self._asleep
+        self.watch.estimated(theta, now)
+        self._estimate = theta
 
     def zeros(self, known: bool, less: Array) -> None:
         """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
         self.safety.shift(less)
-        self._plausibility = Plausibility(self._robot)
+        self.watch.forget()
         if known != self.safety.zeroed or less.any():
             self._starts, self._follows = True, False
         self.safety.zeroed = known
@@ -185,10 +135,10 @@ class Controller:
 
     def anomaly(self, detected: bool) -> None:
         """Take anomaly_detected; once a suspect was verified, the arm goes on when it is over."""
-        if detected and not self._anomaly:
-            self._anomaly_at, self._explored = self.stepped_at, self.posture.exploring
+        if detected and not self.watch.anomaly:
+            self._anomaly_at, self._explored = self.watch.stepped_at, self.posture.exploring
         self._resumes |= self._verifies and not detected
-        self._verifies, self._anomaly = self._verifies and detected, detected
+        self._verifies, self.watch.anomaly = self._verifies and detected, detected
         if detected:
             self.stop('anomaly_detected')
         self._note_suspect()
@@ -198,14 +148,14 @@ class Controller:
         muscles, before = set(muscles), set(self._robot.isolated)
         self._robot.isolate(muscles)
         if added := muscles - before:
-            self._isolated_at = max(added), self.stepped_at
+            self._isolated_at = max(added), self.watch.stepped_at
         if self._mae is not None:
             self.use(self._mae)
         self._note_suspect()
 
     def _note_suspect(self) -> None:
         muscle, at = self._isolated_at  # whichever was told first
-        here = self._anomaly and at > self._anomaly_at - AT_ONCE
+        here = self.watch.anomaly and at > self._anomaly_at - AT_ONCE
         here = here and muscle in self._robot.isolated
         self.safety.suspect = muscle if here else None
         self._verifies |= here
@@ -314,7 +264,7 @@ class Controller:
         self._refuse_floating()
         if self._estimate is None or self._mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
-        if cause := self.safety.cause or self.present_cause(self.stepped_at):
+        if cause := self.safety.cause or self.watch.present_cause(self.watch.stepped_at):
             raise MessageError('stopped', cause)
         if not self.safety.zeroed:
             raise MessageError('length zeros are unknown', 'find them by estimator/zero')
@@ -363,55 +313,15 @@ class Controller:
 
     def clock_jumped_back(self) -> None:
         """Count the messages' time from here."""
-        self._time, self.pace = math.nan, Pace()
+        self.watch.clock_jumped_back()
 
     def reset(self, now: float) -> str:
         """Clear a stop and go on to the last target; return why not, or ''."""
-        cause = self.present_cause(now)
+        cause = self.watch.present_cause(now)
         if not cause and self.safety.cause:
             self.safety.cause = ''
             self._starts = True
         return cause
-
-    def present_cause(self, now: float) -> str:
-        """Return why the arm must not move now, or ''."""
-        if self._mae is None:
-            return 'no checkpoint'
-        if self._anomaly:
-            return 'anomaly_detected; call estimator/reset when it is mended'
-        doubts = self._plausibility
-        for what, doubt in (('muscle_states', doubts.muscles), ('estimate', doubts.estimates)):
-            if why := doubt.lasting(now):
-                return f'{what}: {why}'
-        return self.intruder or self._late(now) or self._overload(now) or self._overheat()
-
-    def _late(self, now: float) -> str:
-        allowed = self.settings.max_age / min(max(self.pace.value, SLOWEST), 1.0)
-        for what, arrival in (
-            ('muscle_states', self._muscles_at),
-            ('estimated_joint_states', self._estimate_at),
-        ):
-            if now - self._asleep - arrival > allowed:
-                return f'{what} older than {allowed:.3g} s'
-        return ''
-
-    def _overload(self, now: float) -> str:
-        longest = self.settings.overload_time, OVERLOAD_MOMENT
-        for since, allowed, most in zip(self._tense_since, longest, self._overloads):
-            if now - self._asleep - since.min() > allowed:
-                m = int(since.argmin())
-                name = self._robot.muscles[m]
-                return f'{name}: tension above {most[m]:g} N for {allowed:g} s'
-        return ''
-
-    def _overheat(self) -> str:
-        now, bias = np.nan_to_num(self.heat.core, nan=-np.inf), self._robot.tension.bias
-        highest = self.settings.temperature_limit
-        hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
-        self._overheated = bool(hot or (self.limit <= bias).all())
-        name = self._robot.muscles[int(now.argmax())]
-        told = f'overheated: {name} {now.max():.0f} °C, limit {highest:g} °C'
-        return told if self._overheated else ''
 
     def report(self, now: float) -> Report:
         """Say what control is doing and what is in its way."""
@@ -454,12 +364,12 @@ class Controller:
             values['isolated muscles'] = self._left_out
         if not self.safety.zeroed:
             warnings.append('length zeros are unknown: the arm only explores, gently')
-        if tense := [n for n, t in zip(robot.muscles, self._tense_since[0]) if t < math.inf]:
+        if tense := self.watch.tense:
             warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')
-        if np.isfinite(core := self.heat.core).any():
+        if np.isfinite(core := self.watch.heat.core).any():
             windings = (f'{n} {c:.0f} °C' for n, c in zip(robot.muscles, core))
             values['temperature of windings'] = ', '.join(windings)
-        limited = zip(robot.muscles, self.limit, robot.tension.limit)
+        limited = zip(robot.muscles, self.watch.limit, robot.tension.limit)
         hot = {name: limit for name, limit, most in limited if limit < most}
         if hot:
             values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
@@ -473,7 +383,7 @@ class Controller:
             if self.safety.passing:
                 return Report('warn', f'holding: {cause}', values)
             return Report('error', f'stopped: {cause}', values)
-        if waiting := self.present_cause(now):
+        if waiting := self.watch.present_cause(now):
             return Report('warn', f'waiting: {waiting}', values)
         if warnings:
             return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
@@ -523,9 +433,11 @@ class Controller:
         `time` is the messages' [s], that of the steady clock if it is not given.
         """
         # What computing took is over when a command goes out: it may bring no change with it.
-        computing = max(self.sent_at - self.stepped_at, 0.0)
-        dt, awake = self._elapsed(now, now if time is None else time)
-        late, cause = self._late(now), self.present_cause(now)
+        computing = max(self.sent_at - self.watch.stepped_at, 0.0)
+        stopped = bool(self.safety.cause)
+        dt, awake, paused = self.watch.step(now, now if time is None else time, stopped)
+        self._starts |= paused
+        late, cause = self.watch.late(now), self.watch.present_cause(now)
         # Before the first command there is nothing to stop.
         self._follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:
@@ -536,12 +448,12 @@ class Controller:
         self._fresh = 0.0 if cause else self._fresh + awake
         if self.safety.passing and self._fresh > RESUME:
             self.safety.cause, self.safety.passing, self._starts = '', False, True
-        self._limit_by_heat(dt)
+        self.watch.limit_by_heat(self.safety.most_change(TENSION, dt))
         if self._resumes and (not self._may_resume or not self.reset(now)):
             self._resumes = False
             if self._may_resume and self._explored:
                 self.explore(True)
-            cause = self.present_cause(now)
+            cause = self.watch.present_cause(now)
         desired = None
         if not cause and not self.safety.cause:
             try:
@@ -553,7 +465,7 @@ class Controller:
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
         fresh = not late.startswith('muscle')
-        limit = self._most
+        limit = self.watch.most
         if not self.safety.zeroed:
             limit = np.minimum(limit, gentle_limit(self._robot))
         passed = 0.0 if waits else max(dt - computing, 0.0)
@@ -561,27 +473,6 @@ class Controller:
         if self.safety.cause and not self.safety.passing:
             self.explore(False)
         return command
-
-    def _limit_by_heat(self, dt: float) -> None:
-        """Let no limit fall faster than the rate limit pays out."""
-        held, most = self.heat.limits(self.settings.temperature_limit)
-        fall = self.safety.most_change(TENSION, dt)
-        self.limit = np.maximum(held, self.limit - fall)
-        self._most = np.maximum(most, self._most - fall)
-
-    def _elapsed(self, now: float, time: float) -> tuple[float, float]:
-        """Return how long this step is on the messages' clock, and on the steady one [s]."""
-        since, passed = max(now - self.stepped_at, 0.0), time - self._time
-        if self.stepped_at == -math.inf or math.isnan(passed):
-            since = passed = 0.0
-        if since > OWN_PAUSE:  # the arm may be elsewhere by now
-            self._asleep += since - OWN_PAUSE
-            self._starts = True
-        self.stepped_at, self._time = now, time
-        self.pace.step(passed, min(since, OWN_PAUSE))
-        # Where the messages' clock stands still for good, a stop must still let go.
-        passed = since if self.pace.value < SLOWEST and self.safety.cause else passed
-        return min(max(passed, 0.0), LONGEST_STEP), min(since, LONGEST_STEP)
 
     def _slack(self, command: Command | None) -> Command | None:
         """Return a command that gives isolated muscles all the length, or no tension."""
@@ -603,7 +494,7 @@ class Controller:
                 last = safety.unchanging(self._robot, LENGTH, muscles)
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
-        planned = np.minimum(self.limit, self._robot.tension.limit)
+        planned = np.minimum(self.watch.limit, self._robot.tension.limit)
         if self._starts and self._follows:  # after a pause: on from where it was
             self._starts = False
             self.motion.start()

@@ -192,7 +192,7 @@ def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[str]:
             wrench[:3] = rng.uniform(*PUSH) * way / np.linalg.norm(way) if n % every == 0 else 0.0
             arm.set_wrench(wrench)
         loop.explore()
-        if loop.core.present_cause(n * SAMPLE_TIME).startswith('anomaly') and not loop.isolated:
+        if loop.core.watch.anomaly and not loop.isolated:
             loop.estimator.reset()  # as somebody would: acquitted twice, the arm stays stopped
     return [f'{found} {"isolated" if isolated else ""}' for isolated, found in loop.found]
 

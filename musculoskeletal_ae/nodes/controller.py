@@ -64,7 +64,7 @@ class Controller(Shell):
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
         self.follow_zeros(self._shift)
-        self.follow_muscle_states(self._muscles, partial(setattr, self.core, 'intruder'))
+        self.follow_muscle_states(self._muscles, partial(setattr, self.core.watch, 'intruder'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
@@ -193,7 +193,7 @@ class Controller(Shell):
         return 'going on to the last target, if any; controller/explore explores again'
 
     def _watch(self) -> None:
-        if time.monotonic() - self.core.stepped_at > 1.5 / self.rate:
+        if time.monotonic() - self.core.watch.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:

@@ -259,7 +259,7 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
         core.estimated(theta, 0.01 * step)
         core.step(0.01 * step)
         planned.append(core.posture.solution.tension if core.posture.solution else None)
-    limit = core.limit[strongest]
+    limit = core.watch.limit[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
     said = core.report(12.0)
@@ -328,7 +328,7 @@ def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm(
         bench.target(OTHER)
         bench.step(100)
         assert bench.core.safety.cause == ''
-        assert bench.core.limit.min() == ROBOT.tension.bias[0]
+        assert bench.core.watch.limit.min() == ROBOT.tension.bias[0]
 
 
 def test_a_floating_arm_follows_the_hand_takes_no_target_and_is_held_where_it_was_left():

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.controller import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE, RESUME
+from musculoskeletal_ae.control.controller import RESUME
 from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.control.watch import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE
 from musculoskeletal_ae.exceptions import MessageError
 
 TICK = 0.1 * DT  # [m] that the rate limit allows
@@ -108,7 +109,7 @@ def test_modules_without_thermometers_are_no_reason_and_hide_no_hot_one(known):
     assert bench.core.safety.cause[:10] == ('overheated' if known else '')
     warm = np.isin(np.arange(ROBOT.muscle_count), known)
     tension = ROBOT.tension
-    np.testing.assert_array_equal(bench.core.limit, np.where(warm, tension.bias, tension.max))
+    np.testing.assert_array_equal(bench.core.watch.limit, np.where(warm, tension.bias, tension.max))
 
 
 def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
@@ -129,14 +130,14 @@ def test_a_hot_glitch_changes_nothing_and_real_heat_pays_out_within_the_rate_lim
     bench = Lied()
     bench.pull(np.full(ROBOT.muscle_count, 150.0))
     bench.step(300)
-    limit, before = bench.core.limit.copy(), bench.core.safety.command
+    limit, before = bench.core.watch.limit.copy(), bench.core.safety.command
     for hot in (84.0, 90.0, 200.0):
         sent = bench.lies(2, temperature=lambda t, hot=hot: t * 0.0 + hot) + bench.step(10)
-        np.testing.assert_array_equal(bench.core.limit, limit)
+        np.testing.assert_array_equal(bench.core.watch.limit, limit)
         assert largest_step(before, sent) <= TICK + 1e-9
     bench.temperature = COLD + np.array([60.0, *[0.0] * (ROBOT.muscle_count - 1)])
     assert largest_step(before, bench.step(200)) <= TICK + 1e-9
-    assert bench.core.limit[0] == ROBOT.tension.bias[0]
+    assert bench.core.watch.limit[0] == ROBOT.tension.bias[0]
 
 
 def test_overheating_is_reset_only_when_the_module_is_cool():
@@ -174,7 +175,7 @@ def test_a_tension_above_the_limit_is_said_at_once_and_stops_the_arm_after_the_s
 
 def test_a_second_source_of_muscle_states_stops_the_arm_by_name():
     bench = Lied()
-    bench.core.intruder = 'muscle_states come from /a and /b'
+    bench.core.watch.intruder = 'muscle_states come from /a and /b'
     bench.step(2)
     assert bench.core.safety.cause == 'muscle_states come from /a and /b'
     assert bench.core.reset(bench.now)

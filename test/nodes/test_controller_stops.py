@@ -10,7 +10,7 @@ from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.control.controller import LONGEST_STEP
+from musculoskeletal_ae.control.watch import LONGEST_STEP
 from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.stop_recording import FILE
 

@@ -15,7 +15,7 @@ from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from bench.gate import ATTACKS
-from musculoskeletal_ae.control.controller import LONGEST_STEP
+from musculoskeletal_ae.control.watch import LONGEST_STEP
 from musculoskeletal_ae.estimation import gate
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
@@ -108,7 +108,7 @@ def test_a_second_driver_of_the_same_name_is_one_too_many(arm):
 
         node.create_subscription(Float64MultiArray, 'muscle_states', repeat, 10)
         two = f'from 2 nodes {node.get_namespace()}/hardware_emulator'
-        arm.graph.wait(lambda: two in arm.controller.core.intruder, 'the stop')
+        arm.graph.wait(lambda: two in arm.controller.core.watch.intruder, 'the stop')
     finally:
         twin.destroy_node()
 
@@ -162,7 +162,7 @@ def test_under_use_sim_time_the_ramp_follows_the_clock(graph, arm26, trained_fil
     # By the steady clock it would be over after 0.6 s of this one, or last for 6 s.
     assert done_at - begun >= 0.9 * ramp.duration
     assert len(sent) > 0
-    assert (node.core.pace.value < 1.0) is (pace < 1.0)
+    assert (node.core.watch.pace < 1.0) is (pace < 1.0)
 
 
 # The estimate of the first is so far off that the controller does not even start.
