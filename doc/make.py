@@ -29,6 +29,7 @@ MODULES = {
     'estimation/estimator.py': ['Estimator', 'Estimate'],
     'control/controller.py': ['Controller'],
     'control/watch.py': ['Watch'],
+    'control/status.py': ['report', 'slowed'],
     'control/settings.py': ['Settings'],
     'control/trajectory.py': ['Trajectory', 'Points', 'Setpoint'],
     'control/motion.py': ['MotionControl'],

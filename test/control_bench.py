@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from exact_mae import ExactMae, rest_readings
 
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
@@ -52,7 +53,7 @@ class Bench:
         self.core.target(dict(zip(ROBOT.joints, zip(theta, effort))))
 
     def report(self):
-        return self.core.report(self.now)
+        return status.report(self.core, self.now)
 
 
 def values(commands):

@@ -42,12 +42,9 @@ from musculoskeletal_ae.control.watch import Watch
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import PRESETS
-from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
-NOTABLE = 0.05  # [N·m] of missing torque
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
@@ -60,8 +57,8 @@ class Controller:
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
-        self._robot, self.settings = copy.copy(robot), settings or Settings()
-        robot = self._robot
+        self.robot, self.settings = copy.copy(robot), settings or Settings()
+        robot = self.robot
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
@@ -73,11 +70,11 @@ class Controller:
         self.safety = SafetyFilter(robot, self.settings)
         self.watch = Watch(robot, self.settings)
         self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
-        self._mae: Mae | None = None
+        self.mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
         self._exploration = Exploration(robot, seed)
         self.gentle = GentleMotion(robot, seed)
-        self._estimate: Array | None = None
+        self.estimate: Array | None = None
         self.sent_at = 0.0  # when the last command went out; its user says so
         self._fresh = 0.0  # [s] of data since it was late
         # whether it explored at an anomaly; whether a suspect is verified; whether the arm is to go
@@ -94,7 +91,7 @@ class Controller:
 
         A MusculoskeletalError says that the joint stiffness does not fit the robot.
         """
-        before, joints = self.settings, self._robot.joint_count
+        before, joints = self.settings, self.robot.joint_count
         stiffness = settings.desired_stiffness(joints)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
@@ -108,7 +105,7 @@ class Controller:
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
-        self._mae, self.watch.checkpoint = mae, True
+        self.mae, self.watch.checkpoint = mae, True
         self.posture.use(mae)
         self.motion.use(mae)
 
@@ -120,9 +117,9 @@ class Controller:
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
         if not self.safety.zeroed:
-            theta = np.clip(theta, self._robot.lower, self._robot.upper)
+            theta = np.clip(theta, self.robot.lower, self.robot.upper)
         self.watch.estimated(theta, now)
-        self._estimate = theta
+        self.estimate = theta
 
     def zeros(self, known: bool, less: Array) -> None:
         """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
@@ -145,26 +142,26 @@ class Controller:
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Go on without these muscles, places in T and l, and with all others."""
-        muscles, before = set(muscles), set(self._robot.isolated)
-        self._robot.isolate(muscles)
+        muscles, before = set(muscles), set(self.robot.isolated)
+        self.robot.isolate(muscles)
         if added := muscles - before:
             self._isolated_at = max(added), self.watch.stepped_at
-        if self._mae is not None:
-            self.use(self._mae)
+        if self.mae is not None:
+            self.use(self.mae)
         self._note_suspect()
 
     def _note_suspect(self) -> None:
         muscle, at = self._isolated_at  # whichever was told first
         here = self.watch.anomaly and at > self._anomaly_at - AT_ONCE
-        here = here and muscle in self._robot.isolated
+        here = here and muscle in self.robot.isolated
         self.safety.suspect = muscle if here else None
         self._verifies |= here
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
         self._refuse_floating()
-        robot = self._robot
-        kept = self.posture.theta if self.posture.theta is not None else self._estimate
+        robot = self.robot
+        kept = self.posture.theta if self.posture.theta is not None else self.estimate
         if kept is None and len(joints) < robot.joint_count:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
@@ -183,9 +180,9 @@ class Controller:
         self.posture.set_target(inside, effort)
 
     def _approach(self, theta: Array, effort: Array) -> None:
-        start, mae = self._ready(), self._mae
+        start, mae = self._ready(), self.mae
         assert mae is not None  # else it was not ready
-        way = reach.way(self._robot, mae, start.theta, theta)
+        way = reach.way(self.robot, mae, start.theta, theta)
         self._follow(Trajectory.to(start, way, self.settings.target_duration), effort=effort)
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
@@ -193,7 +190,7 @@ class Controller:
 
         A MessageError says why not: nothing changes then.
         """
-        robot = self._robot
+        robot = self.robot
         if points is not None:
             beyond = (points.position < robot.lower[points.joints] - ROUNDING) | (
                 points.position > robot.upper[points.joints] + ROUNDING
@@ -219,7 +216,7 @@ class Controller:
 
         A MessageError says why not: nothing changes then.
         """
-        start, chosen, mae = self._ready(), self.settings, self._mae
+        start, chosen, mae = self._ready(), self.settings, self.mae
         assert mae is not None  # else it was not ready
         nearest = chosen.unreachable == 'nearest'
         theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
@@ -231,7 +228,7 @@ class Controller:
 
         A MessageError says why not: nothing changes then.
         """
-        start, mae = self._ready(), self._mae
+        start, mae = self._ready(), self.mae
         assert mae is not None
         self._follow(self._hand.moved(mae, start, twist))
 
@@ -240,12 +237,12 @@ class Controller:
 
         A MessageError says that they are needed, unless the nearest posture is wished.
         """
-        if self._robot.used.all() or self._mae is None or self._estimate is None:
+        if self.robot.used.all() or self.mae is None or self.estimate is None:
             return theta, ''
-        nearest, short = reach.nearest_held(self._robot, self._mae, self._estimate, theta)
+        nearest, short = reach.nearest_held(self.robot, self.mae, self.estimate, theta)
         if not short:
             return theta, ''
-        angles = ', '.join(f'{n} {a:.2f}' for n, a in zip(self._robot.joints, nearest))
+        angles = ', '.join(f'{n} {a:.2f}' for n, a in zip(self.robot.joints, nearest))
         short = f'{short} without {self._left_out}; nearest posture held: {angles} rad'
         if self.settings.unreachable == 'refuse':
             raise MessageError('out of reach', short)
@@ -253,7 +250,7 @@ class Controller:
 
     @property
     def _left_out(self) -> str:
-        return self._robot.names(self._robot.isolated)
+        return self.robot.names(self.robot.isolated)
 
     def _refuse_floating(self) -> None:
         if self.settings.method == 'float':
@@ -262,7 +259,7 @@ class Controller:
     def _ready(self, delay: float = 0.0) -> Setpoint:
         """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
         self._refuse_floating()
-        if self._estimate is None or self._mae is None:
+        if self.estimate is None or self.mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
         if cause := self.safety.cause or self.watch.present_cause(self.watch.stepped_at):
             raise MessageError('stopped', cause)
@@ -270,20 +267,20 @@ class Controller:
             raise MessageError('length zeros are unknown', 'find them by estimator/zero')
         if self._follows and not self._starts:
             return self.motion.ahead(delay)
-        robot = self._robot
-        return Setpoint.resting(np.clip(self._estimate, robot.lower, robot.upper))
+        robot = self.robot
+        return Setpoint.resting(np.clip(self.estimate, robot.lower, robot.upper))
 
     def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
         if not self._follows or self._starts:
             self.explore(False)
             self.motion.start()
             if delay > 0.0:
-                self.motion.follow(Trajectory.stopping(self._ready(), self._robot))
+                self.motion.follow(Trajectory.stopping(self._ready(), self.robot))
         self._follows, self._starts, self.clamped, self.short = True, False, (), ''
         self._approaches = 0
         try:
             self.motion.follow(planned, delay)
-            self.motion.exert(np.zeros(self._robot.joint_count) if effort is None else effort)
+            self.motion.exert(np.zeros(self.robot.joint_count) if effort is None else effort)
         except Exception as error:  # noqa: BLE001 (as in `step`)
             self.stop(f'fault of control: {type(error).__name__}: {error}')
         self.posture.theta, self.posture.effort = planned.end, self.motion.effort
@@ -323,81 +320,6 @@ class Controller:
             self._starts = True
         return cause
 
-    def report(self, now: float) -> Report:
-        """Say what control is doing and what is in its way."""
-        chosen, posture, robot = self.settings, self.posture, self._robot
-        solution = self.motion.solution if self._follows else posture.solution
-        missing = np.zeros(0)
-        values, warnings = {'method': chosen.method, 'preset': chosen.preset}, []
-        if self.clamped:
-            values['target clamped at'] = ', '.join(self.clamped)
-            warnings.append('target clamped to the joint limits')
-        if solution is not None:
-            missing = solution.missing_torque
-        if solution is not None and solution.stiffness is not None:
-            expected, *reachable = solution.stiffness
-            desired = chosen.desired_stiffness(robot.joint_count)
-            for row in zip(robot.joints, desired, expected.diagonal(), *reachable):
-                name, wanted, planned, low, high = row
-                text = f'{planned:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'
-                if wanted > 0.0 and not low <= wanted <= high:
-                    text += f', desired {wanted:.2f} clamped'
-                values[f'joint stiffness {name}'] = text
-        if posture.effort.any() and chosen.method in ('geometric', 'first', 'second'):
-            warnings.append(f'method {chosen.method} exerts no effort')
-        if self._in_tension:
-            missing = self._torque.missing_torque
-        if self._follows:
-            missing = self.motion.missing_torque
-            values['lag of the winches'] = f'{1000.0 * self.motion.winches.lag:.0f} ms'
-            if self.motion.moving and self.slowed:
-                warnings.append(f'trajectory {self.slowed}')
-        if np.abs(missing).max(initial=0.0) > NOTABLE:
-            lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
-            values['missing torque'] = ', '.join(lacks)
-            warnings.append('the target needs more torque than the muscles have')
-        if self.short:
-            warnings.append(f'out of reach: {self.short}')
-        if self._follows and self.motion.fallen:
-            warnings.append(self._lying())
-        if self._left_out:
-            values['isolated muscles'] = self._left_out
-        if not self.safety.zeroed:
-            warnings.append('length zeros are unknown: the arm only explores, gently')
-        if tense := self.watch.tense:
-            warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')
-        if np.isfinite(core := self.watch.heat.core).any():
-            windings = (f'{n} {c:.0f} °C' for n, c in zip(robot.muscles, core))
-            values['temperature of windings'] = ', '.join(windings)
-        limited = zip(robot.muscles, self.watch.limit, robot.tension.limit)
-        hot = {name: limit for name, limit, most in limited if limit < most}
-        if hot:
-            values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
-            warnings.append(f'hot: {", ".join(hot)}')
-        still = 'no target' if posture.theta is None else 'holding'
-        doing = 'exploring' if posture.exploring else still
-        doing = 'floating' if chosen.method == 'float' else doing
-        if self._follows and self.motion.moving:
-            doing = 'following a trajectory'
-        if cause := self.safety.cause:
-            if self.safety.passing:
-                return Report('warn', f'holding: {cause}', values)
-            return Report('error', f'stopped: {cause}', values)
-        if waiting := self.watch.present_cause(now):
-            return Report('warn', f'waiting: {waiting}', values)
-        if warnings:
-            return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
-        return Report('ok', doing, values)
-
-    def _lying(self) -> str:
-        """Return how far from its target an arm rests that fell, and what keeps it there."""
-        mae, estimate, off = self._mae, self._estimate, self.motion.error
-        assert mae is not None and estimate is not None  # it has moved
-        joint = int(np.abs(off).argmax())
-        told = f'fallen: {self._robot.joints[joint]} rests {abs(off[joint]):.2f} rad off its target'
-        lacks = reach.lacking(self._robot, mae, estimate)
-        return f'{told}, where the muscles lack {lacks}; lift it by hand' if lacks else told
-
     # -- time -----------------------------------------------------------------------------------
 
     @property
@@ -412,19 +334,10 @@ class Controller:
         return self._follows
 
     @property
-    def slowed(self) -> str:
-        """By how much the last trajectory was slowed, or ''."""
-        last = self.motion.latest
-        if last is None or last.slowed == 1.0:
-            return ''
-        return f'slowed to {100.0 / last.slowed:.0f} % of its speed for the winches'
-
-    @property
-    def _in_tension(self) -> bool:
-        return self.settings.method in ('tension', 'float') and not self.posture.exploring
-
-    @property
-    def _torque(self) -> TorqueControl:
+    def by_tension(self) -> TorqueControl | None:
+        """What commands tensions now; None where lengths are commanded."""
+        if self.settings.method not in ('tension', 'float') or self.posture.exploring:
+            return None
         return self.floating if self.settings.method == 'float' else self.torque
 
     def step(self, now: float, time: float | None = None) -> Command | None:
@@ -467,7 +380,7 @@ class Controller:
         fresh = not late.startswith('muscle')
         limit = self.watch.most
         if not self.safety.zeroed:
-            limit = np.minimum(limit, gentle_limit(self._robot))
+            limit = np.minimum(limit, gentle_limit(self.robot))
         passed = 0.0 if waits else max(dt - computing, 0.0)
         command = self.safety.step(desired, limit, passed, fresh)
         if self.safety.cause and not self.safety.passing:
@@ -476,25 +389,25 @@ class Controller:
 
     def _slack(self, command: Command | None) -> Command | None:
         """Return a command that gives isolated muscles all the length, or no tension."""
-        if command is None or self._robot.used.all():
+        if command is None or self.robot.used.all():
             return command
         nothing = self.safety.longest if command.kind == LENGTH else 0.0
-        return Command(command.kind, np.where(self._robot.used, command.value, nothing))
+        return Command(command.kind, np.where(self.robot.used, command.value, nothing))
 
     def _command(self, dt: float) -> Command | None:
-        mae, muscles, estimate = self._mae, self.safety.now, self._estimate
+        mae, muscles, estimate = self.mae, self.safety.now, self.estimate
         # No present cause: all are there.
         assert mae is not None and muscles is not None and estimate is not None
-        posture, in_tension = self.posture, self._in_tension
+        posture, by_tension = self.posture, self.by_tension
         if not self.safety.zeroed:
             if not posture.exploring:
                 return None
             last = self.safety.command
             if last is None or last.kind != LENGTH:
-                last = safety.unchanging(self._robot, LENGTH, muscles)
+                last = safety.unchanging(self.robot, LENGTH, muscles)
             now = muscles.tension, muscles.length, estimate
             return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
-        planned = np.minimum(self.watch.limit, self._robot.tension.limit)
+        planned = np.minimum(self.watch.limit, self.robot.tension.limit)
         if self._starts and self._follows:  # after a pause: on from where it was
             self._starts = False
             self.motion.start()
@@ -506,24 +419,24 @@ class Controller:
         if self._starts:
             self._starts = False
             # Go on from the last command, or from how the muscles pull at this moment.
-            kind, command = TENSION if in_tension else LENGTH, self.safety.command
+            kind, command = TENSION if by_tension else LENGTH, self.safety.command
             if command is None or command.kind != kind:
-                command = safety.unchanging(self._robot, kind, muscles)
-            (self._torque if in_tension else posture).start_from(command.value)
+                command = safety.unchanging(self.robot, kind, muscles)
+            (by_tension or posture).start_from(command.value)
         if self._follows:
             sent = self.safety.command
             if sent is None or sent.kind != LENGTH:
-                sent = safety.unchanging(self._robot, LENGTH, muscles)
+                sent = safety.unchanging(self.robot, LENGTH, muscles)
             follow = self.motion.step
             return Command(LENGTH, follow(muscles, estimate, sent.value, planned, dt))
-        if not in_tension:
+        if by_tension is None:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
         if self.settings.method == 'float':
             nothing = np.zeros_like(estimate)
             tension = self.floating.step(mae, estimate, estimate, nothing, planned, dt)
             # Where it is left is held by the method that comes next.
-            inside = np.clip(estimate, self._robot.lower, self._robot.upper)
+            inside = np.clip(estimate, self.robot.lower, self.robot.upper)
             posture.theta, posture.effort = inside, nothing
             return Command(TENSION, tension)
         if posture.theta is None:

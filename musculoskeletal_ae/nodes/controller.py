@@ -26,6 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
@@ -157,7 +158,7 @@ class Controller(Shell):
         self.core.twist(read_twist(message, self.root_frame))
 
     def _tell_slowed(self) -> None:
-        if slowed := self.core.slowed:
+        if slowed := status.slowed(self.core.motion):
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
     def _state(self) -> JointTrajectory:
@@ -215,7 +216,7 @@ class Controller(Shell):
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
-        report = super().report()
+        report = status.report(self.core, time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
         stopped = [report.message] if self.core.safety.cause else []

@@ -10,6 +10,7 @@ from exact_mae import ExactMae, rest_readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.posture import REPLAN
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
@@ -262,7 +263,7 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
     limit = core.watch.limit[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
-    said = core.report(12.0)
+    said = status.report(core, 12.0)
     assert said.level == 'warn'
     assert robot.muscles[strongest] in said.values['tension limited by heat']
 

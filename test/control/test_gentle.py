@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import SPEED, gentle_limit
 from musculoskeletal_ae.control.safety import Muscles
@@ -50,7 +51,7 @@ def test_a_target_waits_for_the_zeros(loop):
     loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
     loop.run(0.5)
     assert not loop.commands
-    assert 'length zeros are unknown' in loop.core.report(loop.now).message
+    assert 'length zeros are unknown' in status.report(loop.core, loop.now).message
     loop.core.zeros(True, loop.offset)
     loop.run(0.5)
     assert loop.commands

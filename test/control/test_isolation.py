@@ -101,7 +101,7 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench.configure(unreachable='nearest')
     bench.target(NOT_THERE)
     goal = bench.core.posture.theta
-    assert not lacking(bench.core._robot, bench.mae, goal)
+    assert not lacking(bench.core.robot, bench.mae, goal)
     way, whole = goal - THERE, NOT_THERE - THERE
     np.testing.assert_allclose(way, whole * (way @ whole) / (whole @ whole), atol=1e-9)
     bench.step()
@@ -251,9 +251,9 @@ def test_exploring_goes_on_after_the_suspect_was_verified():
 def test_nothing_is_shared_with_whoever_else_has_the_robot():
     one, two = Controller(ROBOT), Controller(ROBOT)
     one.isolate([1])
-    assert two._robot.tension.bias[1] == 30.0
+    assert two.robot.tension.bias[1] == 30.0
     one.isolate([])
-    np.testing.assert_array_equal(one._robot.tension.limit, ROBOT.tension.limit)
+    np.testing.assert_array_equal(one.robot.tension.limit, ROBOT.tension.limit)
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])

@@ -139,7 +139,7 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
     bench.step(100)
     assert not bench.core.reset(bench.now)
     bench.step(5)
-    assert not bench.core.motion.moving or not bench.core._follows
+    assert not bench.core.motion.moving or not bench.core.follows
     np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
 
 

@@ -38,21 +38,21 @@ def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
     assert arm.estimator.core.verified == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name
     graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
-    assert arm.controller.core._robot.isolated == (3,)
+    assert arm.controller.core.robot.isolated == (3,)
     arm.target(THERE)
     arm.goes_to(THERE)
     assert arm.estimator.core.cause == ''
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
     answer = graph.call(Trigger, 'estimator/restore')
     assert (answer.success, answer.message) == (True, 'isolated: none')
-    graph.wait(lambda: arm.controller.core._robot.isolated == (), 'its use')
+    graph.wait(lambda: arm.controller.core.robot.isolated == (), 'its use')
 
 
 def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
     graph, name = arm.graph, arm.robot.muscles[2]
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
-    graph.wait(lambda: arm.controller.core._robot.isolated == (2,), 'the controller')
+    graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
     assert arm.estimator.core.verified == f'{name}: a sensor says no number'
     graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
     arm.target(THERE)
@@ -70,12 +70,12 @@ def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, tr
     assert 'legal: ' in reason
     assert graph.set_parameter('estimator', 'isolate_muscles', names)[0]
     assert graph.call(Trigger, 'estimator/isolate').message == f'isolated: {", ".join(names)}'
-    graph.wait(lambda: arm.controller.core._robot.isolated == (1, 2), 'the controller')
+    graph.wait(lambda: arm.controller.core.robot.isolated == (1, 2), 'the controller')
     stranger = graph.publisher(String, 'isolated_muscles', LATCHED)
     stranger.publish(String(data='tail'))
     graph.wait(lambda: sum(n for what, n in arm.controller.rejected.items() if 'isolated' in what),
                'the rejection')  # fmt: skip
-    assert arm.controller.core._robot.isolated == (1, 2)
+    assert arm.controller.core.robot.isolated == (1, 2)
     # A learner's network that knows of none is told again who they are.
     count = len(graph.received['isolated_muscles'])
     network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)

@@ -76,7 +76,7 @@ def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, tra
     detected = arm.graph.publisher(Bool, 'anomaly_detected', LATCHED)
     detected.publish(Bool(data=True))
     arm.says('anomaly_detected')
-    assert arm.controller.gate.mae is core._mae is first
+    assert arm.controller.gate.mae is core.mae is first
     reset = arm.graph.call(Trigger, 'controller/reset')
     assert 'anomaly' in reset.message
 
