@@ -29,7 +29,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach, safety
+from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
@@ -62,7 +62,7 @@ class Controller:
         self.posture = PostureControl(robot, self.settings)
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
-        self._follows = False  # a trajectory, or holds where it ended
+        self.follows = False  # a trajectory, or holds where one ended
         self._approaches = 0  # of a target that are left, if the arm falls
         self._hand = Hand(robot)
         self.short = ''  # what the last target was out of reach by
@@ -99,9 +99,9 @@ class Controller:
         if settings.method == 'float':
             self.explore(False)
         if settings.method != before.method and not self.posture.exploring:
-            self._starts, self._follows = True, False
+            self._starts, self.follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
-            (self.motion.plan_anew if self._follows else self.posture.start)()
+            (self.motion.plan_anew if self.follows else self.posture.start)()
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
@@ -126,7 +126,7 @@ class Controller:
         self.safety.shift(less)
         self.watch.forget()
         if known != self.safety.zeroed or less.any():
-            self._starts, self._follows = True, False
+            self._starts, self.follows = True, False
         self.safety.zeroed = known
         self.gentle.start()
 
@@ -166,24 +166,23 @@ class Controller:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
-        inside = np.clip(theta, robot.lower, robot.upper)
-        inside, short = self._within_reach(inside)
+        inside, self.short = self._within_reach(np.clip(theta, robot.lower, robot.upper))
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
-        if self._quick and not self.safety.cause:
+        chosen = self.settings
+        solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
+        if solved and chosen.target_duration > 0.0 and not self.safety.cause:
             with suppress(MessageError):  # not ready: then by a ramp, once it is
-                clamped = self.clamped
-                self._approach(inside, effort)
-                self.clamped, self.short, self._approaches = clamped, short, APPROACHES
+                self._approach(inside, effort, APPROACHES)
                 return
-        self._starts |= self.posture.exploring or self._follows
-        self._follows, self.short = False, short
+        self._starts |= self.posture.exploring or self.follows
+        self.follows = False
         self.posture.set_target(inside, effort)
 
-    def _approach(self, theta: Array, effort: Array) -> None:
-        start, mae = self._ready(), self.mae
-        assert mae is not None  # else it was not ready
+    def _approach(self, theta: Array, effort: Array, left: int) -> None:
+        kept, (start, mae) = (self.clamped, self.short), self._ready()
         way = reach.way(self.robot, mae, start.theta, theta)
         self._follow(Trajectory.to(start, way, self.settings.target_duration), effort=effort)
+        (self.clamped, self.short), self._approaches = kept, left
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
         """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
@@ -192,16 +191,14 @@ class Controller:
         """
         robot = self.robot
         if points is not None:
-            beyond = (points.position < robot.lower[points.joints] - ROUNDING) | (
-                points.position > robot.upper[points.joints] + ROUNDING
-            )
+            low, high = robot.lower[points.joints], robot.upper[points.joints]
+            beyond = (points.position < low - ROUNDING) | (points.position > high + ROUNDING)
             if beyond.any():
                 k, j = np.argwhere(beyond)[0]
-                place = points.joints[j]
-                limits = f'{robot.lower[place]:.3f} to {robot.upper[place]:.3f}'
-                told = f'{robot.joints[place]} {points.position[k, j]:.3f}, legal: {limits} rad'
-                raise MessageError('beyond the joint limits', told)
-        start = self._ready(max(delay, 0.0))
+                told = f'{robot.joints[points.joints[j]]} {points.position[k, j]:.3f}'
+                limits = f'legal: {low[j]:.3f} to {high[j]:.3f} rad'
+                raise MessageError('beyond the joint limits', f'{told}, {limits}')
+        start, _ = self._ready(max(delay, 0.0))
         if points is None:
             self._follow(Trajectory.stopping(start, robot))
         else:
@@ -216,8 +213,7 @@ class Controller:
 
         A MessageError says why not: nothing changes then.
         """
-        start, chosen, mae = self._ready(), self.settings, self.mae
-        assert mae is not None  # else it was not ready
+        (start, mae), chosen = self._ready(), self.settings
         nearest = chosen.unreachable == 'nearest'
         theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
         self._follow(self._hand.towards(start, pose, theta, chosen.hand_speed, now))
@@ -228,8 +224,7 @@ class Controller:
 
         A MessageError says why not: nothing changes then.
         """
-        start, mae = self._ready(), self.mae
-        assert mae is not None
+        start, mae = self._ready()
         self._follow(self._hand.moved(mae, start, twist))
 
     def _within_reach(self, theta: Array) -> tuple[Array, str]:
@@ -256,8 +251,11 @@ class Controller:
         if self.settings.method == 'float':
             raise MessageError('floating', 'a hand moves the arm; set another method first')
 
-    def _ready(self, delay: float = 0.0) -> Setpoint:
-        """Return where a trajectory starts in `delay` [s]; a MessageError says why none may."""
+    def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
+        """Return where a trajectory starts in `delay` [s], and the network.
+
+        A MessageError says why none may start.
+        """
         self._refuse_floating()
         if self.estimate is None or self.mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
@@ -265,18 +263,18 @@ class Controller:
             raise MessageError('stopped', cause)
         if not self.safety.zeroed:
             raise MessageError('length zeros are unknown', 'find them by estimator/zero')
-        if self._follows and not self._starts:
-            return self.motion.ahead(delay)
-        robot = self.robot
-        return Setpoint.resting(np.clip(self.estimate, robot.lower, robot.upper))
+        if self.follows and not self._starts:
+            return self.motion.ahead(delay), self.mae
+        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
+        return Setpoint.resting(inside), self.mae
 
     def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
-        if not self._follows or self._starts:
+        if not self.follows or self._starts:
             self.explore(False)
             self.motion.start()
             if delay > 0.0:
-                self.motion.follow(Trajectory.stopping(self._ready(), self.robot))
-        self._follows, self._starts, self.clamped, self.short = True, False, (), ''
+                self.motion.follow(Trajectory.stopping(self._ready()[0], self.robot))
+        self.follows, self._starts, self.clamped, self.short = True, False, (), ''
         self._approaches = 0
         try:
             self.motion.follow(planned, delay)
@@ -297,7 +295,7 @@ class Controller:
             self.short = ''
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
-            self._starts, self._follows = True, False
+            self._starts, self.follows = True, False
         return ''
 
     def stop(self, cause: str) -> None:
@@ -323,17 +321,6 @@ class Controller:
     # -- time -----------------------------------------------------------------------------------
 
     @property
-    def _quick(self) -> bool:
-        chosen = self.settings
-        solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
-        return solved and chosen.target_duration > 0.0
-
-    @property
-    def follows(self) -> bool:
-        """Whether a trajectory is followed, or the end of one held."""
-        return self._follows
-
-    @property
     def by_tension(self) -> TorqueControl | None:
         """What commands tensions now; None where lengths are commanded."""
         if self.settings.method not in ('tension', 'float') or self.posture.exploring:
@@ -352,7 +339,7 @@ class Controller:
         self._starts |= paused
         late, cause = self.watch.late(now), self.watch.present_cause(now)
         # Before the first command there is nothing to stop.
-        self._follows &= not (cause or self.safety.cause)
+        self.follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:
             if cause == late:
                 self.safety.stop(cause, passing=True)
@@ -402,33 +389,23 @@ class Controller:
         if not self.safety.zeroed:
             if not posture.exploring:
                 return None
-            last = self.safety.command
-            if last is None or last.kind != LENGTH:
-                last = safety.unchanging(self.robot, LENGTH, muscles)
-            now = muscles.tension, muscles.length, estimate
-            return Command(LENGTH, self.gentle.step(mae, *now, last.value, dt))
+            now = muscles.tension, muscles.length, estimate, self.safety.last(LENGTH).value
+            return Command(LENGTH, self.gentle.step(mae, *now, dt))
         planned = np.minimum(self.watch.limit, self.robot.tension.limit)
-        if self._starts and self._follows:  # after a pause: on from where it was
+        if self._starts and self.follows:  # after a pause: on from where it was
             self._starts = False
             self.motion.start()
-        if self._follows and self._approaches and self.motion.fallen:
+        if self.follows and self._approaches and self.motion.fallen:
             assert posture.theta is not None  # what is followed has led there
-            self._starts, left, kept = True, self._approaches - 1, (self.clamped, self.short)
-            self._approach(posture.theta, posture.effort)
-            self._approaches, (self.clamped, self.short) = left, kept
+            self._starts = True
+            self._approach(posture.theta, posture.effort, self._approaches - 1)
         if self._starts:
             self._starts = False
-            # Go on from the last command, or from how the muscles pull at this moment.
-            kind, command = TENSION if by_tension else LENGTH, self.safety.command
-            if command is None or command.kind != kind:
-                command = safety.unchanging(self.robot, kind, muscles)
-            (by_tension or posture).start_from(command.value)
-        if self._follows:
-            sent = self.safety.command
-            if sent is None or sent.kind != LENGTH:
-                sent = safety.unchanging(self.robot, LENGTH, muscles)
-            follow = self.motion.step
-            return Command(LENGTH, follow(muscles, estimate, sent.value, planned, dt))
+            kind = TENSION if by_tension else LENGTH
+            (by_tension or posture).start_from(self.safety.last(kind).value)
+        if self.follows:
+            sent = self.safety.last(LENGTH).value
+            return Command(LENGTH, self.motion.step(muscles, estimate, sent, planned, dt))
         if by_tension is None:
             length = posture.step(muscles.tension, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)

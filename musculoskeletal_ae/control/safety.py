@@ -130,6 +130,13 @@ class SafetyFilter:
             self.command = self._released(self.command, muscles, dt, fresh)
         return self.command
 
+    def last(self, kind: str) -> Command:
+        """Return the last command, or one of this kind under which the muscles pull as now."""
+        assert self.now is not None  # nothing is commanded before
+        if self.command is None or self.command.kind != kind:
+            return unchanging(self._robot, kind, self.now)
+        return self.command
+
     def most_change(self, kind: str, dt: float) -> Array | float:
         """Return by how much a command may change in dt [s]."""
         rate = self.settings.rate_limit
@@ -158,9 +165,7 @@ class SafetyFilter:
         self.passing = False
         winding = self.suspect is not None and fresh
         winding &= self._held > self.settings.hold_time + PAYING_OUT
-        if winding and command.kind == TENSION:
-            command = unchanging(self._robot, LENGTH, muscles)
-        kind, value = command
+        kind, value = self.last(LENGTH) if winding else command
         change = self.most_change(kind, dt)
         if kind == TENSION:
             return Command(kind, np.maximum(self._robot.tension.bias, value - change))

@@ -41,7 +41,8 @@ class Watch:
         self.checkpoint = self.anomaly = False  # whether there is one
         self.intruder = ''  # who else sends muscle_states
         self._plausibility = Plausibility(robot)
-        self.stepped_at = self._muscles_at = self._estimate_at = -math.inf
+        self.stepped_at = -math.inf
+        self._came_at = dict.fromkeys(('muscle_states', 'estimated_joint_states'), -math.inf)
         self._time, self._asleep = math.nan, 0.0  # [s] of own pauses
         self.pace = 1.0  # of the messages' clock beside the steady one
         self.heat = Heat(robot)
@@ -56,16 +57,14 @@ class Watch:
         #: since when each muscle pulls above each of them
         self._tense_since: Array = np.full((2, robot.muscle_count), math.inf)
 
-    # -- what comes in --------------------------------------------------------------------------
-
     def muscles(self, muscles: Muscles, zeroed: bool, now: float) -> None:
         """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
         length, tension, temperature = muscles
         # While zeros are unknown a guess may make any length of them, and any posture.
         self._plausibility.check_muscles(tension, length if zeroed else None, temperature, now)
         awake = now - self._asleep
-        since = awake - self._muscles_at if self._muscles_at > -math.inf else 0.0
-        self._muscles_at = awake
+        before, self._came_at['muscle_states'] = self._came_at['muscle_states'], awake
+        since = awake - before if before > -math.inf else 0.0
         # NaN is not known, and no reason for anything.
         self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
         self.heat.step(tension, np.median(np.array(self._temperatures), axis=0), since)
@@ -78,13 +77,11 @@ class Watch:
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
         self._plausibility.check_estimate(theta, now)
-        self._estimate_at = now - self._asleep
+        self._came_at['estimated_joint_states'] = now - self._asleep
 
     def forget(self) -> None:
         """Judge messages anew: lengths have another zero."""
         self._plausibility = Plausibility(self._robot)
-
-    # -- time -----------------------------------------------------------------------------------
 
     def clock_jumped_back(self) -> None:
         """Count the messages' time from here."""
@@ -115,8 +112,6 @@ class Watch:
         self.limit = np.maximum(held, self.limit - fall)
         self.most = np.maximum(most, self.most - fall)
 
-    # -- what is found --------------------------------------------------------------------------
-
     def present_cause(self, now: float) -> str:
         """Return why the arm must not move now, or ''."""
         if not self.checkpoint:
@@ -132,11 +127,8 @@ class Watch:
     def late(self, now: float) -> str:
         """Return which data is too old, or ''."""
         allowed = self.settings.max_age / min(max(self.pace, SLOWEST), 1.0)
-        for what, arrival in (
-            ('muscle_states', self._muscles_at),
-            ('estimated_joint_states', self._estimate_at),
-        ):
-            if now - self._asleep - arrival > allowed:
+        for what, at in self._came_at.items():
+            if now - self._asleep - at > allowed:
                 return f'{what} older than {allowed:.3g} s'
         return ''
 
