@@ -59,6 +59,8 @@ class QuasiStatics:
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
         self._load, self._slopes = Load(robot.kinematics), Slopes(robot, mae)
+        # A noisy fit may find a little less than none, which would drive the arm.
+        self._friction = np.maximum(mae.friction, 0.0)
         self._eye = np.eye(robot.joint_count)
         postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
         levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
@@ -79,7 +81,7 @@ class QuasiStatics:
         """
         robot, theta, tension = self._robot, state.theta, state.tension
         stiffness, limits = robot.stiffness, robot.tension
-        passed = np.exp(-self._mae.friction * state.slid)  # from the motor to the elastic unit
+        passed = np.exp(-self._friction * state.slid)  # from the motor to the elastic unit
         end = passed * tension
         length, pullback = self._mae.lengths_with_pullback(theta, end)
         span = (limits.max - limits.bias) / stiffness
@@ -92,7 +94,7 @@ class QuasiStatics:
         load, load_slope = self._load(theta, wrench)
         # Where a wire slides, friction is like a stiff spring until it has turned round.
         torque = load + pullback(end)
-        rubbing = self._mae.friction * end
+        rubbing = self._friction * end
         turning, free = state.slid, np.abs(state.slid) < 1.0
         for _ in range(ROUNDS):
             rub = rubbing * free / REVERSAL
