@@ -232,7 +232,7 @@ class EagerLengths:
 
     def __init__(self, mae: Mae) -> None:
         """Take the weights of a network."""
-        self._network, self.lengths = from_mae(mae), mae.lengths
+        self._network, self.lengths, self.friction = from_mae(mae), mae.lengths, mae.friction
         self._scale = torch.tensor(scale_vector(len(mae.joints), len(mae.muscles)))
         self._joints, self._muscles = len(mae.joints), len(mae.muscles)
 
