@@ -142,11 +142,11 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         _say('nothing may move before the driver is changed; listening on')
     if options.move:
         driver.alone()
-    if options.move and verdict.wrong - {'zero'}:
-        _say('not moved: what is wrong already comes first')
-    elif options.move:
-        driver.wind(verdict)
-        _say(verdict)
+        if verdict.wrong - {'zero'}:
+            _say('not moved: what is wrong already comes first')
+        else:
+            driver.wind(verdict)
+            _say(verdict)
     _say('the driver keeps its contract' if not verdict.faults else 'the driver is to be changed')
     return 1 if verdict.faults else 0
 

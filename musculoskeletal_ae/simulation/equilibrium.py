@@ -92,8 +92,8 @@ class QuasiStatics:
         command_tension = limits.bias + stiffness * (length - followed)
         jacobian, curvature = self._slopes(theta, end)
         load, load_slope = self._load(theta, wrench)
-        # Where a wire slides, friction is like a stiff spring until it has turned round.
         torque = load + pullback(end)
+        # Where a wire slides, friction is like a stiff spring until it has turned round.
         rubbing = self._friction * end
         turning, free = state.slid, np.abs(state.slid) < 1.0
         for _ in range(ROUNDS):
