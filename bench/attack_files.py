@@ -292,7 +292,7 @@ def _child(start: str, count: str, seed: str, folder: str) -> None:
     faulthandler.enable()
     for result in attempts(int(start), int(count), int(seed), Path(folder)):
         print(json.dumps(result), flush=True)
-        faulthandler.dump_traceback_later(60.0, exit=True)
+        faulthandler.dump_traceback_later(300.0, exit=True)
 
 
 if __name__ == '__main__':

@@ -43,7 +43,7 @@ def python(code, *arguments):
         ],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         cwd=ROOT,
     )
 
@@ -129,7 +129,7 @@ def test_a_file_of_parameters_for_all_nodes_may_name_no_unknown_one(tmp_path):
     file = tmp_path / 'nodes.yaml'
     file.write_text('/**: {ros__parameters: {explore: true, temprature_limit: 50.0}}')
     command = [*executable('estimator'), '--ros-args', '--params-file', str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert "'temprature_limit'; nearest: temperature_limit" in done.stderr
 

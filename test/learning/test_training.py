@@ -19,7 +19,7 @@ from musculoskeletal_ae.learning.training import Training, TrainingProcess
 
 from .conftest import job
 
-PATIENCE = 60.0  # [s] until a test is given up
+PATIENCE = 300.0  # [s] until a test is given up: a machine at work starts a process in minutes
 
 
 @pytest.fixture

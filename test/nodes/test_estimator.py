@@ -248,7 +248,7 @@ def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
 def test_a_wrong_parameter_is_one_clear_line(graph, parameters, expected):
     process = graph.start('estimator', **parameters)
     graph.processes.remove(process)
-    output, _ = process.process.communicate(timeout=60)
+    output, _ = process.process.communicate(timeout=300)
     assert process.process.returncode == 1
     assert output.startswith('error: ') and output.count('\n') == 1
     assert expected in output

@@ -338,7 +338,7 @@ def test_two_learners_do_not_share_a_directory(graph, host, state):
     host(state_directory=state)
     second = graph.start('learner', robot='arm26', state_directory=state)
     graph.processes.remove(second)
-    output, _ = second.process.communicate(timeout=60)
+    output, _ = second.process.communicate(timeout=300)
     assert second.process.returncode == 1
     assert 'another learner' in output
     assert 'Traceback' not in output
