@@ -32,6 +32,7 @@ from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     SAMPLE_TIME,
     Recording,
+    end_tensions,
     record,
 )
 from musculoskeletal_ae.learning.learner import Learner
@@ -144,7 +145,7 @@ MESSAGES = {
 
 def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, float]:
     """Return the largest of MESSAGES over a recording, θ_est by `mae`."""
-    theta = mae.estimate(stream.tension, stream.length).theta
+    theta = mae.estimate(end_tensions(mae, stream), stream.length).theta
     above, longest = np.zeros(robot.muscle_count), 0.0
     for over in stream.tension > robot.tension.limit:
         above = (above + SAMPLE_TIME) * over

@@ -41,6 +41,7 @@ from musculoskeletal_ae.experiments.detection import (
     watch,
 )
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, record, rows_between
+from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -115,28 +116,30 @@ def at_rest(robot: Robot, seed: int, mae: Mae, count: int) -> dict[str, Any]:
     corner = np.where(rng.uniform(size=theta.shape) < 0.5, robot.lower, robot.upper)
     theta[::2] = corner[::2]
     tension = rng.uniform(robot.tension.bias, MOST_TENSE, shape)
-    end = tension * np.exp(-individual.cable_friction * rng.choice([-1.0, 1.0], shape))
+    direction = rng.choice([-1.0, 1.0], shape)
+    end = end_tension(individual.cable_friction, tension, direction)
     length = individual.muscle_lengths(theta, end) + individual.length_bias
+    end = end_tension(mae.friction, tension, direction)
     counts = dict.fromkeys(REST_COUNTS, 0)
     slowest, widest = 0.0, anomaly.WIDEST
     for n in range(count):
-        if detector.unfamiliar(mae.estimate(tension[n], length[n]).theta) <= 1.0:
+        if detector.unfamiliar(mae.estimate(end[n], length[n]).theta) <= 1.0:
             continue
         counts['postures'] += 1
         for name, anomaly.WIDEST in (('alarms', widest), ('narrow_alarms', 1.0)):
             detector.reset()
-            state = mae.estimate(tension[n], length[n])
+            state = mae.estimate(end[n], length[n])
             for _ in range(anomaly.IN_A_ROW):
-                verdict = detector.step(state, tension[n], length[n], SAMPLE_TIME)
+                verdict = detector.step(state, end[n], tension[n], length[n], SAMPLE_TIME)
             counts[name] += bool(verdict.cause)
         anomaly.WIDEST = widest
         muscle = int(rng.integers(robot.muscle_count))
-        pull, wound = tension[n].copy(), length[n].copy()
-        pull[muscle] = 0.0
+        cut, wound = 1.0 * (np.arange(robot.muscle_count) != muscle), length[n].copy()
+        reads = cut * end[n], cut * tension[n]
         detector.reset()
         for tick in range(round(WITHIN / SAMPLE_TIME)):
             wound[muscle] -= SPEED_LIMIT * SAMPLE_TIME
-            verdict = detector.step(mae.estimate(pull, wound), pull, wound, SAMPLE_TIME)
+            verdict = detector.step(mae.estimate(reads[0], wound), *reads, wound, SAMPLE_TIME)
             if verdict.cause:
                 counts['noticed'] += 1
                 counts['named'] += verdict.suspect == muscle

@@ -30,6 +30,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,
+    end_tensions,
     estimation_error,
     mean_error,
     record,
@@ -107,7 +108,8 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
         pull = max(pull, float(muscles.tension.max()))
     zeros, took, alarms = loop.estimator.zeros, loop.time, loop.alarms
     part = held_out.part(np.s_[::5])
-    after = mae.estimate(part.tension, part.length + offset - zeros.offset).theta
+    tension = end_tensions(mae, held_out)[::5]
+    after = mae.estimate(tension, part.length + offset - zeros.offset).theta
     loop.controller.explore(True)
     for _ in range(round(AFTER / SAMPLE_TIME)):
         loop.step(False)

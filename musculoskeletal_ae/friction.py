@@ -4,7 +4,8 @@
     T = T_end e^{μ s},   s ← clip(s − Δl/b, −1, 1)
 
 T is the motor's, T_end the elastic unit's; s = 1 if the wire was wound in last: T is more then (the
-stop operator of hysteresis theory).
+stop operator of hysteresis theory). The network is that of the body without friction: what it takes
+for T is T_end, so that everybody who asks it about what sensors read turns one into the other.
 """
 
 from __future__ import annotations
@@ -25,6 +26,12 @@ def slid(direction: Array, moved: Array) -> Array:
     return after
 
 
+def end_tension(friction: Array, tension: Array, direction: Array) -> Array:
+    """Return T_end [N] (..., M) of T [N], by μ (M,) and s (..., M)."""
+    end: Array = tension * np.exp(-friction * direction)
+    return end
+
+
 class FrictionDirection:
     """Which way each wire slid last, from muscle lengths alone."""
 
@@ -39,6 +46,10 @@ class FrictionDirection:
         self._length = self._length + moved
         self._direction = slid(self._direction, moved)
         return self._direction
+
+    def end_tension(self, friction: Array, tension: Array, length: Array, dt: float) -> Array:
+        """Take T [N] and l [m] (M,), `dt` [s] after those before; return T_end (M,), by μ (M,)."""
+        return end_tension(friction, tension, self.step(length, dt))
 
     def reset(self) -> None:
         """Forget, as after a jump of the clock."""

@@ -112,12 +112,14 @@ class AnomalyDetector:
         """Note the targets that the modules follow, [m] or [N] (M,); neither: they follow none."""
         self._length_command, self._tension_command = length, tension
 
-    def step(self, state: State, tension: Array, length: Array, dt: float) -> Verdict:
-        """Judge measured T [N] and l [m] (M,), from which ② restored the state.
+    def step(
+        self, state: State, end_tension: Array, tension: Array, length: Array, dt: float
+    ) -> Verdict:
+        """Judge measured T [N] and l [m] (M,); ② restored the state from T_end and l.
 
         It came dt [s] after the message before.
         """
-        error = residuals(state, tension, length, self._robot.isolated)
+        error = residuals(state, end_tension, length, self._robot.isolated)
         size, distance, share = float(anomaly(error)), float('nan'), error
         if self._statistics is not None:
             centred = error - self._statistics.mean
@@ -141,7 +143,8 @@ class AnomalyDetector:
             cause = self._beyond_threshold(size, distance, state.theta, tension, slack, waits)
         # Where one is cut, another may be slack for a moment.
         if cause and self._beyond == IN_A_ROW and self.calibrated and slack.sum() != 1:
-            suspect = self._unlikeliest(tension, length, slack if slack.any() else self._robot.used)
+            among = slack if slack.any() else self._robot.used
+            suspect = self._unlikeliest(end_tension, length, among)
         return Verdict(size, distance, suspect, cause)
 
     def unfamiliar(self, theta: Array) -> float:

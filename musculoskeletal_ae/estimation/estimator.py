@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint angles from muscle length and tension, message by message; is the body still healthy.
 
-    (T, l) ─② of the MAE→ θ, T, l ─→ detector ─→ anomaly, latched until `reset`
+    (T_end, l) ─② of the MAE→ θ, T, l ─→ detector ─→ anomaly, latched until `reset`
     while zeros are sought: no judgement, but `zeroing` finds them and the estimate follows
     θ, T, l ─→ what pushes the arm from outside (`touch`)
     pose of the marker ─inverse kinematics from the estimate→ θ as a camera sees it
+
+T_end is T without what friction along the wires adds or takes (`friction`).
 
 What was detected first names the suspect for as long as the latch holds. With `on_anomaly:
 isolate` the suspect is isolated at once and verified (`verification`), also one whose length has
@@ -32,6 +34,7 @@ from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
 from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -88,7 +91,7 @@ class Estimator:
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self.heat = Heat(robot)
-        self._external = ExternalTorque(robot)
+        self._direction, self._external = FrictionDirection(), ExternalTorque(robot)
         self._touch: Touch | None = None
         self._contacts = 0
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
@@ -164,7 +167,7 @@ class Estimator:
             return None
         dt = min(since, LONGEST_PERIOD)
         if since > SILENCE:
-            self._external.reset()
+            self._forget_motion()
         self._stepped_at, self._silent = now, (None, 0.0)
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
@@ -174,11 +177,12 @@ class Estimator:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
         if guess is None:
             return None
-        state = self.mae.estimate(tension, length - guess.offset)
+        end = self._direction.end_tension(self.mae.friction, tension, length, dt)
+        state = self.mae.estimate(end, length - guess.offset)
         self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
         if self._verification is not None:
             self._verify(self._verification, state.theta, tension, length, dt, now)
-        verdict = self._verdict = self.detector.step(state, tension, length, dt)
+        verdict = self._verdict = self.detector.step(state, end, tension, length, dt)
         still = self._stands_still(self.mae, tension, length, dt)
         if still is not None and not verdict.cause:
             why = 'a sensor stands still while the arm moves'
@@ -193,8 +197,7 @@ class Estimator:
             self._begin_verification(verdict.suspect, now)
         before, self._touch = self._touch, None
         if self.zeros.known:
-            pulled = tension * self._robot.used
-            self._touch = touch = self._external.step(state.theta, pulled, length, dt)
+            self._touch = touch = self._external.step(state.theta, end * self._robot.used, dt)
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
 
@@ -314,6 +317,10 @@ class Estimator:
         """Start the detector's counts anew; what was detected stays."""
         self._time = math.inf
         self.detector.reset()
+        self._forget_motion()
+
+    def _forget_motion(self) -> None:
+        self._direction.reset()
         self._external.reset()
 
     def report(self, now: float) -> Report:

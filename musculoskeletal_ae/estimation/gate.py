@@ -24,6 +24,7 @@ On an anomaly the newest network that has been in use for PROOF without one come
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from functools import cached_property
@@ -33,6 +34,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import Mask
@@ -42,6 +44,7 @@ POSTURES = 64
 SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept
 LEAST = 20  # messages that say something
 PROOF = 10.0  # [s]
+LONGEST_PERIOD = 0.5  # [s] without messages in which a wire may have slid anywhere
 NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already wrong
 
 #: largest share left unexplained of the fixed postures
@@ -75,7 +78,8 @@ class Gate:
         self._postures = theta, pull, _ = self._states(POSTURES)
         slope = robot.series_elastic.length_slope(pull)[..., None]
         self._jacobian = robot.routes.muscle_jacobian(theta) * (1.0 - slope)
-        self._messages: deque[tuple[float, Array, Array]] = deque()
+        self._messages: deque[tuple[float, Array, Array, Array]] = deque()
+        self._direction, self._time = FrictionDirection(), math.inf
         self._used: list[tuple[float, Mae]] = []  # since when which network was in use
         self._anomaly = False
         self.isolated: tuple[int, ...] = ()  # muscles whose messages say nothing
@@ -104,9 +108,14 @@ class Gate:
 
     def message(self, tension: Array, length: Array, now: float) -> None:
         """Note one of the node's own messages, T [N] and l [m] (M,)."""
+        since, self._time = now - self._time, now
+        if not 0.0 <= since < LONGEST_PERIOD:
+            self._direction.reset()
+            since = 0.0
+        direction = self._direction.step(length, since)
         if self._anomaly or (self._messages and 0.0 <= now - self._messages[-1][0] < SPACING):
             return
-        self._messages.append((now, tension, length))
+        self._messages.append((now, tension, length, direction))
         while now - self._messages[0][0] > SPAN:
             self._messages.popleft()
 
@@ -162,11 +171,16 @@ class Gate:
         error, size = map(_size, by_muscle)
         return errors | {'G by ①': error / np.maximum(size, LEAST_ARM)}
 
+    def _seen_by(self, mae: Mae) -> tuple[Array, Array]:
+        """Return T_end [N] and l [m] of the messages (N, M), by a network's friction."""
+        _, tension, length, direction = map(np.array, zip(*self._messages))
+        return end_tension(mae.friction, tension, direction), length
+
     def message_errors(self, mae: Mae) -> dict[str, Array]:
         """Return what is left of T [N] and l [m] of the messages, of each muscle; {} if too few."""
         if len(self._messages) < LEAST:
             return {}
-        _, tension, length = map(np.array, zip(*self._messages))
+        tension, length = self._seen_by(mae)
         restored = mae.estimate(tension, length)
         used = np.delete(np.arange(self._robot.muscle_count), self.isolated)
         parts = (
@@ -188,7 +202,7 @@ class Gate:
         if statistics is None or not statistics.calibrated or len(self._messages) < LEAST:
             return np.nan, np.nan
         threshold = statistics.thresholds.get(DISTANCE, np.inf)
-        _, tension, length = map(np.array, zip(*self._messages))
+        tension, length = self._seen_by(mae)
 
         def distance(tension: Array) -> float:
             state = mae.estimate(tension, length)

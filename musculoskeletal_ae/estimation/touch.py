@@ -67,17 +67,15 @@ class ExternalTorque:
 
     def reset(self) -> None:
         """Forget the past, as after a jump of the clock."""
-        self._direction = FrictionDirection()
         self._value: Array | None = None
         self.velocity: Array = np.zeros(self._robot.joint_count)  # θ̇ [rad/s], (D,)
         self._beyond = 0
 
-    def step(self, theta: Array, tension: Array, length: Array, dt: float) -> Touch:
-        """Take estimated θ [rad] (D,), T [N] and l [m] (M,), dt [s] after the ones before."""
+    def step(self, theta: Array, end_tension: Array, dt: float) -> Touch:
+        """Take estimated θ [rad] (D,) and T_end [N] (M,), dt [s] after those before."""
         kinematics, joints = self._robot.kinematics, len(theta)
         if not np.abs(theta - self._turned).max() <= TURNED:  # not a number, too
-            self._jacobian, self._turned = self._mae.muscle_jacobian(theta, tension), theta
-        end_tension = tension * np.exp(-self._mae.friction * self._direction.step(length, dt))
+            self._jacobian, self._turned = self._mae.muscle_jacobian(theta, end_tension), theta
         now: Array = np.concatenate((theta, end_tension @ self._jacobian))
         if self._value is None:
             self._value, self._rate = now, np.zeros_like(now)
@@ -119,7 +117,7 @@ class HealthyTorque:
 
     def __init__(self, robot: Robot) -> None:
         """Start with nothing; a network is needed first."""
-        self._observer = ExternalTorque(robot)
+        self._observer, self._direction = ExternalTorque(robot), FrictionDirection()
         self._square, self._time = np.zeros(robot.joint_count), 0.0
 
     def use(self, mae: Mae) -> Mae:
@@ -137,11 +135,13 @@ class HealthyTorque:
     def reset(self) -> None:
         """Forget the past, as after a jump of the clock."""
         self._observer.reset()
+        self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
         """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after those before."""
-        theta = self._mae.estimate(tension, length).theta
-        torque = self._observer.step(theta, tension, length, dt).torque
+        end = self._direction.end_tension(self._mae.friction, tension, length, dt)
+        theta = self._mae.estimate(end, length).theta
+        torque = self._observer.step(theta, end, dt).torque
         if np.linalg.norm(self._observer.velocity) < MOVING:
             return
         square = torque**2

@@ -12,7 +12,13 @@ from scipy.stats import mannwhitneyu
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM, AnomalyDetector
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, columns, rows_between
+from musculoskeletal_ae.experiments.recording import (
+    SAMPLE_TIME,
+    Recording,
+    columns,
+    end_tensions,
+    rows_between,
+)
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets import PRESETS
@@ -113,11 +119,12 @@ def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     """Run estimator and detector over a recording as the node does; nothing is latched."""
     detector, rows = AnomalyDetector(robot, preset=mae.preset), []
     detector.use(mae)
-    estimated = mae.estimate(recording.tension, recording.length)
-    for n, (tension, length) in enumerate(zip(recording.tension, recording.length, strict=True)):
+    ends = end_tensions(mae, recording)
+    estimated, read = mae.estimate(ends, recording.length), (recording.tension, recording.length)
+    for n, (end, tension, length) in enumerate(zip(ends, *read, strict=True)):
         detector.commanded(length=recording.command[n])
         restored = State(*(part[n] for part in estimated))
-        verdict = detector.step(restored, tension, length, SAMPLE_TIME)
+        verdict = detector.step(restored, end, tension, length, SAMPLE_TIME)
         rows.append((*verdict[:3], bool(verdict.cause)))
     return Watched(estimated.theta, *columns(rows))
 

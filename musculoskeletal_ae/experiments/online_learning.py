@@ -41,6 +41,7 @@ from musculoskeletal_ae.experiments.recording import (
     times,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
@@ -82,14 +83,15 @@ def follow(
     joint sensors by default.
     """
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
-    errors, mae = list[float](), None
+    errors, mae, direction = list[float](), None, FrictionDirection()
     for n, row in enumerate(stream):
         if learner.mae is not mae:
             mae = learner.mae
             samples.append(len(learner.samples))
             errors.append(estimation_error(mae, held_out, CURVE_STRIDE))
         _, sensor, length, tension, _ = row
-        running.append(float(np.linalg.norm(mae.estimate(tension, length).theta - sensor)))
+        end = direction.end_tension(mae.friction, tension, length, SAMPLE_TIME)
+        running.append(float(np.linalg.norm(mae.estimate(end, length).theta - sensor)))
         theta = sensor if see is None else see(n, mae)
         learner.step(n * SAMPLE_TIME, theta, tension, length)
         rows.append(row)

@@ -19,6 +19,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.mae.mae import Mae
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
@@ -60,6 +61,7 @@ class ClosedLoop:
     def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
         """Connect an arm where it is; the random seed is that of the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
+        self._direction = FrictionDirection()
         self._read, self._now = arm.sense(), 0.0
         self.use(mae)
 
@@ -86,7 +88,9 @@ class ClosedLoop:
 
     def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (of others)
         """Return θ [rad] (D,) from what was read at `now` [s]."""
-        return self.mae.estimate(read.tension, read.length).theta
+        friction, length = self.mae.friction, read.length
+        end = self._direction.end_tension(friction, read.tension, length, SAMPLE_TIME)
+        return self.mae.estimate(end, length).theta
 
     def commanded(self, command: Command | None, now: float) -> None:
         """Take what is commanded at `now` [s]."""
@@ -180,7 +184,14 @@ def mean_error(estimate: Array, truth: Array) -> float:
     return float(np.linalg.norm(estimate - truth, axis=1).mean())
 
 
+def end_tensions(mae: Mae, recording: Recording) -> Array:
+    """Return T_end [N] (N, M) of what was recorded, by a network's friction, as nodes know it."""
+    step = FrictionDirection().step
+    direction = np.array([step(length, SAMPLE_TIME) for length in recording.length])
+    return end_tension(mae.friction, recording.tension, direction)
+
+
 def estimation_error(mae: Mae, recording: Recording, stride: int = 1) -> float:
     """Return the mean error of a network's estimate on every so many messages [rad]."""
-    part = recording.part(np.s_[::stride])
-    return mean_error(mae.estimate(part.tension, part.length).theta, part.theta)
+    tension, part = end_tensions(mae, recording)[::stride], recording.part(np.s_[::stride])
+    return mean_error(mae.estimate(tension, part.length).theta, part.theta)

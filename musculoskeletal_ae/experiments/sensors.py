@@ -22,7 +22,12 @@ from scipy.stats import chi2
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, estimation_error
+from musculoskeletal_ae.experiments.recording import (
+    SAMPLE_TIME,
+    Recording,
+    end_tensions,
+    estimation_error,
+)
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
@@ -85,7 +90,8 @@ def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -
 def ellipsoid_share(mae: Mae, recording: Recording) -> float:
     """Return the share of messages whose true θ lies in the ellipsoid of 95 %."""
     assert mae.covariance is not None  # asked by the caller
-    error = mae.estimate(recording.tension, recording.length).theta - recording.theta
+    tension = end_tensions(mae, recording)
+    error = mae.estimate(tension, recording.length).theta - recording.theta
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
     return float((distance <= chi2.ppf(INSIDE, error.shape[1])).mean())
 

@@ -16,6 +16,7 @@ from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.experiments.plots import AFTER, MARK, new_figure, tidy
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -35,7 +36,7 @@ class FeelingLoop(ClosedLoop):
     """A closed loop that is asked what pushes the arm."""
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
-        self._external = ExternalTorque(arm.robot)
+        self._external, self._sliding = ExternalTorque(arm.robot), FrictionDirection()
         super().__init__(arm, mae, settings, seed)
 
     def use(self, mae: Mae) -> None:
@@ -46,9 +47,9 @@ class FeelingLoop(ClosedLoop):
     def feel(self, exploring: bool = False) -> Touch:
         """Let a message's time pass; return what it says of the outside."""
         _ = self.explore() if exploring else self.step()
-        length, tension = self._read.length, self._read.tension
-        theta = self.mae.estimate(tension, length).theta
-        return self._external.step(theta, tension, length, SAMPLE_TIME)
+        length, friction = self._read.length, self.mae.friction
+        end = self._sliding.end_tension(friction, self._read.tension, length, SAMPLE_TIME)
+        return self._external.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
     def rest(self, theta: Array) -> None:
         """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""

@@ -104,6 +104,10 @@ class CorrectedBody:
             nominal.force[m] * force, nominal.rate[m] * rate, nominal.wire_stretch[m] * stretch
         )
 
+    def frictions(self) -> Array:
+        """Return μ of each wire (M,)."""
+        return np.array([self.friction(m) for m in range(len(self.layouts))])
+
     def friction(self, m: int) -> float:
         """Return μ of one muscle."""
         value = self.parameters[m][self.layouts[m].friction]

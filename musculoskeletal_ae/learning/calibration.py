@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM
+from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
@@ -50,7 +51,7 @@ RECENT, RECENT_RESTS = 3600.0, 200
 class Healthy(NamedTuple):
     """What was seen of the healthy arm since it was last changed."""
 
-    messages: NDArray[np.float32]  # (T, l), (N, 2M)
+    messages: NDArray[np.float32]  # (T, l, s), (N, 3M)
     time: float  # that they were drawn from [s]
     rests: int  # how many different ones there were within
     #: recent ones, moving or resting, with all angles: those that are learned, and those that judge
@@ -107,7 +108,7 @@ class Reservoir:
         """Return what was seen."""
         m, count = self._muscles, len(self._rests)
         if not self._kept:
-            return Healthy(np.empty((0, 2 * m), np.float32), self.time, count)
+            return Healthy(np.empty((0, 3 * m), np.float32), self.time, count)
         rows = np.array(self._kept)
         columns = np.split(rows.astype(float), [m, 2 * m, 3 * m, -2, -1], axis=1)
         tension, length, direction, theta, number, time = columns
@@ -119,7 +120,7 @@ class Reservoir:
         seen = Observations(theta, tension, length, direction, known, age=age)
         place, second = np.flatnonzero(whole), np.arange(len(rows))[whole] % 2
         parts = seen[place[second == 0]], seen[place[second == 1]]
-        return Healthy(rows[:, : 2 * m], self.time, count, *parts)
+        return Healthy(rows[:, : 3 * m], self.time, count, *parts)
 
 
 def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
@@ -151,7 +152,8 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     """Return statistics of a network's residuals, or None where there is too little."""
     if len(healthy.messages) < 2:
         return None
-    tension, length = np.split(healthy.messages.astype(float), 2, axis=1)
+    tension, length, direction = np.split(healthy.messages.astype(float), 3, axis=1)
+    tension = end_tension(mae.friction, tension, direction)
     state = mae.estimate(tension, length)
     error = residuals(state, tension, length, mae.isolated)
     sound = ~_glitches(error)

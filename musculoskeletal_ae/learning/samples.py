@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
 
@@ -86,6 +87,10 @@ class Observations:
     def state(self) -> State:
         """Return (θ, T, l)."""
         return State(self.theta, self.tension, self.length)
+
+    def end_tension(self, friction: Array) -> Array:
+        """Return T at the elastic units [N] (N, M), by μ (M,): what networks take for T."""
+        return end_tension(friction, self.tension, self.direction)
 
     def seen_whole(self) -> Observations:
         """Return those of which all joint angles are known."""

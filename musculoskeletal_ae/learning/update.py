@@ -62,7 +62,8 @@ class Updater(ABC):
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
-        estimate = self._mae.without(job.isolated).estimate(newest.tension, newest.length).theta
+        mae = self._mae.without(job.isolated)
+        estimate = mae.estimate(newest.end_tension(mae.friction), newest.length).theta
         seen = np.isfinite(newest.theta)
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
@@ -85,16 +86,17 @@ class Updater(ABC):
         mae = mae.without(job.isolated)
         before = self._mae.without(job.isolated)
         before = before if job.statistics_hold else uncalibrated(before)
-        mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if self.body is not None:
-            friction = np.array([self.body.friction(m) for m in range(self._robot.muscle_count)])
-            mae = replace(mae, touch=TouchStatistics(friction, np.ones(self._robot.joint_count)))
+            touch = TouchStatistics(self.body.frictions(), np.ones(self._robot.joint_count))
+            mae = replace(mae, touch=touch)
+        mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
-            rng, tension = np.random.default_rng(self._seed), job.seen.tension
+            rng, tension = np.random.default_rng(self._seed), job.seen.end_tension(mae.friction)
             covariance = estimate_covariance(mae, self.body, fit, tension, rng)
             judging = job.healthy.judging
             if judging is not None and len(judging) >= MANY:
-                off = mae.estimate(judging.tension, judging.length).theta - judging.theta
+                end = judging.end_tension(mae.friction)
+                off = mae.estimate(end, judging.length).theta - judging.theta
                 covariance = holding(covariance, off)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
@@ -205,7 +207,7 @@ class BodyUpdater(Updater):
     def _learn(self, job: Job) -> Update:
         seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
-        guess = self._mae.estimate(seen.tension, seen.length).theta
+        guess = self._mae.estimate(seen.end_tension(self._mae.friction), seen.length).theta
         fit = fit_body(body, seen, self._prior_mean, guess)
         known, self._known = self._known, self._mean_length()
         self._trainer.move(self._known - known)
@@ -266,15 +268,14 @@ class BodyUpdater(Updater):
         self._put(data, seen[sound], slice(len(data.seen) - int(share * len(data.seen)), None))
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
-        """Put some of what was measured there, freed of friction as the body knows it."""
+        """Put some of what was measured there, with T as the elastic units have it."""
         if len(real) == 0:
             return
         real = real[self._rng.integers(len(real), size=len(data.seen[places]))]
-        still = np.zeros_like(real.direction)
-        with_friction, without = self.body.lengths(real.theta, real.tension, real.direction, still)
-        length = real.length + self.body.crept(real.age) + without - with_friction
-        data.seen[places] = real.state().scaled()
-        data.true[places] = real.state()._replace(length=length).scaled()
+        state = real.state()._replace(tension=real.end_tension(self.body.frictions()))
+        data.seen[places] = state.scaled()
+        length = real.length + self.body.crept(real.age)
+        data.true[places] = state._replace(length=length).scaled()
 
 
 def contradicted_muscles(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
@@ -308,6 +309,7 @@ class TrainingData(NamedTuple):
 
 #: share of the wires at rest, those of the nearest tensions, one of which says which way one slid
 NEAR = 0.05
+UNSURE = 0.25  # share of the friction that the direction of sliding, as lengths tell it, misses
 
 
 def synthetic_samples(
@@ -319,13 +321,14 @@ def synthetic_samples(
 ) -> TrainingData:
     """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
 
-        (θ, T, l) = (θ_r, T_r, l(θ_r, T_r; s = 0)),   seen as (θ_r, T_r, l(θ_r, T_r; s_r) + ε)
+        (θ, T, l) = (θ_r, T_r, l(θ_r, T_r; s = 0)),   seen as (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
 
-    Which way each wire slid last, s_r, is not known to an estimator, so that the network sees
-    lengths with the friction's and the sensors' scatter and is asked for those without: ② then
-    learns to weigh muscles by how far their lengths can be trusted, as weighted least squares do.
-    The tension does tell something of it: muscle stiffness control has wound in what pulls more
-    than T_bias. So s_r is that of a wire with about this tension among the samples `like`.
+    T_r is at the elastic units. An estimator knows that but for the share u (UNSURE) of friction,
+    so that the network sees lengths with this and the sensors' scatter and is asked for those
+    without: ② then learns to weigh muscles by how far their lengths can be trusted, as weighted
+    least squares do. Which way a wire slid last, s_r, hangs on its tension (muscle stiffness
+    control has wound in what pulls more than T_bias), so it is that of one with about this tension
+    among the samples `like`.
     """
     robot = body.robot
     shape = count, robot.muscle_count
@@ -339,7 +342,7 @@ def synthetic_samples(
     else:
         # Mostly at either end of [−1, 1], where sliding leaves it.
         direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
-    length, scattered = body.lengths(theta, tension, np.zeros(shape), direction)
+    length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     true, seen = State(theta, tension, length), State(theta, tension, scattered)
     return TrainingData(seen.scaled(), true.scaled())
@@ -362,7 +365,7 @@ def estimate_covariance(
     bodies = np.repeat(np.arange(BODIES), EACH)
     theta = fit.theta[rng.integers(len(fit.theta), size=len(bodies))]
     tension = tension[rng.integers(len(tension), size=len(bodies))]
-    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
+    direction = UNSURE * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
     poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
     for muscles, root in fit.root:
         steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T

@@ -16,6 +16,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -125,6 +126,7 @@ def learn(
     `progress` is told the recorded seconds that have passed since it was last told.
     """
     detector = AnomalyDetector(learner.robot, preset=learner.training.preset.name)
+    direction = FrictionDirection()
     mae = learner.mae
     detector.use(mae)
     learner.reset()
@@ -132,7 +134,8 @@ def learn(
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for dt, at, theta, length, tension in zip(steps, *recording, strict=True):
         # The estimator gates live learning; here its detector does the same.
-        verdict = detector.step(mae.estimate(tension, length), tension, length, dt)
+        end = direction.end_tension(mae.friction, tension, length, dt)
+        verdict = detector.step(mae.estimate(end, length), end, tension, length, dt)
         if verdict.cause:
             learner.anomaly(True)
         learner.step(at, theta, tension, length)
@@ -145,7 +148,11 @@ def learn(
 
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
-    estimate = mae.estimate(recording.tension, recording.length).theta
+    direction, end = FrictionDirection(), np.empty_like(recording.tension)
+    steps = np.diff(recording.time, prepend=recording.time[:1])
+    for n, read in enumerate(zip(recording.tension, recording.length, steps, strict=True)):
+        end[n] = direction.end_tension(mae.friction, *read)
+    estimate = mae.estimate(end, recording.length).theta
     return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
 
 

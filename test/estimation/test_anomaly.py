@@ -30,7 +30,7 @@ def judge(robot):
 
         def verdicts(message, times=1):
             state = mae.estimate(*message)
-            return [detector.step(state, *message, DT) for _ in range(times)]
+            return [detector.step(state, message.tension, *message, DT) for _ in range(times)]
 
         return detector, verdicts
 
@@ -125,7 +125,7 @@ def test_what_the_arm_s_own_motion_shortens_is_no_slack_wound_in(robot, mae, jud
         each = robot.muscle_lengths(at, tension)
         each[shortest] = length[n]
         detector.commanded(length=each - 0.01)
-        causes.add(detector.step(State(at, tension, each), tension, each, DT).cause)
+        causes.add(detector.step(State(at, tension, each), tension, tension, each, DT).cause)
     assert causes == ({''} if moves else {'', 'no tension where the command demands it'})
 
 
@@ -181,7 +181,7 @@ def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound):
         length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
         told[0] = 140.0 if n < 200 else 60.0
         detector.commanded(length=length - (told - 30.0) / 1e4)
-        verdict = detector.step(state, tension, length, 0.01)
+        verdict = detector.step(state, tension, tension, length, 0.01)
         named += [(n, verdict.suspect)] * ('its winch stands' in verdict.cause)
     assert named
     assert {suspect for _, suspect in named} == {3}

@@ -39,7 +39,8 @@ def seeing(gate, start=0.0):
 
 
 def calibrated(mae):
-    healthy = Healthy(np.hstack(body(500, 1)).astype(np.float32), 100.0, 50)
+    seen = (*body(500, 1), np.zeros((500, ROBOT.muscle_count)))
+    healthy = Healthy(np.hstack(seen).astype(np.float32), 100.0, 50)
     return replace(mae, anomaly=calibrate(mae, healthy, 50))
 
 

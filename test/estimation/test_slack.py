@@ -31,7 +31,7 @@ def noticed(robot, mae, slack):
             wound = min(until, speed * n * DT) * np.eye(6)[MUSCLE]
             length = slack.length - wound + 1e-4 * rng.standard_normal(6)
             detector.commanded(length=length - 0.003)
-            verdict = detector.step(state, slack.tension, length, DT)
+            verdict = detector.step(state, slack.tension, slack.tension, length, DT)
             if verdict.cause:
                 assert verdict.suspect == MUSCLE and 'no tension' in verdict.cause
                 return n * DT
@@ -79,7 +79,7 @@ def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, 
         length = start - 0.009 * n * DT * one
         detector.commanded(length=length - 0.003)
         state = calibrated.estimate(tension, length)
-        causes.append(detector.step(state, tension, length, DT).cause)
+        causes.append(detector.step(state, tension, tension, length, DT).cause)
     assert any(cause.startswith('d = ') for cause in causes[:50]) == found
 
 

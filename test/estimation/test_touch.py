@@ -11,6 +11,7 @@ from exact_mae import ExactMae
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.touch import ExternalTorque, HealthyTorque
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -21,9 +22,8 @@ DT = 0.01
 SPREAD = np.full(5, 0.2)
 
 
-def observer(friction=0.0, spread=SPREAD, time=LEAST_MOTION, robot=ARM):
+def observer(spread=SPREAD, time=LEAST_MOTION, robot=ARM):
     mae = ExactMae(robot)
-    mae.friction = np.full(robot.muscle_count, friction)
     mae.touch = TouchStatistics(mae.friction, spread, time)
     result = ExternalTorque(robot)
     result.use(mae)
@@ -39,9 +39,9 @@ def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
     return tension, robot.muscle_lengths(theta, tension)
 
 
-def felt(core, theta, tension, length, times=100):
+def felt(core, theta, tension, _length=None, times=100):
     for _ in range(times):
-        touch = core.step(theta, tension, length, DT)
+        touch = core.step(theta, tension, DT)
     return touch
 
 
@@ -74,10 +74,10 @@ def test_friction_that_is_known_is_no_force():
     wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # s = 1: the motor pulls more
     errors = []
     for friction in (0.0, 0.1):
-        core = observer(friction)
-        for row in wound:
-            touch = core.step(THETA, tension * np.exp(0.1), row, DT)
-        touch = felt(core, THETA, tension * np.exp(0.1), length)
+        core, sliding = observer(), FrictionDirection()
+        for row in (*wound, *[length] * 100):
+            end = sliding.end_tension(np.full(10, friction), tension * np.exp(0.1), row, DT)
+            touch = core.step(THETA, end, DT)
         errors.append(np.abs(touch.torque).max())
     assert errors[1] < 0.05 < 0.2 < errors[0]
 
@@ -93,7 +93,7 @@ def test_inertia_is_no_force():
         torque = ARM.kinematics.inverse_dynamics(theta, velocity, turn)
         jacobian = ExactMae(ARM).muscle_jacobian(theta, np.full(10, 60.0))
         tension = TensionProgramme(jacobian, torque, 5.0, 400.0).nearest(60.0)
-        touch = core.step(theta, tension, ARM.muscle_lengths(theta, tension), DT)
+        touch = core.step(theta, tension, DT)
         if n > 50:
             largest = max(largest, np.abs(touch.torque).max())
             free = max(free, np.abs(torque - ARM.kinematics.holding_torque(theta)).max())
@@ -120,7 +120,7 @@ def test_without_statistics_there_is_a_force_but_no_contact():
 @pytest.mark.filterwarnings('ignore:invalid value')
 def test_a_message_that_is_no_number_is_forgotten():
     core, (tension, length) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
-    touch = core.step(np.full(5, np.nan), tension, length, DT)
+    touch = core.step(np.full(5, np.nan), tension, DT)
     np.testing.assert_array_equal(touch.force, 0.0)
     assert not touch.contact
     np.testing.assert_allclose(felt(core, THETA, tension, length).force, [20.0, 0.0, 0.0], atol=1.0)
@@ -128,9 +128,9 @@ def test_a_message_that_is_no_number_is_forgotten():
 
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
 def test_it_is_stable_at_any_rate(dt):
-    core, (tension, length) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
+    core, (tension, _) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
     for _ in range(200):
-        touch = core.step(THETA, tension, length, dt)
+        touch = core.step(THETA, tension, dt)
     np.testing.assert_allclose(touch.force, [0.0, 20.0, 0.0], atol=1.0)
 
 

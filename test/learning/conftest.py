@@ -71,9 +71,9 @@ class Stage:
         return theta, tension, length
 
     def messages(self, count: int):
-        """Return (T, l) without friction."""
+        """Return (T, l, s) without friction."""
         _, tension, length = self.states(count)
-        return np.concatenate([tension, length], axis=1).astype(np.float32)
+        return np.concatenate([tension, length, np.zeros_like(length)], axis=1).astype(np.float32)
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def stage(other_body) -> Stage:
 
 
 def job(store, messages=None, time=0.0, steps=60, hold=True, rests=100, **parts):
-    empty = np.empty((0, 12), dtype=np.float32)
+    empty = np.empty((0, 18), dtype=np.float32)
     healthy = Healthy(empty if messages is None else messages, time, rests, **parts)
     return Job(store.observations(), healthy, hold, steps)
 
