@@ -219,7 +219,7 @@ class BodyUpdater(Updater):
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
-        data = synthetic_samples(body, fit.noise, count, self._rng, seen)
+        data = synthetic_samples(body, fit.noise, count, self._rng)
         self._mix_in_real(data, replace(seen, theta=fit.theta), fit)
         if job.healthy.learned is not None:
             self._mix_in_moving(data, job.healthy.learned, fit.noise)
@@ -307,8 +307,6 @@ class TrainingData(NamedTuple):
     true: Array  # what the network is to restore
 
 
-#: share of the wires at rest, those of the nearest tensions, one of which says which way one slid
-NEAR = 0.05
 UNSURE = 0.25  # share of the friction that the direction of sliding, as lengths tell it, misses
 
 
@@ -317,7 +315,6 @@ def synthetic_samples(
     noise: Array,
     count: int,
     rng: np.random.Generator,
-    like: Observations | None = None,
 ) -> TrainingData:
     """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
 
@@ -326,22 +323,14 @@ def synthetic_samples(
     T_r is at the elastic units. An estimator knows that but for the share u (UNSURE) of friction,
     so that the network sees lengths with this and the sensors' scatter and is asked for those
     without: ② then learns to weigh muscles by how far their lengths can be trusted, as weighted
-    least squares do. Which way a wire slid last, s_r, hangs on its tension (muscle stiffness
-    control has wound in what pulls more than T_bias), so it is that of one with about this tension
-    among the samples `like`.
+    least squares do.
     """
     robot = body.robot
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = _tensions(robot, count, rng)
-    if like is not None and like.known.any():
-        pull, slid = like.tension[like.known], like.direction[like.known]
-        order, reach = np.argsort(pull), max(1.0, 0.5 * NEAR * len(pull))
-        place = np.searchsorted(pull[order], tension) + rng.uniform(-reach, reach, shape)
-        direction = slid[order[np.clip(place, 0, len(pull) - 1).astype(int)]]
-    else:
-        # Mostly at either end of [−1, 1], where sliding leaves it.
-        direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
+    # Mostly at either end of [−1, 1], where sliding leaves it.
+    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     true, seen = State(theta, tension, length), State(theta, tension, scattered)

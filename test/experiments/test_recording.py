@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
+    end_tensions,
     record,
     rows_between,
     times,
 )
 from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 
 
 @pytest.fixture(scope='module')
@@ -65,3 +70,15 @@ def test_without_friction_it_is_the_same_body_otherwise(arm26, tmp_path):
     assert rubbing.cable_friction.all() and rubbing.joint_friction.all()
     theta = arm26.random_postures(3, np.random.default_rng(0))
     np.testing.assert_array_equal(smooth.absolute_lengths(theta), rubbing.absolute_lengths(theta))
+
+
+def test_a_recording_is_estimated_as_the_estimator_does(arm26, mae, plain):
+    spread, rubbing = np.ones(arm26.joint_count), np.full(arm26.muscle_count, 0.1)
+    mae = replace(mae, touch=TouchStatistics(rubbing, spread))
+    core, estimated = Estimator(arm26), []
+    core.use(mae)
+    for now, tension, length in zip(times(len(plain.length)), plain.tension, plain.length):
+        estimated.append(core.step(tension, length, now, now).state.theta)
+    tension = end_tensions(mae, plain)
+    np.testing.assert_allclose(mae.estimate(tension, plain.length).theta, estimated, atol=1e-6)
+    assert np.abs(np.log(tension / plain.tension)).max() > 0.09  # it did rub
