@@ -8,7 +8,8 @@ Here. Both bodies, each explored by the default network and by preset paper as i
 foreign too. "Frozen" is the learner before it was changed for the foreign body, taught by the same
 messages. Oracle: least squares on one message with the true routes and elastic constants. The
 informed oracle also knows the errors of the tension and length sensors, and how much each wire
-rubs; neither knows what a message does not tell: which way a wire slid, loops, creep, drift. The
+rubs; neither knows what a message does not tell: which way a wire slid, loops, creep, drift. What
+is learned comes from the joint sensors, whose own error is there, too. The
 ablation leaves out some effects of the foreign body, the rest of the individual staying as it is.
 """
 
@@ -37,6 +38,7 @@ from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     Recording,
     estimation_error,
+    mean_error,
     record,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
@@ -114,6 +116,7 @@ def _numbers(study: Study, seed: int) -> dict[str, Any]:
     kept = json.loads(study.numbers_file(seed).read_text(encoding='utf-8'))
     names = 'before_rad', 'after_rad', 'paper_before_rad', 'paper_after_rad', 'oracle_rad'
     return {name: kept[name] for name in (*names, 'samples_to_halve') if name in kept} | {
+        'joint_sensors_rad': mean_error(held_out.theta_sensor, held_out.theta),
         'least_squares_rad': nominal(study.robot).error(held_out),
         'informed_oracle_rad': _informed(study.arm(seed), held_out),
     }
@@ -187,6 +190,7 @@ ESTIMATES = {
     'after_rad': 'learned',
     'oracle_rad': 'oracle',
     'informed_oracle_rad': 'informed oracle',
+    'joint_sensors_rad': 'joint sensors',
 }
 
 
