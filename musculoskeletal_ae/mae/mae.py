@@ -306,6 +306,7 @@ class Mae:
     def estimate(self, tension: Array, length: Array) -> State:
         """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation").
 
+        T is that of the elastic units: what a sensor reads, without friction (`friction`).
         Isolated muscles have no part in it: theirs is what the others make likely.
         """
         if not self.isolated:
