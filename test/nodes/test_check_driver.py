@@ -102,6 +102,17 @@ def test_it_does_not_move_what_a_controller_moves(graph):
     assert 'stop the controller' in output
 
 
+def test_it_stops_winding_when_a_controller_starts(graph):
+    started(graph)
+    commands = graph.listen(Float64MultiArray, 'muscle_length_command')
+    process = check(graph, '--wait', '--seconds', '1', '--move')
+    graph.wait(lambda: commands, 'the first command')
+    graph.publisher(Float64MultiArray, 'muscle_length_command')
+    status, output = ended(process)
+    assert status == 1
+    assert 'stop the controller' in output
+
+
 def test_ctrl_c_ends_it_without_a_traceback(graph):
     waiting = check(graph)
     waiting.stdout.readline()
