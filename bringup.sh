@@ -68,7 +68,7 @@ controller=true
 combined=false
 hardware=false
 bag=
-recording=
+record=
 view=
 port=8080
 read_only=()
@@ -80,15 +80,10 @@ while [ $# -gt 0 ]; do
   case $1 in
     --robot | --checkpoint | --bag | --preset | --seed | --reality | --joint-source | --namespace | --duration | --record | --port)
       if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
+      option=${1#--}
+      printf -v "${option//-/_}" %s "$2" && shift
       ;;
-  esac
-  case $1 in
-    --robot) robot=$2 && shift ;;
-    --checkpoint) checkpoint=$2 && shift ;;
-    --bag) bag=$2 && shift ;;
-    --record) recording=$2 && shift ;;
     --view) view=view ;;
-    --port) port=$2 && shift ;;
     --read-only) read_only=(--read-only) ;;
     --explore) explore=true ;;
     --no-explore) explore=false ;;
@@ -96,23 +91,13 @@ while [ $# -gt 0 ]; do
     --hardware) hardware=true ;;
     --no-controller) controller=false ;;
     --combined) combined=true ;;
-    --preset) preset=$2 && shift ;;
-    --seed) seed=$2 && shift ;;
-    --reality) reality=$2 && shift ;;
-    --joint-source) joint_source=$2 && shift ;;
-    --namespace) namespace=$2 && shift ;;
-    --duration) duration=$2 && shift ;;
     -h | --help) usage && exit ;;
-    *)
-      refuse "unknown option '$1'; legal are --robot, --checkpoint, --hardware,\
- --no-controller, --combined, --bag, --explore, --no-explore, --no-learner, --preset, --seed, --reality, --joint-source, --namespace, --duration, --record, --view, --port,\
- --read-only, --help"
-      ;;
+    *) refuse "unknown option '$1'; legal are $(usage | grep -o -e '--[a-z-]*' | sort -u | paste -sd ' ')" ;;
   esac
   shift
 done
 
-if [ -d "$repository/config/$robot" ] && [[ $robot != */* ]]; then
+if [ -f "$repository/config/$robot/muscles.yaml" ] && [[ $robot != */* ]]; then
   robot_directory=$repository/config/$robot
 elif [ -d "$robot" ]; then
   robot=$(cd "$robot" && pwd -P) || exit 2
@@ -137,27 +122,19 @@ if [ $combined = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
   refuse '--combined is estimator and controller in one process: not with --no-controller or --bag'
 fi
 [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
-if [ -n "$recording" ]; then
-  [ ! -e "$recording" ] || refuse "--record '$recording' is there already; name a new directory"
-  recording=$(realpath -m "$recording")
+if [ -n "$record" ]; then
+  [ ! -e "$record" ] || refuse "--record '$record' is there already; name a new directory"
+  record=$(realpath -m "$record")
 fi
-case $preset in
-  default | paper) ;;
-  *) refuse "--preset '$preset' must be default or paper" ;;
-esac
+[[ $preset =~ ^(default|paper)$ ]] || refuse "--preset '$preset' must be default or paper"
 [[ $seed =~ ^[0-9]{1,9}$ ]] || refuse "--seed '$seed' must be a whole number from 0 to 999999999"
 seed=$((10#$seed))
-case $reality in
-  kin | foreign) ;;
-  *)
-    [ -f "$reality" ] || refuse "--reality '$reality' must be kin, foreign or an MJCF file"
-    reality=$(realpath "$reality")
-    ;;
-esac
-case $joint_source in
-  sensor | marker | none) ;;
-  *) refuse "--joint-source '$joint_source' must be sensor, marker or none" ;;
-esac
+if [[ ! $reality =~ ^(kin|foreign)$ ]]; then
+  [ -f "$reality" ] || refuse "--reality '$reality' must be kin, foreign or an MJCF file"
+  reality=$(realpath "$reality")
+fi
+[[ $joint_source =~ ^(sensor|marker|none)$ ]] ||
+  refuse "--joint-source '$joint_source' must be sensor, marker or none"
 if [ -n "$duration" ]; then
   [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
     refuse "--duration '$duration' must be a number of seconds above 0, such as 30 or 2.5"
@@ -200,14 +177,15 @@ declare -A pid_of=()
 with_us=()
 if setpriv --pdeathsig TERM true 2>/dev/null; then with_us=(setpriv --pdeathsig TERM); fi
 
-# Usage: start NAME EXECUTABLE ARGUMENT…   Output goes to NAME.log.
-start() {
-  local name=$1 executable=$2
-  shift 2
-  say "starting $name"
+launch() { # NAME ARGUMENT…
   # Through $python, because a #! line cannot name a path with a space in it.
-  "${with_us[@]}" "$python" "$executables/$executable" "$@" >"$logs/$name.log" 2>&1 </dev/null &
-  pid_of[$name]=$!
+  "${with_us[@]}" "$python" "$executables/$1" "${@:2}" </dev/null &
+  pid_of[$1]=$!
+}
+
+start() { # NAME ARGUMENT…   Output goes to NAME.log.
+  say "starting $1"
+  launch "$@" >"$logs/$1.log" 2>&1
 }
 
 is_running() { kill -0 "$1" 2>/dev/null; }
@@ -276,7 +254,7 @@ train_once() {
     {
       (cd "$robot_directory" && sha256sum robot.urdf muscles.yaml) # what a network is made from
       cd "$repository/musculoskeletal_ae" &&
-        find robot mae presets.py tools/initial_training.py -name '*.py' -print0 | LC_ALL=C sort -z |
+        find robot mae presets.* tools/initial_training.py -name '*.py' -print0 -o -name '*.yaml' -print0 | LC_ALL=C sort -z |
         xargs -0 sha256sum
     } | sha256sum | cut -c 1-16
   )
@@ -289,10 +267,8 @@ train_once() {
   training=$(mktemp -d "$cache/.training-XXXXXX") || exit 1
   [ -t 1 ] || export TQDM_MININTERVAL=5 # a progress bar in a file: a line now and then
   say "training the MAE of $(basename "$robot_directory"), once (about a minute)"
-  "${with_us[@]}" "$python" "$executables/train" --robot "$robot" --preset "$preset" \
-    --out "$training/$(basename "$checkpoint")" \
-    > >(tee "$logs/train.log") 2>&1 </dev/null &
-  pid_of[train]=$!
+  launch train --robot "$robot" --preset "$preset" --out "$training/$(basename "$checkpoint")" \
+    > >(tee "$logs/train.log") 2>&1
   watch_until_ended train || status=$?
   [ $status -eq 0 ] || died train $status
   mv -f "$training"/* "$cache"/
@@ -317,7 +293,7 @@ if [ -n "$bag" ]; then
 elif [ $hardware = false ]; then
   camera=()
   [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
-  start hardware_emulator hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")" "${camera[@]}"
+  start hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")" "${camera[@]}"
 fi
 
 [ -n "$checkpoint" ] || train_once
@@ -326,36 +302,35 @@ if [ $hardware = true ]; then
   rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
   check=(--robot "$robot" --rate "$rate" --wait --seconds 3)
   ! grep -q '^    zero_at_start: *true' "$repository/config/nodes.yaml" || check+=(--unzeroed)
-  "${with_us[@]}" "$python" "$executables/check_driver" "${check[@]}" "${remap[@]}" </dev/null &
-  pid_of[check_driver]=$!
+  launch check_driver "${check[@]}" "${remap[@]}"
   status=0
   watch_until_ended check_driver || status=$?
   [ $status -eq 0 ] || finish 1
 fi
 common+=(-p "checkpoint:=$(quoted "$checkpoint")")
 
-[ $combined = true ] || start estimator estimator "${common[@]}"
-start sim sim "${common[@]}"
+[ $combined = true ] || start estimator "${common[@]}"
+start sim "${common[@]}"
 # What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware is
 # the same arm tomorrow, and the learner goes on from where it was.
 kept=(-p "state_directory:=$(quoted "$logs/learner")")
 [ $hardware = false ] || kept=()
-[ $learner = false ] || start learner learner "${common[@]}" "${kept[@]}" \
+[ $learner = false ] || start learner "${common[@]}" "${kept[@]}" \
   -p "joint_source:=$joint_source"
-[ -z "$recording" ] || start record record -o "$recording" "${remap[@]}"
+[ -z "$record" ] || start record -o "$record" "${remap[@]}"
 if [ -n "$bag" ]; then
-  start replay replay "$bag" --clock "${remap[@]}"
+  start replay "$bag" --clock "${remap[@]}"
 elif [ $controller = true ]; then
   moving=(-p "explore:=$explore")
   # A pause of a busy desktop is no fault of an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
   name=controller
   [ $combined = false ] || name=combined
-  start $name $name "${common[@]}" "${moving[@]}"
+  start $name "${common[@]}" "${moving[@]}"
 fi
 
 if [ -n "$view" ]; then
-  start view view --robot "$robot" --port "$port" "${read_only[@]}" "${remap[@]}"
+  start view --robot "$robot" --port "$port" "${read_only[@]}" "${remap[@]}"
   say "the arm is on http://localhost:$port"
 fi
 
@@ -363,9 +338,8 @@ fi
 # machine, and ends after it; without any estimate it gives up.
 seconds=${duration:-0} # 0: without end
 [[ $seconds == *.* ]] || seconds+=.0 # a ROS double
-"${with_us[@]}" "$python" "$executables/bringup_status" "${common[@]}" \
-  -p "duration:=$seconds" ${duration:+-p patience:=300.0} 2>"$logs/bringup_status.log" </dev/null &
-pid_of[bringup_status]=$!
+launch bringup_status "${common[@]}" \
+  -p "duration:=$seconds" ${duration:+-p patience:=300.0} 2>"$logs/bringup_status.log"
 
 status=0
 watch_until_ended bringup_status || status=$?

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD, MOMENT = 60.0, 5.0  # [s] ahead: of what is planned, and of what is never exceeded
@@ -67,6 +67,7 @@ class Heat:
         self._begin = self._state[2:5].copy()
         self._covariance: Array = np.tile(np.diag(SPREAD**2), (count, 1, 1))
         self._known = np.zeros(count, dtype=bool)  # whether there is a temperature of the housing
+        self._spoilt = np.zeros(count, dtype=bool)  # it came, went or jumped since the last update
         self._age: Array = np.zeros(count)  # [s] of learning
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ as first known
         self._sums: Array = np.zeros((2, count))
@@ -109,19 +110,21 @@ class Heat:
         known, measured = np.isfinite(housing), self._state[1]
         strange = known & ((np.abs(housing - measured) > JUMP) | ~self._known)
         self._state[1] = np.where(strange, housing, measured)
-        hidden, self._known = (known != self._known).any(), known
+        self._spoilt |= strange | (known != self._known)
+        self._known = known
         self._sums += tension * tension, np.where(known, housing, 0.0)
         self._messages, self._passed = self._messages + 1, self._passed + dt
-        learns = not (strange.any() or hidden)
-        if learns and self._passed < EVERY:
+        if strange.any():
+            self._ahead = None
+        if self._passed < EVERY:
             return
-        if learns:
-            square, mean = self._sums / self._messages
-            self._update(square, mean, min(self._passed, LONGEST))
-        self._ahead = None
+        square, mean = self._sums / self._messages
+        # One thermometer that fails tells nothing; windings warm all the same, and others tell.
+        self._update(square, mean, known & ~self._spoilt, min(self._passed, LONGEST))
+        self._ahead, self._spoilt[:] = None, False
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
 
-    def _update(self, square: Array, housing: Array, dt: float) -> None:
+    def _update(self, square: Array, housing: Array, told: Bools, dt: float) -> None:
         before, covariance = self._state, self._covariance
         after = flow(before, square, dt)
         moved = flow(before[:, None] + SLOPE * np.eye(6)[:, :, None], square, dt)
@@ -129,18 +132,18 @@ class Heat:
         covariance = slope @ covariance @ slope.transpose(0, 2, 1) + np.diag(WALK**2 * dt)
         gain = covariance[:, :, 1] / (covariance[:, 1, 1] + NOISE**2)[:, None]
         corrected = covariance - gain[:, :, None] * covariance[:, None, 1]
-        after = after + np.where(self._known, gain.T * (housing - after[1]), 0.0)
+        after = after + np.where(told, gain.T * (housing - after[1]), 0.0)
         after[2:5] = np.clip(after[2:5], self._begin - FAR, self._begin + FAR)
         self._state = after
-        self._covariance = np.where(self._known[:, None, None], corrected, self._covariance)
-        self._age += np.where(self._known, dt, 0.0)
+        self._covariance = np.where(told[:, None, None], corrected, self._covariance)
+        self._age += np.where(told, dt, 0.0)
         logs, unsure = after[[2, 4]], self._covariance[:, [2, 4], [2, 4]].max(axis=1)
         first = (self._age > LEARNED) & (unsure < KNOWN**2) & np.isnan(self._reference[0])
         self._reference = np.where(first, logs, self._reference)
         factor = np.exp(logs - self._reference)
-        told = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
+        says = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
         self.changed = {
-            int(m): f'{told[k].format(factor[k, m])} as much as it did'
+            int(m): f'{says[k].format(factor[k, m])} as much as it did'
             for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
         }
 

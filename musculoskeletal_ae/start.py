@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +27,9 @@ def load(module: str) -> ModuleType:
 def main() -> int | None:
     """Run the node or tool that this process is named after; return its exit status."""
     name = Path(sys.argv[0]).stem
+    # What ends the interpreter itself says where, on stderr (there may be none).
+    with suppress(AttributeError, ValueError, RuntimeError, OSError):
+        faulthandler.enable()
     try:
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # setup.py says why
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -218,6 +218,8 @@ def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
         values[:4] = 0.0, 0.0, 0.0, 1.0
     if not np.isfinite(values).all():
         raise MessageError('not finite', 'a position or orientation')
-    if abs(np.linalg.norm(values[:4]) - 1.0) > UNIT_TOLERANCE:
+    norm = np.linalg.norm(values[:4])
+    if abs(norm - 1.0) > UNIT_TOLERANCE:
         raise MessageError('not a unit quaternion', str(values[:4]))
+    values[:4] /= norm
     return pin.XYZQUATToSE3(np.concatenate([values[4:], values[:4]]))

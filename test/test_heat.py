@@ -10,7 +10,7 @@ from numba import njit
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.heat import HELD, LEARNED, MOMENT, RATIO, Heat, flow
+from musculoskeletal_ae.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
@@ -179,3 +179,19 @@ def test_an_unknown_temperature_limits_nothing_and_comes_back():
         np.testing.assert_array_equal(np.isfinite(heat.core), np.isfinite(read))
         free = heat.limits(HIGHEST)[0] == TENSION.max
         np.testing.assert_array_equal(free, ~np.isfinite(read))
+
+
+def test_a_thermometer_that_comes_and_goes_leaves_all_other_windings_watched():
+    sound, flaky = Motors(seed=3), Motors(seed=3)
+    read = np.full((2, COUNT), AIR + 5.0)
+    for n in range(1200):
+        for heat, lost in ((sound.heat, False), (flaky.heat, n % 2 == 0)):
+            here = np.where((np.arange(COUNT) == 1) & lost, np.nan, read[0] + 0.02 * n)
+            heat.step(1.2 * TENSION.limit, here, 0.25)
+    others = np.arange(COUNT) != 1
+    np.testing.assert_allclose(flaky.heat.core[others], sound.heat.core[others], atol=0.1)
+    for known, seen in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
+        np.testing.assert_allclose(seen[others], known[others], atol=0.5)
+    # Its own winding warms all the same, as far as is known.
+    flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
+    assert flaky.heat.core[1] > AIR + 40.0

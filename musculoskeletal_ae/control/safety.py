@@ -96,9 +96,9 @@ class SafetyFilter:
 
     def muscles(self, muscles: Muscles) -> Muscles:
         """Take new muscle_states; return the medians of the last three, isolated ones without T."""
-        self._newest = muscles
-        self._readings.append(muscles._replace(tension=muscles.tension * self._robot.used))
-        self.now = Muscles(*np.median(np.array(self._readings), axis=0))
+        self._readings.append(muscles)
+        median = Muscles(*np.median(np.array(self._readings), axis=0))
+        self.now = median._replace(tension=median.tension * self._robot.used)
         return self.now
 
     def stop(self, cause: str, passing: bool = False) -> None:
@@ -181,7 +181,8 @@ class SafetyFilter:
         """Return the next command [m] of the suspect, after `value`."""
         if self._wound_from is None:
             self._wound_from = value
-        length, tension = self._newest.length[muscle], self._newest.tension[muscle]
+        newest = self._readings[-1]  # with the tensions of isolated muscles
+        length, tension = newest.length[muscle], newest.tension[muscle]
         rise = tension - self._robot.description.tension.bias[muscle]
         if max(rise, self._robot.stiffness[muscle] * (length - value)) > WIND:
             return value

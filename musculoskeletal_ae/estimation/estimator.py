@@ -181,9 +181,9 @@ class Estimator:
         state = self.mae.estimate(end, length - guess.offset)
         self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
         if self._verification is not None:
-            self._verify(self._verification, state.theta, tension, length, dt, now)
+            self._verify(self._verification, state.theta, tension, end, length, dt, now)
         verdict = self._verdict = self.detector.step(state, end, tension, length, dt)
-        still = self._stands_still(self.mae, tension, length, dt)
+        still = self._stands_still(self.mae, tension, end, length, dt)
         if still is not None and not verdict.cause:
             why = 'a sensor stands still while the arm moves'
             verdict = verdict._replace(suspect=still, cause=why)
@@ -201,7 +201,9 @@ class Estimator:
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
 
-    def _stands_still(self, mae: Mae, tension: Array, length: Array, dt: float) -> int | None:
+    def _stands_still(
+        self, mae: Mae, tension: Array, end: Array, length: Array, dt: float
+    ) -> int | None:
         """Return the muscle of a sensor that says the same though the others say that it moves."""
         robot, read, before = self._robot, np.array([length, tension]), self._read
         self._read = read
@@ -217,8 +219,8 @@ class Estimator:
         isolated = tuple(sorted((*robot.isolated, muscle)))
         if less.isolated != isolated:
             less, low, high = mae.without(isolated), np.inf, -np.inf
-        theta = less.estimate(tension, length).theta
-        likely = float(less.lengths(theta, np.minimum(tension, robot.tension.limit))[muscle])
+        theta = less.estimate(end, length).theta
+        likely = float(less.lengths(theta, np.minimum(end, robot.tension.limit))[muscle])
         self._moved = less, min(low, likely), max(high, likely)
         return muscle if self._moved[2] - self._moved[1] > MOVED else None
 
@@ -257,13 +259,13 @@ class Estimator:
         self.isolate((*robot.isolated, suspect))
 
     def _verify(
-        self, suspect: Verification, theta: Array, tension: Array, length: Array, dt: float,
-        now: float,
+        self, suspect: Verification, theta: Array, tension: Array, end: Array, length: Array,
+        dt: float, now: float,
     ) -> None:  # fmt: skip
         assert self.mae is not None
         m = suspect.muscle
         command = None if self._command is None else float(self._command[m])
-        pulls = np.clip(tension, 0.0, self._robot.description.tension.limit)
+        pulls = np.clip(end, 0.0, self._robot.description.tension.limit)
         likely = self.mae.lengths(theta, pulls)
         found = suspect.step(float(tension[m]), float(length[m]), command, float(likely[m]), dt)
         if not found:

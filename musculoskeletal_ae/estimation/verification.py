@@ -2,7 +2,7 @@
 """Is a suspect muscle broken: what it does while the controller winds it in a little.
 
 The arm has stopped, and the estimate is made without the suspect already. Once its command falls
-again (`control/safety.Winding`), what it reads, T and l, is compared with what muscle stiffness
+again (`control/safety`), what it reads, T and l, is compared with what muscle stiffness
 control demands of it, T_ref = T_bias + K (l − l_target), and with the length l' that the other
 muscles make likely:
 

@@ -125,11 +125,12 @@ class _Reader:
 
     def _strength(self, a: int) -> float:
         m = self.model
-        gain = m.actuator_gainprm[a]
+        gain, force = m.actuator_gainprm[a], 0.0
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
-            return float(gain[2] if gain[2] > 0.0 else gain[3] / m.actuator_acc0[a])
-        limited = m.actuator_forcelimited[a]
-        return float(np.abs(m.actuator_forcerange[a]).max()) if limited else 0.0
+            force = gain[2] if gain[2] > 0.0 else gain[3] / m.actuator_acc0[a]
+        elif m.actuator_forcelimited[a]:
+            force = np.abs(m.actuator_forcerange[a]).max()
+        return float(force * abs(m.actuator_gear[a][0]))
 
     def _route(self, name: str, wraps: range) -> None:
         m, types = self.model, mujoco.mjtWrap

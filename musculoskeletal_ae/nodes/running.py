@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import ast
-import faulthandler
 import signal
 import sys
 import time
@@ -209,9 +208,6 @@ def run(name: str) -> None:
             print(ast.get_docstring(ast.parse(source)), end='\n\n')
         print(help_text(name))
         return
-    # What ends the interpreter itself says where, on stderr, which bringup.sh keeps.
-    with suppress(AttributeError, ValueError, RuntimeError, OSError):
-        faulthandler.enable()
     try:
         given = sys.argv[1:]
         mine = given[: given.index('--ros-args')] if '--ros-args' in given else given
@@ -231,10 +227,8 @@ def run(name: str) -> None:
         pass
     except MusculoskeletalError as error:
         sys.exit(f'error: {error}')
-    except PARAMETER_ERRORS as error:
-        sys.exit(f'error: {printable(reason(error))}')
-    except rclpy_implementation.RCLError as error:
-        if not nodes:
+    except (*PARAMETER_ERRORS, rclpy_implementation.RCLError) as error:
+        if isinstance(error, PARAMETER_ERRORS) or not nodes:
             sys.exit(f'error: {printable(reason(error))}')
         # A callback that publishes while a signal shuts the context down is no failure.
         if rclpy.ok():
@@ -282,7 +276,6 @@ def run_tool(
     that something cannot be used, 2 that an option is wrong.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
-    faulthandler.enable()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])

@@ -45,6 +45,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
 OLD = 1.0  # [s] after which something that moves is no longer shown
+PATIENCE = 10.0  # [s] with a service
 ARM_TOPICS = {
     'measured': 'joint_states',
     'estimated': 'estimated_joint_states',
@@ -81,7 +82,7 @@ class View(Node):
         self.taken: list[Any] = []  # subscriptions
         self.ruptured: list[str] = []
         self.payload = 0.0
-        self.pending: list[tuple[Any, Callable[[Any], None]]] = []  # answers that are waited for
+        self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
         self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
@@ -134,11 +135,11 @@ class View(Node):
         for _ in range(len(self.pending) + 1 if self.pending else 0):
             self.spinner.spin_once(timeout_sec=0.0)
         waiting, self.pending = self.pending, []
-        for future, answered in waiting:  # an executor would call back one request later
+        for since, future, answered in waiting:  # an executor would call back one request later
             if future.done():
                 answered(future.result())
-            else:
-                self.pending.append((future, answered))
+            elif time.monotonic() - since < PATIENCE:  # else its node died over it
+                self.pending.append((since, future, answered))
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -220,7 +221,7 @@ class View(Node):
 
         if self.ways[name].service_is_ready():
             future = self.ways[name].call_async(SERVICES[name].Request(**fields))
-            self.pending.append((future, answered))
+            self.pending.append((time.monotonic(), future, answered))
 
     def _do(self, what: str, value: Any = None) -> None:
         """Do what a visitor asked for."""

@@ -182,6 +182,7 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     ('arguments', 'expected'),
     [
         (['--robot', 'no_such_robot'], 'musashi_left_arm'),
+        (['--robot', 'testbed'], 'arm26'),
         (['--duration', 'soon'], 'soon'),
         (['--view', '--port', '65536'], '65536'),
         (['--seed', '-1'], '-1'),
