@@ -123,12 +123,12 @@ def at_rest(robot: Robot, seed: int, mae: Mae, count: int) -> dict[str, Any]:
     counts = dict.fromkeys(REST_COUNTS, 0)
     slowest, widest = 0.0, anomaly.WIDEST
     for n in range(count):
-        if detector.unfamiliar(mae.estimate(end[n], length[n]).theta) <= 1.0:
+        state = mae.estimate(end[n], length[n])
+        if detector.unfamiliar(state.theta) <= 1.0:
             continue
         counts['postures'] += 1
         for name, anomaly.WIDEST in (('alarms', widest), ('narrow_alarms', 1.0)):
             detector.reset()
-            state = mae.estimate(end[n], length[n])
             for _ in range(anomaly.IN_A_ROW):
                 verdict = detector.step(state, end[n], tension[n], length[n], SAMPLE_TIME)
             counts[name] += bool(verdict.cause)

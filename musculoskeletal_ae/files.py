@@ -175,3 +175,12 @@ def _check(text: str) -> None:
             raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases included')
         if len(within) > DEEPEST:
             raise ValueError(f'{where}: more than {DEEPEST} levels')
+
+
+def sync_directory(directory: Path) -> None:
+    """Let names in a directory survive a power cut."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -26,7 +26,7 @@ def slid(direction: Array, moved: Array) -> Array:
     return after
 
 
-def end_tension(friction: Array, tension: Array, direction: Array) -> Array:
+def end_tension(friction: Array | float, tension: Array, direction: Array) -> Array:
     """Return T_end [N] (..., M) of T [N], by μ (M,) and s (..., M)."""
     end: Array = tension * np.exp(-friction * direction)
     return end
@@ -54,3 +54,10 @@ class FrictionDirection:
     def reset(self) -> None:
         """Forget, as after a jump of the clock."""
         self._length = None
+
+
+def directions(length: Array, dt: Array | float) -> Array:
+    """Return s (N, M) of l [m] (N, M), each `dt` [s] after the one before: one for all, or (N,)."""
+    step = FrictionDirection().step
+    seen = zip(length, np.broadcast_to(dt, len(length)), strict=True)
+    return np.array([step(*each) for each in seen]).reshape(length.shape)

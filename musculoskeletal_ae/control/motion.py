@@ -30,6 +30,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
 from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFeedback
+from musculoskeletal_ae.control.reach import NOTABLE
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
@@ -49,7 +50,6 @@ FALLEN, FALLING = 0.2, 2.0  # [rad] off, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
 TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
-LACKING = 0.05  # [N·m] of torque
 LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
 LARGEST_LAG, SPAN = 0.1, 0.0095  # [s]; over which l tells how fast it winds, above its noise
 AHEAD = 0.2  # [s] to the moment of T_K, and between two of them
@@ -308,7 +308,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
         pulls, missing = (np.array(part) for part in zip(*plans))
         command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
         change = np.abs(np.diff(command, axis=0)).max(axis=1)
-        lacking = np.abs(missing).max(axis=1) > LACKING
+        lacking = np.abs(missing).max(axis=1) > NOTABLE
         change[lacking[1:] | lacking[:-1]] = 0.0
         needed = change.max() * count / tried.duration / (SHARE * settings.rate_limit)
         if needed <= 1.0:

@@ -77,22 +77,16 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
             low, high = at < robot.lower + AT_STOP, at > robot.upper - AT_STOP
             stops = np.vstack([-joints[low], joints[high]])
             none = np.zeros(len(stops))
+            ends = np.concatenate([limits.bias, none]), np.concatenate([most, none + STOP])
             torque = robot.kinematics.holding_torque(at)
-            found.append(
-                least_tension(
-                    np.vstack([jacobian, stops]),
-                    torque,
-                    np.concatenate([limits.bias, none]),
-                    np.concatenate([most, none + STOP]),
-                ).missing_torque
-            )
-        return np.abs(found).max(axis=1)
+            found.append(least_tension(np.vstack([jacobian, stops]), torque, *ends).missing_torque)
+        m = np.abs(found).max(axis=1)
+        return np.where(m > NOTABLE, m, 0.0)
 
     def cost(one: Array, other: Array) -> float:
         length = float(np.linalg.norm(other - one))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
         m = missing(one + shares * (other - one))
-        m = np.where(m > NOTABLE, m, 0.0)
         return length * (1.0 + PRICE * float(m.mean()))
 
     direct = cost(start, theta)
@@ -108,7 +102,6 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     postures = np.vstack([start, theta, postures])
     apart = np.linalg.norm(postures[:, None] - postures, axis=2)
     m = missing(postures)
-    m = np.where(m > NOTABLE, m, 0.0)
     price = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
     near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
     price = np.where(near | near.T, price, 0.0)

@@ -12,8 +12,6 @@ from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
 
-NOTABLE = 0.05  # [N·m] of missing torque
-
 
 def report(core: Controller, now: float) -> Report:
     """Return the state that /diagnostics shows: a stop, else why it waits, else all warnings."""
@@ -41,7 +39,7 @@ def report(core: Controller, now: float) -> Report:
         values['lag of the winches'] = f'{1000.0 * motion.winches.lag:.0f} ms'
         if motion.moving and (slow := slowed(motion)):
             warnings.append(f'trajectory {slow}')
-    if np.abs(missing).max(initial=0.0) > NOTABLE:
+    if np.abs(missing).max(initial=0.0) > reach.NOTABLE:
         lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
         values['missing torque'] = ', '.join(lacks)
         warnings.append('the target needs more torque than the muscles have')

@@ -62,7 +62,6 @@ class Winding:
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
         self._highest: Array = np.maximum(highest or self._bias + ABOVE_BIAS, self._bias + CLIP[0])
-        self._stiffness = robot.stiffness
         self.trying = ''  # what is going on, for people
         self.done = False
         self._now = 0.0
@@ -110,7 +109,7 @@ class Winding:
         while self._now < end:
             yield
             (length, tension, _), limit = self._recent[-1][1], self._robot.tension.limit
-            asked = np.minimum(self._demand(length), limit)
+            asked = np.minimum(self._robot.demanded(length, self._target), limit)
             self._tame_at[~(tension > asked + RUN_AWAY_TENSION)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
@@ -119,13 +118,9 @@ class Winding:
             if start is not None and (fell := start[0] - length).max() > RUN_AWAY:
                 raise RunAwayError(int(fell.argmax()), f'l fell by {1e3 * fell.max():.0f} mm')
 
-    def _demand(self, length: Array) -> Array:
-        demand: Array = self._bias + np.maximum(0.0, self._stiffness * (length - self._target))
-        return demand
-
     def _mean(self) -> _Reading:
         length, tension, third = np.mean([states for _, states in self._recent], axis=0)
-        demand = np.minimum(self._demand(length), self._robot.tension.max)
+        demand = np.minimum(self._robot.demanded(length, self._target), self._robot.tension.max)
         return _Reading(length, tension, third, demand)
 
     def _go(self, m: int, goal: float) -> Wait:
@@ -144,11 +139,12 @@ class Winding:
         """Ask for a level [N], follow the arm as it gives way, and return what is then read."""
         before = self._mean()
         noise = np.std([states[1, m] for _, states in self._recent])
-        further = (level - self._bias[m]) / self._stiffness[m]
+        further = (level - self._bias[m]) / self._robot.stiffness[m]
         self._target[m] = before.length[m] - further
         start = last = self._now
         while True:
-            lacking = self._demand(self._recent[-1][1][0])[m] < level
+            length = self._recent[-1][1][0]
+            lacking = self._robot.demanded(length, self._target)[m] < level
             going_on = lacking and home - self._target[m] < FURTHEST + further
             if self._now - start >= HOLD and not going_on:
                 break
@@ -220,7 +216,7 @@ class Winding:
         if other != m and pulled[other] > RESPONSE[0]:
             self.verdict.failed('other one', m, other=self._robot.muscles[other])
             return
-        self._target[m] = home.length[m] + ((self._highest - self._bias) / self._stiffness)[m]
+        self._target[m] = home.length[m] + ((self._highest - self._bias) / self._robot.stiffness)[m]
         yield from self._wait(HOLD)
         answered = self._mean().tension[m] - home.tension[m] > RESPONSE[0]
         yield from self._go(m, home.length[m])

@@ -188,19 +188,16 @@ class AnomalyDetector:
             less = self._mae.without((*isolated, muscle))
             assert less.anomaly is not None
             error = residuals(less.estimate(tension, length), tension, length, less.isolated)
-            centred = error - less.anomaly.mean
-            distance[muscle] = centred @ np.linalg.solve(less.anomaly.covariance, centred)
+            distance[muscle] = less.anomaly.distances(error[None])[0]
         return int(distance.argmin())
-
-    def _demand(self, length: Array, command: Array) -> Array:
-        pulled: Array = np.maximum(0.0, self._robot.stiffness * (length - command))
-        return self._robot.tension.bias + pulled
 
     def _jam(self, tension: Array, length: Array, dt: float) -> int | None:
         if self._length_command is None:
             self._jammed[:] = 0.0
             return None
-        demand = np.minimum(self._demand(length, self._length_command), self._robot.tension.max)
+        demand = np.minimum(
+            self._robot.demanded(length, self._length_command), self._robot.tension.max
+        )
         far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
         told = far & self._robot.used
         stands = told & (np.abs(length - self._stands) < STANDS)
@@ -211,7 +208,7 @@ class AnomalyDetector:
     def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
         bias, demand = self._robot.tension.bias, self._tension_command
         if self._length_command is not None:
-            demand = self._demand(length, self._length_command)
+            demand = self._robot.demanded(length, self._length_command)
         if demand is None:
             # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
             lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE

@@ -206,9 +206,8 @@ class Gate:
 
         def distance(tension: Array) -> float:
             state = mae.estimate(tension, length)
-            off = residuals(state, tension, length, mae.isolated) - statistics.mean
-            square = np.einsum('ni,in->n', off, np.linalg.solve(statistics.covariance, off.T))
-            return float(np.median(np.sqrt(square))) / threshold
+            error = residuals(state, tension, length, mae.isolated)
+            return float(np.median(statistics.distances(error))) / threshold
 
         uncut = 1.0 - np.eye(self._robot.muscle_count)
         used = np.delete(uncut, self.isolated, axis=0)

@@ -37,6 +37,7 @@ from musculoskeletal_ae.experiments.recording import (
     Recording,
     columns,
     estimation_error,
+    judge,
     record,
     times,
 )
@@ -84,11 +85,12 @@ def follow(
     """
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
     errors, mae, direction = list[float](), None, FrictionDirection()
+    error = judge(held_out, CURVE_STRIDE)
     for n, row in enumerate(stream):
         if learner.mae is not mae:
             mae = learner.mae
             samples.append(len(learner.samples))
-            errors.append(estimation_error(mae, held_out, CURVE_STRIDE))
+            errors.append(error(mae))
         _, sensor, length, tension, _ = row
         end = direction.end_tension(mae.friction, tension, length, SAMPLE_TIME)
         running.append(float(np.linalg.norm(mae.estimate(end, length).theta - sensor)))
@@ -96,7 +98,7 @@ def follow(
         learner.step(n * SAMPLE_TIME, theta, tension, length)
         rows.append(row)
     samples.append(len(learner.samples))
-    errors.append(estimation_error(learner.mae, held_out, CURVE_STRIDE))
+    errors.append(error(learner.mae))
     return Curve(samples, errors, np.array(running)), Recording(*columns(rows))
 
 

@@ -19,7 +19,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.friction import FrictionDirection, end_tension
+from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
 from musculoskeletal_ae.mae.mae import Mae
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
@@ -156,8 +156,7 @@ def record(
             if off is None:
                 arm.command_length(command)
             else:
-                pull = np.maximum(0.0, robot.stiffness * (read.length - command))
-                arm.command_tension(np.where(off, 0.0, robot.tension.bias + pull))
+                arm.command_tension(np.where(off, 0.0, robot.demanded(read.length, command)))
             arm.step(SAMPLE_TIME)
             read = arm.sense()
             rows.append((arm.theta, read.theta, read.length, read.tension, command))
@@ -186,12 +185,25 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
     """Return T_end [N] (N, M) of what was recorded, by a network's friction, as nodes know it."""
-    step = FrictionDirection().step
-    direction = np.array([step(length, SAMPLE_TIME) for length in recording.length])
+    direction = directions(recording.length, SAMPLE_TIME)
     return end_tension(mae.friction, recording.tension, direction)
+
+
+def judge(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
+    """Return what gives a network's mean error on every so many messages [rad].
+
+    Which way wires slid is found once for all networks that are asked.
+    """
+    direction = directions(recording.length, SAMPLE_TIME)[::stride]
+    part = recording.part(np.s_[::stride])
+
+    def error(mae: Mae) -> float:
+        tension = end_tension(mae.friction, part.tension, direction)
+        return mean_error(mae.estimate(tension, part.length).theta, part.theta)
+
+    return error
 
 
 def estimation_error(mae: Mae, recording: Recording, stride: int = 1) -> float:
     """Return the mean error of a network's estimate on every so many messages [rad]."""
-    tension, part = end_tensions(mae, recording)[::stride], recording.part(np.s_[::stride])
-    return mean_error(mae.estimate(tension, part.length).theta, part.theta)
+    return judge(recording, stride)(mae)

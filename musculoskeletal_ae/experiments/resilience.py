@@ -37,7 +37,7 @@ from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.detection import grasp_and_release
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, estimation_error
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, judge
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.plausibility import Plausibility
@@ -201,10 +201,11 @@ def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
     robot, mae, rng = study.robot, study.network(seed), np.random.default_rng([seed, 0x2E5])
     stream, stride = study.stream(seed, 'held_out'), EVERY * (10 if study.quick else 1)
-    whole = estimation_error(mae, stream, stride)
+    error = judge(stream, stride)
+    whole = error(mae)
     muscles = range(robot.muscle_count)
-    one = [estimation_error(mae.without([m]), stream, stride) for m in muscles]
-    two = [estimation_error(mae.without(pair), stream, stride) for pair in combinations(muscles, 2)]
+    one = [error(mae.without([m])) for m in muscles]
+    two = [error(mae.without(pair)) for pair in combinations(muscles, 2)]
     right, ended, shares, dead, trapped, cuts = [], [], [], [], [], {}
     for m in rng.permutation(robot.muscle_count)[:1].tolist() if study.quick else muscles:
         loop, _ = broken(study.arm(seed), mae, seed, m, '')

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.postures import FIRST_NOISE, fit_jointly, student
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
@@ -155,7 +156,7 @@ class CorrectedBody:
             fixed += self._smooth(theta, m) @ self.parameters[m][layout.rest]
             elastic, friction = self.elastic(m), self.friction(m)
             for lengths, s in zip(result, direction, strict=True):
-                end = tension[:, m] * np.exp(-friction * s[:, m])
+                end = end_tension(friction, tension[:, m], s[:, m])
                 lengths[:, m] = fixed - elastic.elongation(absolute, end)
         return result
 
@@ -179,7 +180,7 @@ class CorrectedBody:
         whole = norm.sum(axis=1) + poses.detour[:, m]
         absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)
-        end = np.maximum(tension * np.exp(-self.friction(m) * direction), 0.0)
+        end = np.maximum(end_tension(self.friction(m), tension, direction), 0.0)
         smooth = self._smooth(theta, m)
         length = absolute - at_zero - elastic.elongation(absolute, end)
         length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]

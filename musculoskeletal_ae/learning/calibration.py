@@ -164,8 +164,8 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     part = _statistics(error[sound & first], calibrated)
     statistics = _statistics(error[sound], calibrated)
     largest = max(
-        distances(part, error[sound & ~first]).max(initial=0.0),
-        distances(statistics, error[sound]).max(),
+        part.distances(error[sound & ~first]).max(initial=0.0),
+        statistics.distances(error[sound]).max(),
     )
     margin = MARGIN * (1.0 + YOUNG / max(known, 1))
     thresholds = {
@@ -195,15 +195,8 @@ def _glitches(error: Array) -> Bools:
     middle = np.median(error, axis=0)
     spread = np.median(np.abs(error - middle), axis=0) + FLOOR
     order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
-    distance = distances(_statistics(error[order[:-few]]), error)
+    distance = _statistics(error[order[:-few]]).distances(error)
     return np.greater(distance, GLITCH * np.sort(distance)[-few - 1])
-
-
-def distances(statistics: AnomalyStatistics, error: Array) -> Array:
-    """Return d of residuals (N, 2M)."""
-    centred = error - statistics.mean
-    squares = np.einsum('ni,ni->n', centred, np.linalg.solve(statistics.covariance, centred.T).T)
-    return np.sqrt(squares)
 
 
 def _statistics(error: Array, calibrated: bool = False) -> AnomalyStatistics:

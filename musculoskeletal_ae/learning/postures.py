@@ -23,6 +23,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
@@ -135,7 +136,7 @@ class _GroupFit:
             length[:, m] = seen.length[:, m] - l_m[0]
             by_body.append(j_m[0])
             slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
-            end[:, m] = pull * np.exp(-body.friction(m) * way)
+            end[:, m] = end_tension(body.friction(m), pull, way)
             block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
             block[:, :, body.layouts[m].friction] -= way * end[:, m] * slope[:, m, turns].T
             torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)

@@ -74,10 +74,10 @@ class RestDetector:
             return False
         middle = self._time - half
         halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]
-        angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
         lengths = [np.array([r.length for r in part]) for part in halves]
         if not _unmoved(lengths, self.settings.rest_length_rate * half):
             return False
+        angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
         if min(map(len, angles)) < LEAST_READINGS:
             return self.blind
         read = np.isfinite(angles[0][0])  # a robot has a sensor at a joint or has none

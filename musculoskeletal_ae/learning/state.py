@@ -30,7 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Bools, Ints
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
-from musculoskeletal_ae.files import read_start
+from musculoskeletal_ae.files import read_start, sync_directory
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint as checkpoints
 from musculoskeletal_ae.mae.mae import Mae
@@ -324,7 +324,7 @@ class State:
             with closing(_connect(unfinished / FILE)) as connection:
                 self._write(connection, samples, checkpoint)
             unfinished.rename(backup)
-            _sync(self.directory)
+            sync_directory(self.directory)
         except (OSError, sqlite3.Error) as error:
             shutil.rmtree(unfinished, ignore_errors=True)
             raise StateError(f'{self.directory}: no backup can be made ({error})') from error
@@ -342,8 +342,8 @@ class State:
         backup.mkdir()
         for file in files:
             file.rename(backup / file.name)
-        _sync(backup)
-        _sync(self.directory)
+        sync_directory(backup)
+        sync_directory(self.directory)
         if problem:
             self.not_used = f'{problem} (kept in {backup})'
 
@@ -360,12 +360,3 @@ def _connect(file: Path) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
-
-
-def _sync(directory: Path) -> None:
-    """Let names in a directory survive a power cut."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -63,7 +63,7 @@ class Updater(ABC):
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
         mae = self._mae.without(job.isolated)
-        estimate = mae.estimate(newest.end_tension(mae.friction), newest.length).theta
+        estimate = _estimate(mae, newest)
         seen = np.isfinite(newest.theta)
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
@@ -95,12 +95,15 @@ class Updater(ABC):
             covariance = estimate_covariance(mae, self.body, fit, tension, rng)
             judging = job.healthy.judging
             if judging is not None and len(judging) >= MANY:
-                end = judging.end_tension(mae.friction)
-                off = mae.estimate(end, judging.length).theta - judging.theta
-                covariance = holding(covariance, off)
+                covariance = holding(covariance, _estimate(mae, judging) - judging.theta)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
+
+
+def _estimate(mae: Mae, seen: Observations) -> Array:
+    """Return θ (N, D) as a network has it."""
+    return mae.estimate(seen.end_tension(mae.friction), seen.length).theta
 
 
 def make_updater(robot: Robot, mae: Mae, preset: Preset, seed: int = 0) -> Updater:
@@ -207,8 +210,7 @@ class BodyUpdater(Updater):
     def _learn(self, job: Job) -> Update:
         seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
-        guess = self._mae.estimate(seen.end_tension(self._mae.friction), seen.length).theta
-        fit = fit_body(body, seen, self._prior_mean, guess)
+        fit = fit_body(body, seen, self._prior_mean, _estimate(self._mae, seen))
         known, self._known = self._known, self._mean_length()
         self._trainer.move(self._known - known)
         contradicted = contradicted_muscles(seen, fit)

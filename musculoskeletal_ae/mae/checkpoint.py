@@ -24,7 +24,7 @@ from safetensors.numpy import save as save_tensors
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.files import read_bytes
+from musculoskeletal_ae.files import read_bytes, sync_directory
 from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS
@@ -338,11 +338,7 @@ def save(mae: Mae, path: str | Path) -> None:
         Path(temporary).unlink(missing_ok=True)
         raise
     # The new name survives a power cut only once the directory is on disk too.
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    sync_directory(path.parent)
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:

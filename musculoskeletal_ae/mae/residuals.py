@@ -67,6 +67,12 @@ class AnomalyStatistics:
         covariance = 0.5 * (covariance + covariance.T) + FLOOR**2 * np.eye(error.shape[1])
         return cls(mean, covariance, calibrated, len(error))
 
+    def distances(self, error: Array) -> Array:
+        """Return d = √((e − μ)ᵀ Σ⁻¹ (e − μ)) of residuals (N, 2M)."""
+        centred = error - self.mean
+        squares = np.einsum('ni,ni->n', centred, np.linalg.solve(self.covariance, centred.T).T)
+        return np.sqrt(squares)
+
     def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
         """Return the statistics of the same residuals, but those of some muscles 0."""
         count = len(self.mean) // 2

@@ -8,7 +8,6 @@ hardware's bones are ivory and solid; green those of the estimate, violet the si
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -101,15 +100,9 @@ class Frames:
 class Arm(Shell):
     """A node that stands for an arm."""
 
-    def __init__(self, name: str, **options: Any) -> None:
-        """Advertise NAME/markers; options are those of Node."""
-        super().__init__(name, **options)
-        self._arm = name
-        Markers(self, name, self.lines)
-
-    def follow_wrench(self, follow: Callable[[Array], object]) -> None:
-        """Give `follow` what comes on NAME/external_wrench, (6,) [N, N·m] in root link axes."""
-        topic, frame = f'{self._arm}/external_wrench', self.root_frame
+    def follow_wrench(self, arm: str, follow: Callable[[Array], object]) -> None:
+        """Give `follow` what comes on ARM/external_wrench, (6,) [N, N·m] in root link axes."""
+        topic, frame = f'{arm}/external_wrench', self.root_frame
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
@@ -131,7 +124,3 @@ class Arm(Shell):
             self._joints.publish(joint_message(self.robot.joints, theta, stamp))
         rows = np.stack([length, tension, temperature])
         self._muscles.publish(array_message(rows, 'quantity', 'muscle'))
-
-    def lines(self) -> list[Line]:
-        """Return the arm as lines; none where there is nothing to draw yet."""
-        raise NotImplementedError

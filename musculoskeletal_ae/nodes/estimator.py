@@ -136,7 +136,7 @@ class Estimator(Shell):
         self.chosen = True
         self.core.isolate(set(muscles))
         self._tell_isolated()
-        return f'isolated: {self._isolated_names() or "none"}'
+        return f'isolated: {self.robot.names(self.core.robot.isolated) or "none"}'
 
     def _isolate_asked(self, _: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
@@ -149,13 +149,10 @@ class Estimator(Shell):
         back = self.muscles_to_isolate or self.core.robot.isolated  # none named: all
         return self._isolate(m for m in self.core.robot.isolated if m not in back)
 
-    def _isolated_names(self) -> str:
-        return self.robot.names(self.core.robot.isolated)
-
     def _tell_isolated(self) -> None:
         if self.core.robot.isolated != self.told_isolated:
             self.told_isolated = self.gate.isolated = self.left_out = self.core.robot.isolated
-            self.isolated.publish(String(data=self._isolated_names()))
+            self.isolated.publish(String(data=self.robot.names(self.told_isolated)))
 
     def _tell_anomaly(self) -> None:
         """Say what has changed: an anomaly, or which muscles are isolated for it."""

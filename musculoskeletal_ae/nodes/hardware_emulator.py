@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -31,6 +31,7 @@ class HardwareEmulator(Arm):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('hardware_emulator', **options)
+        Markers(self, 'hardware_emulator', self._lines)
         self.arm = make_arm(self.robot, self.parameter('seed'), self.parameter('reality'))
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
@@ -53,7 +54,7 @@ class HardwareEmulator(Arm):
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_muscles('muscle_length_command', self.arm.command_length)
         self.follow_muscles('muscle_tension_command', self.arm.command_tension)
-        self.follow_wrench(self.arm.set_wrench)
+        self.follow_wrench('hardware_emulator', self.arm.set_wrench)
         serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -91,17 +92,14 @@ class HardwareEmulator(Arm):
         publisher.publish(message)
 
     def _publish_pose(self) -> None:
-        pose = self.arm.marker_pose()
         message = PoseStamped()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.root_frame
-        position, turn = message.pose.position, message.pose.orientation
-        position.x, position.y, position.z = pose.translation.tolist()
-        turn.x, turn.y, turn.z, turn.w = pin.Quaternion(pose.rotation).coeffs().tolist()
+        p, q = message.pose.position, message.pose.orientation
+        p.x, p.y, p.z, q.x, q.y, q.z, q.w = pin.SE3ToXYZQUAT(self.arm.marker_pose()).tolist()
         self.pose.publish(message)
 
-    def lines(self) -> list[Line]:
-        """Return the arm as lines, along its true routes."""
+    def _lines(self) -> list[Line]:
         arm = self.arm
         if arm.broken:
             return []

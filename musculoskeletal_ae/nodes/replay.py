@@ -51,14 +51,10 @@ class Replay(Node):
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
-        latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
+        latched, qos = latched_topics(bag), (QoSProfile(depth=DEPTH), LATCHED)
         self._publisher = {
-            recorded: self.create_publisher(
-                message_class(bag.topics[recorded].type),
-                name,
-                LATCHED if recorded in latched else reliable,
-            )
-            for recorded, name in names.items()
+            at: self.create_publisher(message_class(bag.topics[at].type), name, qos[at in latched])
+            for at, name in names.items()
         }
         self._recorded_time = None
         if options.clock:
@@ -82,10 +78,7 @@ class Replay(Node):
     def get_ready(self, longest: float) -> None:
         """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
         end = time.monotonic() + longest
-        topics = [
-            *self._publisher.values(),
-            *([self._recorded_time] if self._recorded_time else []),
-        ]
+        topics = [*self._publisher.values(), *filter(None, [self._recorded_time])]
         while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
             self._spinner.spin_once(timeout_sec=0.02)
         time.sleep(SETTLE_TIME if longest else 0.0)

@@ -19,7 +19,7 @@ from std_msgs.msg import Bool
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm
+from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm, Markers
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -35,6 +35,7 @@ class Sim(Arm):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
+        Markers(self, 'sim', self._lines)
         as_robot = self.parameter('as_robot')
         self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
@@ -45,7 +46,7 @@ class Sim(Arm):
         self.follow_checkpoints(self._use_checkpoint)
         self.follow_zeros(lambda *_: self.gate.forget())
         self.follow_muscles('muscle_length_command', self._command)
-        self.follow_wrench(partial(setattr, self, 'wrench'))
+        self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not as_robot:
             self.follow_muscle_states(self._note)
         self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
@@ -95,8 +96,7 @@ class Sim(Arm):
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
         self.publish_state(state.theta[0], state.length[0], state.tension[0], temperature)
 
-    def lines(self) -> list[Line]:
-        """Return the simulated arm as lines."""
+    def _lines(self) -> list[Line]:
         if self.arm is None:
             return []
         return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])

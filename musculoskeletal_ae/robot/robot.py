@@ -63,6 +63,11 @@ class Robot:
         )
         return Robot(description)
 
+    def demanded(self, length: Array, command: Array) -> Array:
+        """Return the T [N] (M,) that MSC demands at l under l_target [m] (M,), without T_max."""
+        demand: Array = self.tension.bias + np.maximum(0.0, self.stiffness * (length - command))
+        return demand
+
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
         """Return where in T and l the named muscles stand.
 

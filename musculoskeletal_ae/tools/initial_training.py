@@ -16,7 +16,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.friction import FrictionDirection
+from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -148,11 +148,9 @@ def learn(
 
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
-    direction, end = FrictionDirection(), np.empty_like(recording.tension)
     steps = np.diff(recording.time, prepend=recording.time[:1])
-    for n, read in enumerate(zip(recording.tension, recording.length, steps, strict=True)):
-        end[n] = direction.end_tension(mae.friction, *read)
-    estimate = mae.estimate(end, recording.length).theta
+    tension = end_tension(mae.friction, recording.tension, directions(recording.length, steps))
+    estimate = mae.estimate(tension, recording.length).theta
     return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
 
 

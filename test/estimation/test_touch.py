@@ -39,8 +39,8 @@ def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
     return tension, robot.muscle_lengths(theta, tension)
 
 
-def felt(core, theta, tension, _length=None, times=100):
-    for _ in range(times):
+def felt(core, theta, tension):
+    for _ in range(100):
         touch = core.step(theta, tension, DT)
     return touch
 
@@ -50,13 +50,13 @@ def felt(core, theta, tension, _length=None, times=100):
 def test_a_force_of_the_hand_is_found_and_its_opposite_too(axis, size):
     force = size * np.eye(3)[axis]
     core = observer()
-    touch = felt(core, THETA, *pulling(THETA, force))
+    touch = felt(core, THETA, pulling(THETA, force)[0])
     np.testing.assert_allclose(touch.force, force, atol=1.0)
     assert touch.contact
 
 
 def test_an_arm_that_nothing_touches_feels_nothing():
-    touch = felt(observer(), THETA, *pulling(THETA))
+    touch = felt(observer(), THETA, pulling(THETA)[0])
     np.testing.assert_allclose(touch.torque, 0.0, atol=0.02)
     np.testing.assert_allclose(touch.force, 0.0, atol=0.2)
     assert not touch.contact
@@ -65,7 +65,7 @@ def test_an_arm_that_nothing_touches_feels_nothing():
 def test_a_planar_arm_feels_nothing_across_its_plane(robot):
     theta = 0.5 * (robot.lower + robot.upper)
     core = observer(spread=np.full(2, 0.2), robot=robot)
-    touch = felt(core, theta, *pulling(theta, (5.0, 0.0, -5.0), robot))
+    touch = felt(core, theta, pulling(theta, (5.0, 0.0, -5.0), robot)[0])
     np.testing.assert_allclose(touch.force, [5.0, 0.0, -5.0], atol=0.5)
 
 
@@ -101,29 +101,29 @@ def test_inertia_is_no_force():
 
 
 def test_a_joint_at_its_stop_says_nothing_of_what_the_stop_bears():
-    tension, length = pulling(THETA)
+    tension, _ = pulling(THETA)
     torques = []
     for joint in range(5):
         for stop, away in ((ARM.upper, -1.0), (ARM.lower, 1.0)):
             theta = THETA.copy()
             theta[joint] = stop[joint]
-            torques.append(away * felt(observer(), theta, tension, length).torque[joint])
+            torques.append(away * felt(observer(), theta, tension).torque[joint])
     assert max(torques) == 0.0 and min(torques) < -0.1
 
 
 def test_without_statistics_there_is_a_force_but_no_contact():
     core = observer(time=0.0)
-    touch = felt(core, THETA, *pulling(THETA, (20.0, 0.0, 0.0)))
+    touch = felt(core, THETA, pulling(THETA, (20.0, 0.0, 0.0))[0])
     assert np.linalg.norm(touch.force) > 10.0 and np.isnan(touch.distance) and not touch.contact
 
 
 @pytest.mark.filterwarnings('ignore:invalid value')
 def test_a_message_that_is_no_number_is_forgotten():
-    core, (tension, length) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
+    core, (tension, _) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
     touch = core.step(np.full(5, np.nan), tension, DT)
     np.testing.assert_array_equal(touch.force, 0.0)
     assert not touch.contact
-    np.testing.assert_allclose(felt(core, THETA, tension, length).force, [20.0, 0.0, 0.0], atol=1.0)
+    np.testing.assert_allclose(felt(core, THETA, tension).force, [20.0, 0.0, 0.0], atol=1.0)
 
 
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])

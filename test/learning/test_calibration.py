@@ -15,7 +15,6 @@ from musculoskeletal_ae.learning.calibration import (
     Healthy,
     Reservoir,
     calibrate,
-    distances,
 )
 from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae.residuals import residuals
@@ -69,7 +68,7 @@ def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(lea
     mae = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
 
     def distance(tension, length):
-        return distances(mae.anomaly, residuals(mae.estimate(tension, length), tension, length))
+        return mae.anomaly.distances(residuals(mae.estimate(tension, length), tension, length))
 
     _, tension, length = stage.states(2000)
     threshold = mae.anomaly.thresholds[DISTANCE]
