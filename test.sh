@@ -16,8 +16,16 @@ say 'ruff check'
 "$python" -m ruff check . || exit 1
 say 'ruff format --check'
 "$python" -m ruff format --check . || exit 1
+# What numba compiles, here and where it is installed: beside mypy, instead of in the middle of tests.
+compiled='from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.robot.robot import Robot
+for reality in ("kin", "foreign"): make_arm(Robot.load("arm26"), 0, reality).step(0.001)'
+"$python" -c "$compiled" &
+(cd / && exec "$python" -c "$compiled") &
+
 say 'mypy'
 "$python" -m mypy || exit 1
+wait
 
 # A graph of our own: not the network's, and not that of another run on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST

@@ -263,7 +263,7 @@ assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; t
   touch "$venv/.installing"
   export PIP_USER=0 PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
   if ! step "$title (minutes, the first time)" \
-    "$python" -m pip install --progress-bar off "${arguments[@]}" "${torch[@]}"; then
+    "$python" -m pip install --no-compile --progress-bar off "${arguments[@]}" "${torch[@]}"; then
     rm -f "$venv/.installing"
     fail "The packages could not be installed (log: $setup_log). Is the network there?" \
       "Run the same command again to go on."

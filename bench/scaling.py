@@ -104,7 +104,8 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     part = exploring.part(np.linspace(0, len(exploring.theta) - 1, CAPACITY, dtype=int))
     none = np.zeros_like(part.tension)
     seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
-    messages = np.concatenate([exploring.tension, exploring.length], axis=1)[::10]
+    columns = exploring.tension, exploring.length, np.zeros_like(exploring.length)
+    messages = np.concatenate(columns, axis=1)[::10]
     updater = make_updater(robot, mae, DEFAULT)
     job = Job(seen, Healthy(messages.astype(np.float32), 600.0, 100), True, STEPS)
     updater.update(job)

@@ -49,7 +49,8 @@ MJCF = """<mujoco model="own">
     <fixed name="none"><joint joint="elbow" coef="1"/></fixed>
   </tendon>
   <actuator>
-    <muscle name="m1" tendon="front" force="90" gear="2"/><muscle name="m2" tendon="back" force="150"/>
+    <muscle name="m1" tendon="front" force="90" gear="2"/>
+    <muscle name="m2" tendon="back" force="150"/>
     <muscle name="m3" tendon="out" force="150"/><muscle name="m4" tendon="in" force="150"/>
     <muscle name="m5" tendon="bend" force="200"/><muscle name="m6" tendon="stretch" force="200"/>
     <muscle name="m7" tendon="curler" force="50"/><motor name="not" joint="elbow"/>

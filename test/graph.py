@@ -17,11 +17,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from musculoskeletal_ae.nodes.running import LeanExecutor
 from musculoskeletal_ae.report import Report
 
 DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
@@ -63,6 +63,22 @@ class Process:
         return self.process.returncode, output
 
 
+class Executor(LeanExecutor):
+    """The nodes' own executor, a look at a time."""
+
+    _patience = 50_000_000  # [ns] until a condition is looked at again
+
+    def look(self) -> None:
+        """Handle what there is, or wait a moment for something."""
+        if not self._spin_messages():
+            self._spin_rest()
+
+    def close(self) -> None:
+        """Let go of everything, before nodes are destroyed."""
+        self.shutdown()
+        self._held.close()
+
+
 class Graph:
     """A node of the test, what it received, and the processes it started."""
 
@@ -71,7 +87,7 @@ class Graph:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node('test', context=self.context, namespace=namespace)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = Executor(context=self.context)
         self.executor.add_node(self.node)
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
@@ -123,8 +139,7 @@ class Graph:
         """Handle messages for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            # At a timeout of its own each, rclpy would handle only the first entity that is ready.
-            self.executor.spin_once(timeout_sec=0.05)
+            self.executor.look()
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Handle messages until a condition holds; fail with what was waited for."""
@@ -136,7 +151,7 @@ class Graph:
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
                 raise AssertionError(f'waited {deadline:g} s in vain for {what}; {self._told()}')
-            self.executor.spin_once(timeout_sec=0.05)
+            self.executor.look()
         return value
 
     def next(self, topic: str, count: int = 1) -> Any:
@@ -185,6 +200,7 @@ class Graph:
         """Leave the graph and end what was started."""
         for process in self.processes:
             process.end()
+        self.executor.close()
         for node in (*self.hosted, self.node):
             node.destroy_node()
         rclpy.shutdown(context=self.context)

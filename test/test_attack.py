@@ -10,9 +10,7 @@ import pytest
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from bench import attack
-from bench.attack_files import KINDS, Reader
 from bench.attack_graph import digest, filled
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 RATE = 0.1  # [m/s]
 TIME = np.arange(50) * 0.01
@@ -54,24 +52,6 @@ def test_what_is_hostile_can_be_sent_and_told_from_what_is_not():
         messages = [filled(kind(), rng) for _ in range(50)]
         assert len({digest(message) for message in messages}) > 10
     assert digest(Float64MultiArray(data=[1.0])) == digest(Float64MultiArray(data=[1.0]))
-
-
-@pytest.fixture(scope='module')
-def reader(tmp_path_factory):
-    return Reader(tmp_path_factory.mktemp('hostile'))
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_hostile_files_are_read_or_refused(kind, reader):
-    outcomes = set()
-    for i in range(12):
-        read = reader.attempt(kind, random.Random(i))
-        try:
-            read()
-            outcomes.add('used')
-        except MusculoskeletalError:
-            outcomes.add('refused')
-    assert outcomes
 
 
 @pytest.mark.slow

@@ -246,7 +246,9 @@ def test_a_pose_may_say_its_position_only_and_frames_must_be_right():
         read_pose(message, 'hand', position_only=True)
     turn = message.pose.orientation
     turn.z = turn.w = 1.005 * math.sqrt(0.5)  # nearly a unit
-    np.testing.assert_allclose(read_pose(message, 'base').rotation @ [1, 0, 0], [0, 1, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        read_pose(message, 'base').rotation @ [1, 0, 0], [0, 1, 0], atol=1e-9
+    )
 
 
 def test_a_twist_is_in_the_root_link_finite_and_not_absurd():

@@ -53,7 +53,8 @@ class Individual:
         muscles = robot.muscle_count
         kin = robot.kinematics
         self._kinematics = kin
-        placements = kin.placement_rotation, kin.placement_translation
+        # In one order of memory: code is compiled for each.
+        placements = np.ascontiguousarray(kin.placement_rotation), kin.placement_translation
         self.tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
         nominal = robot.routes
         point = nominal.point + rng.normal(0.0, spread.attachment, nominal.point.shape)
@@ -76,7 +77,7 @@ class Individual:
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
-        q = self._kinematics.tree_angles(theta)
+        q = np.ascontiguousarray(self._kinematics.tree_angles(theta))
         return wrapped_lengths(self.tree, self.routes, len(self.cable_friction), q)
 
     def absolute_lengths(self, theta: Array) -> Array:

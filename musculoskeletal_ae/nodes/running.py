@@ -82,6 +82,7 @@ class LeanExecutor(SingleThreadedExecutor):
     _urgent: tuple[tuple[list[Any], Any, str, Any], ...] = ()
     _actions: tuple[Any, ...] = ()
     _rest_at = 0.0
+    _patience = EVENTS_EVERY * S_TO_NS  # [ns]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -110,7 +111,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 add(entity.handle)
         for action in self._actions:
             action.add_to_wait_set(waiting)
-        waiting.wait(EVENTS_EVERY * S_TO_NS)
+        waiting.wait(self._patience)
         if not self.context.ok():
             raise ExternalShutdownException
         for entities, _, kind, take in self._urgent:

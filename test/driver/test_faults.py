@@ -220,21 +220,22 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
 
 
 @pytest.mark.parametrize(
-    ('fault', 'checks'),
+    ('fault', 'checks', 'told'),
     [
-        ('drop:0.4', {'rate'}),
-        ('delay:0.2', {'latency'}),
-        ('duplicate:0.5', {'rate'}),
-        ('freeze:biceps_long', {'rate', 'law'}),
-        ('dead_sensor:biceps_long', {'rate', 'law'}),
-        ('bias:biceps_long:0.1', {'zero'}),
-        ('bias:tension:biceps_long:40', {'law'}),
-        ('stuck_motor:biceps_long', {'law'}),
+        ('drop:0.4', {'rate'}, 'rate of all muscles'),
+        ('delay:0.2', {'latency'}, 'latency of biceps_long'),
+        ('duplicate:0.5', {'rate'}, 'rate'),
+        ('freeze:biceps_long', {'rate', 'law'}, 'the same reading in every message'),
+        ('dead_sensor:biceps_long', {'rate', 'law'}, 'biceps_long'),
+        ('bias:biceps_long:0.1', {'zero'}, 'zero of biceps_long'),
+        ('bias:tension:biceps_long:40', {'law'}, 'biceps_long'),
+        ('stuck_motor:biceps_long', {'law'}, 'does not respond'),
     ],
 )
-def test_faults_of_the_emulated_arm_are_found(fault, checks):
+def test_faults_of_the_emulated_arm_are_found(fault, checks, told):
     driver = Driver(ROBOT)
     driver.listen(2.0)
     driver.arm.faults.set([fault])
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
+    assert told in str(verdict)

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
@@ -35,6 +33,6 @@ def arm26() -> Robot:
 
 
 @pytest.fixture(scope='session')
-def networks(arm26) -> dict[str, Mae]:
+def networks(trained) -> dict[str, Mae]:
     """Networks of the geometric model by preset, trained for a moment."""
-    return {preset: initial_mae(arm26, preset, steps=600).mae for preset in PRESETS}
+    return trained

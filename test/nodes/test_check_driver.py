@@ -49,14 +49,7 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
 @pytest.mark.parametrize(
     ('fault', 'options', 'told'),
     [
-        ('drop:0.5', [], 'fault: rate of all muscles'),
-        ('freeze:biceps_long', [], 'the same reading in every message'),
         ('bias:biceps_long:0.1', [], 'fault: zero of biceps_long'),
-        (
-            'delay:0.2',
-            ['--wait', '--move', '--muscles', 'biceps_long'],
-            'fault: latency of biceps_long',
-        ),
         (
             'stuck_motor:biceps_long',
             ['--wait', '--move', '--muscles', 'biceps_long'],

@@ -19,6 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.state import FILE
+from musculoskeletal_ae.learning.training import Training
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
@@ -94,7 +95,7 @@ class HostedLearner:
         taken, deadline = self.taken, time.monotonic() + 1.0
         self.arm.publish()
         while self.taken == taken and time.monotonic() < deadline:
-            self.graph.executor.spin_once(timeout_sec=0.1)
+            self.graph.executor.look()
 
     def run(self, seconds):
         """Let time pass."""
@@ -115,10 +116,16 @@ def state(tmp_path):
 
 
 @pytest.fixture
-def host(graph, arm26, trained_file):
-    return lambda **parameters: HostedLearner(
-        graph, arm26, **{'checkpoint': trained_file, 'state_directory': '', **parameters}
-    )
+def host(graph, arm26, trained_file, monkeypatch):
+    """Return what makes a learner that trains here, or in a process of its own."""
+
+    def make(process=False, **parameters):
+        if not process:
+            monkeypatch.setattr('musculoskeletal_ae.nodes.learner.TrainingProcess', Training)
+        given = {'checkpoint': trained_file, 'state_directory': '', **parameters}
+        return HostedLearner(graph, arm26, **given)
+
+    return make
 
 
 def versions(graph, robot):
@@ -129,7 +136,7 @@ def versions(graph, robot):
 
 
 def test_it_learns_and_publishes_whole_checkpoints_that_count_up(host, graph, arm26, state):
-    learner = host(state_directory=state)
+    learner = host(process=True, state_directory=state)
     learner.learn(lambda: len(graph.received['mae_checkpoint']) >= 4, 'three updates')
     assert learner.samples >= 3
     assert versions(graph, arm26) == sorted(set(versions(graph, arm26)))
@@ -197,17 +204,8 @@ def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, graph, sta
     fresh.learn(lambda: fresh.updates >= 1, 'learning anew')
 
 
-def test_a_state_directory_that_is_deleted_is_an_error_that_heals(host, state):
-    learner = host(state_directory=state)
-    learner.learn(lambda: learner.samples >= 2, 'samples')
-    shutil.rmtree(state)
-    learner.learn(lambda: learner.report().level == 'error', 'the error')
-    learner.learn(lambda: learner.report().level == 'ok', 'a new directory')
-    assert (Path(state) / FILE).exists()
-
-
 def test_a_training_process_that_dies_is_noticed_and_replaced(host):
-    learner = host()
+    learner = host(process=True)
     learner.learn(lambda: learner.updates >= 1, 'an update')
     first = learner.report().values['training process']
     os.kill(int(first), signal.SIGKILL)
