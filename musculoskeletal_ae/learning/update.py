@@ -92,10 +92,10 @@ class Updater(ABC):
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
             rng, tension = np.random.default_rng(self._seed), job.seen.end_tension(mae.friction)
-            covariance = estimate_covariance(mae, self.body, fit, tension, rng)
             judging = job.healthy.judging
-            if judging is not None and len(judging) >= MANY:
-                covariance = holding(covariance, _estimate(mae, judging) - judging.theta)
+            if judging is not None and len(judging) < MANY:
+                judging = None
+            covariance = estimate_covariance(mae, self.body, fit, tension, rng, judging)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
@@ -344,17 +344,43 @@ INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says h
 
 
 def estimate_covariance(
-    mae: Mae, body: CorrectedBody, fit: Fit, tension: Array, rng: np.random.Generator
+    mae: Mae,
+    body: CorrectedBody,
+    fit: Fit,
+    tension: Array,
+    rng: np.random.Generator,
+    judging: Observations | None = None,
 ) -> Array:
     """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
 
+    It is that of drawn errors, with postures anywhere and tensions [N] (N, M) of the samples. How
+    far drawn errors are too large or too small is told by messages that judge, if there are any:
+    by their own errors beside those drawn in their postures, most of which are near the samples.
+    """
+    theta = body.robot.random_postures(BODIES * EACH, rng)
+    covariance = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
+    if judging is None:
+        return covariance
+    theta = judging.theta[rng.integers(len(judging), size=BODIES * EACH)]
+    here = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
+    return covariance * _excess(here, _estimate(mae, judging) - judging.theta)
+
+
+def _drawn_errors(
+    mae: Mae,
+    body: CorrectedBody,
+    fit: Fit,
+    theta: Array,
+    tension: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Return θ_est − θ [rad] (BODIES · EACH, D) at as many postures.
+
     What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
-    taken as linear in it), and what the network says of such bodies' lengths, at postures and
-    tensions [N] (N, M) of the samples, is compared with where they are. Errors have heavier tails
-    than a normal distribution (`holding`).
+    taken as linear in it), and what the network says of such bodies' lengths is compared with where
+    they are.
     """
     bodies = np.repeat(np.arange(BODIES), EACH)
-    theta = fit.theta[rng.integers(len(fit.theta), size=len(bodies))]
     tension = tension[rng.integers(len(tension), size=len(bodies))]
     direction = UNSURE * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
     poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
@@ -364,18 +390,26 @@ def estimate_covariance(
         for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
             seen, slope = body.linearised(poses, theta, tension[:, m], direction[:, m], m)
             length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
-    error = mae.estimate(tension, length).theta - theta
+    error: Array = mae.estimate(tension, length).theta - theta
+    return error
+
+
+def _spread(error: Array) -> Array:
+    """Return a covariance whose ellipsoid of 95 % holds as many errors, (N, D).
+
+    They have heavier tails than a normal distribution.
+    """
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
-    return holding(0.5 * (covariance + covariance.T), error)
+    covariance = 0.5 * (covariance + covariance.T)
+    return covariance * _excess(covariance, error)
 
 
-def holding(covariance: Array, error: Array) -> Array:
-    """Return a covariance scaled so that its ellipsoid of 95 % holds as many errors, (N, D)."""
+def _excess(covariance: Array, error: Array) -> float:
+    """Return by what to multiply a covariance for its ellipsoid to hold INSIDE of (N, D) errors."""
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
     # χ² of as many degrees as joints; scipy.stats has the same, and takes 0.7 s to import.
     bound = 2.0 * gammaincinv(0.5 * error.shape[1], INSIDE)
-    scaled: Array = covariance * np.quantile(distance, INSIDE) / bound
-    return scaled
+    return float(np.quantile(distance, INSIDE) / bound)
 
 
 def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
