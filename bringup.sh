@@ -121,6 +121,11 @@ fi
 if [ $combined = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
   refuse '--combined is estimator and controller in one process: not with --no-controller or --bag'
 fi
+[ -n "$view" ] || [ "$port ${#read_only[@]}" = '8080 0' ] ||
+  refuse '--port and --read-only are of the page: they go with --view'
+if [ "$reality" != kin ] && { [ $hardware = true ] || [ -n "$bag" ]; }; then
+  refuse '--reality is of the emulator: not with --hardware or --bag'
+fi
 [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
 if [ -n "$record" ]; then
   [ ! -e "$record" ] || refuse "--record '$record' is there already; name a new directory"

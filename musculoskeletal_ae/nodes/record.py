@@ -108,6 +108,8 @@ def parse(arguments: list[str]) -> Namespace:
     options = parser.parse_args(arguments)
     if options.directory and options.out:
         parser.error('DIR is given twice')
+    if options.recover and (options.topics or options.duration):
+        parser.error('--recover mends the whole recording: without --topics and --duration')
     options.out = options.out or options.directory
     options.topics = options.topics or list(TOPICS)
     return options

@@ -259,6 +259,8 @@ def parse(arguments: list[str]) -> Namespace:
         )
     if options.robot and not options.check:
         parser.error('--robot is for --check')
+    if options.as_trajectory and (options.loop or options.clock or options.paused):
+        parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
     return options
 
 

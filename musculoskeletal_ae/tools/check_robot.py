@@ -9,6 +9,8 @@ from pathlib import Path
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.start import load
 
+REACH = 0.02  # [m]
+
 
 def main(argv: list[str] | None = None) -> int:
     """Check one robot; exit status 0 if it is sound, 1 if it is not or cannot be read."""
@@ -26,11 +28,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--suggest', action='store_true', help=text)
     text = 'new directory for the arm that --suggest finds, and a picture of before and after'
     parser.add_argument('--out', type=Path, metavar='DIR', help=text)
-    text = 'how far --suggest may move a via point [m]'
-    parser.add_argument('--reach', type=number(1e-3, 1.0), default=0.02, help=text)
+    text = f'how far --suggest may move a via point [m] (default: {REACH:g})'
+    parser.add_argument('--reach', type=number(1e-3, 1.0), help=text)
     args = parser.parse_args(argv)
     if args.suggest != bool(args.out) or (args.out and args.out.exists()):
         parser.error('--suggest and --out DIR, a new directory, go together')
+    if args.reach and not args.suggest:
+        parser.error('--reach goes with --suggest')
+    args.reach = args.reach or REACH
     return exit_status(lambda: load('musculoskeletal_ae.tools.robot_report').check(args))
 
 

@@ -33,4 +33,6 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint):
         parser.error('--hold-out and --checkpoint go with --from-bag')
+    if args.from_bag and args.plot:
+        parser.error('--plot shows the initial training: not with --from-bag')
     return exit_status(lambda: load('musculoskeletal_ae.tools.initial_training').train(args))
