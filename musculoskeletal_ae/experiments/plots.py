@@ -48,6 +48,7 @@ def tidy(axes: Any, xlabel: str = '', ylabel: str = '', title: str = '', legend:
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.set_title(title, loc='left' if legend == 'above' else 'center')
     axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)
     axes.spines[['top', 'right']].set_visible(False)
     if legend:
         axes.legend(fontsize=9, **LEGENDS[legend])

@@ -207,7 +207,7 @@ def robustness(_: Study, rows: Rows) -> Plot:
         bars = panel.bar(at, values, 0.36, color=colour, label=f'reality: {reality}')
         labels = ['none' if np.isnan(value) else f'{value:.3f}' for value in values]
         panel.bar_label(bars, labels, fontsize=8)
-    panel.set_xticks(range(len(ESTIMATES)), ESTIMATES.values(), rotation=15)
+    panel.set_xticks(range(len(ESTIMATES)), ESTIMATES.values(), rotation=15, ha='right')
     plots.tidy(panel, '', 'mean error, held-out motion [rad]', legend='above')
     return figure, 'Errors on the motion never used for learning, means over individuals.'
 
