@@ -121,8 +121,9 @@ fi
 if [ $combined = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
   refuse '--combined is estimator and controller in one process: not with --no-controller or --bag'
 fi
-[ -n "$view" ] || [ "$port ${#read_only[@]}" = '8080 0' ] ||
+if [ -z "$view" ] && { [ "$port" != 8080 ] || [ ${#read_only[@]} -gt 0 ]; }; then
   refuse '--port and --read-only are of the page: they go with --view'
+fi
 if [ "$reality" != kin ] && { [ $hardware = true ] || [ -n "$bag" ]; }; then
   refuse '--reality is of the emulator: not with --hardware or --bag'
 fi
@@ -259,8 +260,8 @@ train_once() {
     {
       (cd "$robot_directory" && sha256sum robot.urdf muscles.yaml) # what a network is made from
       cd "$repository/musculoskeletal_ae" &&
-        find robot mae presets.* tools/initial_training.py -name '*.py' -print0 -o -name '*.yaml' -print0 | LC_ALL=C sort -z |
-        xargs -0 sha256sum
+        find robot mae presets.* tools/initial_training.py \( -name '*.py' -o -name '*.yaml' \) \
+          -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
     } | sha256sum | cut -c 1-16
   )
   checkpoint=$cache/$(basename "$robot_directory")-$preset-$hash.safetensors

@@ -73,11 +73,6 @@ class Executor(LeanExecutor):
         if not self._spin_messages():
             self._spin_rest()
 
-    def close(self) -> None:
-        """Let go of everything, before nodes are destroyed."""
-        self.shutdown()
-        self._held.close()
-
 
 class Graph:
     """A node of the test, what it received, and the processes it started."""
@@ -200,7 +195,7 @@ class Graph:
         """Leave the graph and end what was started."""
         for process in self.processes:
             process.end()
-        self.executor.close()
+        self.executor.shutdown()  # before nodes are destroyed
         for node in (*self.hosted, self.node):
             node.destroy_node()
         rclpy.shutdown(context=self.context)

@@ -7,7 +7,7 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,42 +66,49 @@ class Streams(NamedTuple):
         return Pairs(time[muscle], self.joints.values[theta], values[muscle, 0], values[muscle, 1])
 
 
+@dataclass
+class _Stream:
+    """A topic that is being read, and the shape of its values."""
+
+    shape: tuple[int, ...]
+    read: Callable[[Any], Array]
+    times: list[float] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
+
+    def take(self, message: tuple[float, Any]) -> None:
+        """Take the time and the content of a message."""
+        self.values.append(self.read(message[1]))
+        self.times.append(message[0])
+
+
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
     A BagError says that no message of a topic fits the robot, or that the bag is damaged.
     """
     muscles = robot.muscle_count
-    kinds: dict[str, tuple[tuple[int, ...], Callable[[Any], Array]]] = {
-        'joint_states': ((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
-        'muscle_states': ((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
-        'muscle_length_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
-        'muscle_tension_command': ((muscles,), lambda m: read_array(m, 1, muscles)),
+    streams = {
+        'joint_states': _Stream((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
+        'muscle_states': _Stream((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
+        'muscle_length_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
+        'muscle_tension_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
     }
-    came = {name: (list[float](), list[Array]()) for name in kinds}
-
-    def take(name: str, message: tuple[float, Any]) -> None:
-        came[name][1].append(kinds[name][1](message[1]))
-        came[name][0].append(message[0])
-
     recorded = interface_topics(bag, namespace)
-    topics = {recorded[name]: name for name in kinds if name in recorded}
+    topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
     start, told = bag.start, list[str]()
     reception = Reception(told.append)
-    receive = {
-        topic: reception.of(topic, partial(take, name), lambda: 1) for topic, name in topics.items()
-    }
+    receive = {name: reception.of(name, topic.take, lambda: 1) for name, topic in topics.items()}
     for message in bag.messages(topics):
         content = (message.log_time - start) / 1e9, bag.decode(message)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         receive[message.topic](content, sent)
-    for topic, name in topics.items():
+    for topic, stream in topics.items():
         why = [each.partition(f' {topic}: ')[2] for each in told if f' {topic}: ' in each]
-        if why and not came[name][0]:
+        if why and not stream.values:
             problem = f'no message of {topic} fits the robot ({why[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
     joints, states, lengths, tensions = (
-        Series(np.array(times), np.array(values).reshape(-1, *kinds[name][0]))
-        for name, (times, values) in came.items()
+        Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
+        for stream in streams.values()
     )
     return Streams(joints, states, lengths, tensions, reception.rejected)

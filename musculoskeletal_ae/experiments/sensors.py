@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.stats import chi2
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
@@ -31,12 +30,12 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.update import ellipsoids
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
 CAMERA = 10  # messages to one picture, or to one of the accelerometer
 SIGHTED = 10  # samples to one that the marker is seen in
-INSIDE = 0.95
 
 #: told learner, number of a message, true θ (D,) and what sensors read; returns θ (D,) or None
 See = Callable[[Learner, int, Array, Array], Array | None]
@@ -92,8 +91,7 @@ def ellipsoid_share(mae: Mae, recording: Recording) -> float:
     assert mae.covariance is not None  # asked by the caller
     tension = end_tensions(mae, recording)
     error = mae.estimate(tension, recording.length).theta - recording.theta
-    distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
-    return float((distance <= chi2.ppf(INSIDE, error.shape[1])).mean())
+    return float((ellipsoids(mae.covariance, error) <= 1.0).mean())
 
 
 BARS = {

@@ -93,8 +93,6 @@ class Updater(ABC):
         if fit is not None and self.body is not None:
             rng, tension = np.random.default_rng(self._seed), job.seen.end_tension(mae.friction)
             judging = job.healthy.judging
-            if judging is not None and len(judging) < MANY:
-                judging = None
             covariance = estimate_covariance(mae, self.body, fit, tension, rng, judging)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
@@ -349,17 +347,17 @@ def estimate_covariance(
     fit: Fit,
     tension: Array,
     rng: np.random.Generator,
-    judging: Observations | None = None,
+    judging: Observations | None,
 ) -> Array:
     """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
 
     It is that of drawn errors, with postures anywhere and tensions [N] (N, M) of the samples. How
-    far drawn errors are too large or too small is told by messages that judge, if there are any:
+    far drawn errors are too large or too small is told by messages that judge, if there are MANY:
     by their own errors beside those drawn in their postures, most of which are near the samples.
     """
     theta = body.robot.random_postures(BODIES * EACH, rng)
     covariance = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
-    if judging is None:
+    if judging is None or len(judging) < MANY:
         return covariance
     theta = judging.theta[rng.integers(len(judging), size=BODIES * EACH)]
     here = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
@@ -406,10 +404,18 @@ def _spread(error: Array) -> Array:
 
 def _excess(covariance: Array, error: Array) -> float:
     """Return by what to multiply a covariance for its ellipsoid to hold INSIDE of (N, D) errors."""
-    distance = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
+    return float(np.quantile(ellipsoids(covariance, error), INSIDE))
+
+
+def ellipsoids(covariance: Array, error: Array) -> Array:
+    """Return by what to multiply a covariance for each of (N, D) errors to lie on its ellipsoid.
+
+    The ellipsoid is that of the share INSIDE of a normal distribution; (N,).
+    """
+    squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
     # χ² of as many degrees as joints; scipy.stats has the same, and takes 0.7 s to import.
-    bound = 2.0 * gammaincinv(0.5 * error.shape[1], INSIDE)
-    return float(np.quantile(distance, INSIDE) / bound)
+    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], INSIDE))
+    return bounded
 
 
 def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

@@ -51,10 +51,14 @@ class Replay(Node):
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
-        latched, qos = latched_topics(bag), (QoSProfile(depth=DEPTH), LATCHED)
+        latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher = {
-            at: self.create_publisher(message_class(bag.topics[at].type), name, qos[at in latched])
-            for at, name in names.items()
+            recorded: self.create_publisher(
+                message_class(bag.topics[recorded].type),
+                name,
+                LATCHED if recorded in latched else reliable,
+            )
+            for recorded, name in names.items()
         }
         self._recorded_time = None
         if options.clock:

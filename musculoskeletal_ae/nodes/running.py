@@ -98,6 +98,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Let go of the node's entities, and of this executor's own."""
         self._wait_set, self._urgent, self._actions = None, (), ()
+        self._held.close()
         return super().shutdown(timeout_sec)
 
     def _spin_messages(self) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One quick run of every experiment and two small networks, which all tests here look at."""
+"""One quick run of every experiment, which all tests here look at."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
@@ -30,9 +29,3 @@ def quick(alone) -> Path:
 @pytest.fixture(scope='session')
 def arm26() -> Robot:
     return Robot.load('arm26')
-
-
-@pytest.fixture(scope='session')
-def networks(trained) -> dict[str, Mae]:
-    """Networks of the geometric model by preset, trained for a moment."""
-    return trained

@@ -10,8 +10,8 @@ from bench.control_nominal import nominal_arm, nominal_tables
 from musculoskeletal_ae.experiments.control import METHODS, protocol
 
 
-def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm26, networks):
-    ended = protocol(nominal_arm(arm26), networks, seed=0, count=1)
+def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm26, trained):
+    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
     error = {name: np.linalg.norm(offset) for name, offset in ended.offset.items()}
     assert set(error) == set(METHODS)
     assert error['proposed'] < 0.1
@@ -19,13 +19,13 @@ def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm
     assert ended.tension['proposed'].mean() == pytest.approx(ended.bound.mean(), rel=0.15)
 
 
-def test_a_posture_at_the_target_needs_the_bound(arm26, networks):
+def test_a_posture_at_the_target_needs_the_bound(arm26, trained):
     """Where an arm came close to θ_eval, holding it there takes what holding θ_eval takes."""
-    ended = protocol(nominal_arm(arm26), networks, seed=0, count=1)
+    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 
-def test_the_table_of_the_nominal_body_names_every_method(arm26, networks):
-    table = nominal_tables(arm26, networks['default'], networks['paper'], quick=True)
+def test_the_table_of_the_nominal_body_names_every_method(arm26, trained):
+    table = nominal_tables(arm26, trained['default'], trained['paper'], quick=True)
     for word in ('bound', 'proposed, paper', 'second', 'stiffness', 'torque'):
         assert word in table

@@ -76,11 +76,11 @@ def test_a_muscle_that_is_switched_off_keeps_its_wire_and_is_commanded_no_tensio
     assert off.sum(axis=1).max() == 1
 
 
-def test_on_the_arm_a_switched_off_muscle_goes_slack_and_the_others_hold(arm26, networks):
+def test_on_the_arm_a_switched_off_muscle_goes_slack_and_the_others_hold(arm26, trained):
     def script(_, time):
         return np.arange(6) == 1 if time >= 6.0 else None
 
-    taken = record(EmulatedArm(arm26, 3), networks['default'], 7, 7.0, script)
+    taken = record(EmulatedArm(arm26, 3), trained['default'], 7, 7.0, script)
     before, after = taken.tension[590:600], taken.tension[690:700]
     assert after[:, 1].max() < 0.1 * arm26.tension.bias[1] < before[:, 1].min()
     others = np.arange(6) != 1
@@ -94,7 +94,7 @@ def test_the_weight_is_grasped_and_released_every_minute(arm26):
     assert arm.done == [(0.0, 0.0), (60.0, PAYLOAD), (120.0, 0.0), (180.0, PAYLOAD)]
 
 
-def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, networks):
+def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, trained):
     plan = GraspAndCut(arm26, 4.0, seed=0)
     count, muscles = round(plan.duration / 0.01), arm26.muscle_count
     plan.cut, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
@@ -105,7 +105,7 @@ def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, networks)
     alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
     seen = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
     well = Watched(*(np.zeros(5, dtype=bool) for _ in range(5)))
-    numbers = detection(arm26, plan, seen, well, networks['default'])
+    numbers = detection(arm26, plan, seen, well, trained['default'])
     cuts = list(numbers['cuts'].values())
     assert [cut['detected'] for cut in cuts[:3]] == [True, True, False]
     assert [cut['named'] for cut in cuts[:3]] == [True, False, False]

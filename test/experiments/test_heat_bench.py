@@ -9,11 +9,11 @@ from musculoskeletal_ae.mae import checkpoint
 
 
 def test_the_windings_of_an_emulated_arm_are_known_within_a_few_degrees(
-    arm26, networks, tmp_path, monkeypatch
+    arm26, trained, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(heat, 'HELD', 8.0)
     study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
-    checkpoint.save(networks['default'], study.network_file('default', 0))
+    checkpoint.save(trained['default'], study.network_file('default', 0))
     numbers, traces = heat.measure(study, 0)
     assert numbers['core_error_k'] <= numbers['core_error_worst_k'] < 5.0
     assert numbers['heat_alarms'] == 0

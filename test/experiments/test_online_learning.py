@@ -28,12 +28,12 @@ from musculoskeletal_ae.presets import PRESETS
 
 
 @pytest.fixture(scope='module')
-def twice(tmp_path_factory, arm26, networks):
+def twice(tmp_path_factory, arm26, trained):
     """The same individual measured twice, in different folders."""
     measured = []
     for _ in range(2):
         study = Study(arm26, 'default', (0,), 0.25, True, tmp_path_factory.mktemp('study'))
-        for preset, mae in networks.items():
+        for preset, mae in trained.items():
             checkpoint.save(mae, study.network_file(preset, None))
         measured.append((study, measure(study, 0)))
     return measured

@@ -22,8 +22,8 @@ from musculoskeletal_ae.mae.residuals import TouchStatistics
 
 
 @pytest.fixture(scope='module')
-def mae(networks):
-    return networks['default']
+def mae(trained):
+    return trained['default']
 
 
 @pytest.fixture(scope='module')
