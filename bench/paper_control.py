@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readings of the paper's `proposed`, beside `geometric`, `first` and `second`, after learning.
 
-python -m bench paper_control [--robot …] [--seeds 0,1,2,3,4] [--minutes 10] [--quick]
+python -m bench paper_control [--robot …] [--reality kin] [--seeds 0,1,2,3,4] [--quick]
 
 The paper found `proposed` as exact as `second` with less tension than `first` and `second`. Its
 print leaves open in what unit τ is weighted (w₃ = 0.01), whether l sent is decoded after the
@@ -188,6 +188,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser('paper_control', 'Readings of the paper’s `proposed`.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
+    parser.add_reality()
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('one target and start')
     args = parser.parse_args(argv)
@@ -195,7 +196,8 @@ def main(argv: list[str] | None = None) -> int:
     def measure() -> None:
         robot, rows = Robot.load(args.robot), []
         with TemporaryDirectory() as folder:
-            study = Study(robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder))
+            how = args.seeds, args.minutes, args.quick, Path(folder), args.reality
+            study = Study(robot, 'paper', *how)
             checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
             for seed in args.seeds:
                 rows.append(individual(study, seed))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 
 import numpy as np
@@ -81,9 +82,14 @@ class Loop:
         return refused
 
 
-@pytest.fixture
-def loop(trained):
+@pytest.fixture(scope='module')
+def settled(trained):
     return Loop(trained['default'])
+
+
+@pytest.fixture
+def loop(settled):
+    return copy.deepcopy(settled)
 
 
 #: what may stop the arm under a fault, '' for going on

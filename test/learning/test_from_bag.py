@@ -31,7 +31,7 @@ def test_what_is_learned_from_one_recording_improves_another(robot):
     exploration = part(read(BAGS / 'exploration', robot), 0.0, 40.0)
     other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the muscle is cut later
     mae = initial_mae(robot, steps=600).mae
-    learner = Learner(robot, mae)
+    learner = Learner(robot, mae, steps=50)
     told = []
     learn(learner, exploration, told.append)
     assert sum(told) == pytest.approx(exploration.time[-1] - exploration.time[0])

@@ -69,7 +69,7 @@ def test_messages_of_the_moving_arm_tell_what_the_body_cannot_say(arm26, initial
     def learned(**parts):
         updater = BodyUpdater(arm26, initial)
         for _ in range(4):
-            update = updater.update(job(store, steps=300, **parts))
+            update = updater.update(job(store, steps=150, **parts))
         return error(update.mae, seen.theta, seen.tension, seen.length)
 
     stage = Giving(other_body)
