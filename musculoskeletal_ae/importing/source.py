@@ -24,6 +24,7 @@ from musculoskeletal_ae.robot.kinematics import (
     Coupling,
     joint_axis,
     link_placement,
+    reduced,
 )
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -184,7 +185,7 @@ def cut(
             source.note('held fixed', f'joint {name} at {source.rest.get(name, 0.0):.4g}')
     locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
-    source.model = pin.buildReducedModel(model, locked, at_rest)
+    source.model = reduced(model, locked, at_rest)
     if unknown := [name for name in muscles if name not in source.routes]:
         legal = ', '.join(source.routes)
         raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal}')
