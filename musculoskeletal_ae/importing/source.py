@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -31,6 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # in which lengths are compared
 STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
+EARTH = 9.81  # [m/s²]
 UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
 
 #: absolute lengths [m] (N,) of muscles, for values (N,) of joints that are not at rest
@@ -138,6 +139,17 @@ def safe_name(text: str | None, fallback: str) -> str:
     return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback
 
 
+def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """Return names with underscores behind those that are given or taken before."""
+    result, seen = [], {*taken}
+    for name in names:
+        while name in seen:
+            name += '_'
+        seen.add(name)
+        result.append(name)
+    return result
+
+
 def cut(
     source: Source,
     joints: Sequence[str] = (),
@@ -200,6 +212,8 @@ def cut(
         del source.routes[name]
     if any(source.strength.values()):
         source.note('chosen', STRENGTH)
+    if count := sum(not source.strength.get(name) for name in source.routes):
+        source.note('chosen', f'tension of {count} muscles: the default, the source has none')
     if not wanted:
         raise SourceError('no joint is left that moves')
 
@@ -217,9 +231,11 @@ def urdf(source: Source) -> str:
     else:
         down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
+        if abs(size - EARTH) > 0.02:
+            source.note('chosen', f'gravity: {EARTH} m/s², the source has {size:.4g}')
     carriers = {0: root}  # link of each joint
     if not upright.isIdentity(1e-9):
-        carriers[0] = f'{root}_upright'
+        (carriers[0],) = distinct([f'{root}_upright'], source.links)
         source.note('chosen', f'link {carriers[0]}: the root, upright; {root} as it rests')
     for link in source.links:
         joint, at = source.place(link)
@@ -235,7 +251,8 @@ def urdf(source: Source) -> str:
         parts.append(f'  <joint name={quoteattr(name)} type="{kind}">{ends}{origin}{more}</joint>')
 
     for i, name in enumerate(model.names[1:], 1):
-        link, own = carriers.setdefault(i, f'{name}_link'), model.inertias[i]
+        (spare,) = distinct([f'{name}_link'], {*source.links, *carriers.values()})
+        link, own = carriers.setdefault(i, spare), model.inertias[i]
         pairs = combinations_with_replacement(range(3), 2)
         tensor = ' '.join(f'i{"xyz"[j]}{"xyz"[k]}="{own.inertia[j, k]:.12g}"' for j, k in pairs)
         mass = f'<origin xyz="{_text(own.lever)}"/><mass value="{_text(own.mass)}"/>'
@@ -246,10 +263,10 @@ def urdf(source: Source) -> str:
         more = f'<axis xyz="{_text(joint_axis(model.joints[i]))}"/><limit {limits}/>'
         kind = 'prismatic' if source.slides(name) else 'revolute'
         attach(name, kind, link, model.parents[i], model.jointPlacements[i], more)
-    for link in source.links:
-        if link not in carriers.values():
-            parts.append(f'  <link name={quoteattr(link)}/>')
-            attach(f'to_{link}', 'fixed', link, *source.place(link))
+    others = [link for link in source.links if link not in carriers.values()]
+    for link, name in zip(others, distinct([f'to_{link}' for link in others], model.names)):
+        parts.append(f'  <link name={quoteattr(link)}/>')
+        attach(name, 'fixed', link, *source.place(link))
     return '\n'.join([*parts, '</robot>', ''])
 
 
@@ -262,7 +279,7 @@ def write(source: Source, out: Path) -> None:
         muscles.append({'name': name, 'route': [written(item) for item in route]})
         if (force := source.strength.get(name, 0.0)) > 0.0:
             tension = {'bias': min(30.0, 0.1 * force), 'limit': force, 'max': 1.5 * force}
-            muscles[-1]['tension'] = {k: round(v, 3) for k, v in tension.items()}
+            muscles[-1]['tension'] = {k: float(f'{v:.6g}') for k, v in tension.items()}
     joints = [name for name in source.model.names[1:] if name not in source.couplings]
     document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
     if source.end_effector:

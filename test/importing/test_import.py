@@ -67,6 +67,48 @@ def test_what_the_format_cannot_express_is_told_and_measured(
     assert max(result.errors.values()) < 1e-6
 
 
+def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
+    text = mjcf.read_text()
+    for old, new in {
+        'front': 'a/b', 'back': 'a b', 'swing': 'to_base', 'lift': 'universe',
+        'finger': 'swing_link', 'upper': 'elbow',
+    }.items():  # fmt: skip
+        text = text.replace(f'"{old}"', f'"{new}"')
+    mjcf.write_text(text)
+    result = import_robot(mjcf, tmp_path / 'out')
+    assert result.robot.muscles == ('a_b', 'a_b_', 'out', 'in', 'bend', 'stretch', 'curler')
+    assert result.robot.joints == ('to_base', 'universe_', 'elbow')
+    assert max(result.errors.values()) < 1e-6
+
+
+COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        (
+            '<equality>',
+            f'<equality>{COUPLED}',
+            'equality equality_1: joint elbow is coupled already',
+        ),
+        (
+            '<worldbody>',
+            '<option gravity="0 0 -1.6"/><worldbody>',
+            'gravity: 9.81 m/s², the source',
+        ),
+        ('name="upper"', 'name="upper" gravcomp="1"', 'compensated weight: body upper'),
+        ('name="curl"', 'name="curl" stiffness="2" armature="1"', 'armature: joint curl'),
+        ('<site site="o3"/>', '<pulley divisor="2"/><site site="o3"/>', 'one is kept, undivided'),
+        ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
+        ('force="50"', 'force="0.004"', 'tension.limit is what the source says'),
+    ],
+)
+def test_what_differs_from_the_source_is_told(mjcf, tmp_path, old, new, told):
+    mjcf.write_text(mjcf.read_text().replace(old, new, 1))
+    assert any(told in note for note in import_robot(mjcf, tmp_path / 'out').notes)
+
+
 def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_path):
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.muscles == ('front', 'back')
