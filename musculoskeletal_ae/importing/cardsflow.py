@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
-from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
+from musculoskeletal_ae.importing.source import KINDS, Source, distinct, numbers, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
@@ -36,6 +36,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
         name = safe_name(muscle.get('name'), f'muscle_{len(source.routes)}')
+        (name,) = distinct([name], source.routes)
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
             if (link := part.get('name', '')) not in centres:

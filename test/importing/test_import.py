@@ -116,6 +116,8 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
     assert result.errors == pytest.approx({'front': 0.0}, abs=1e-9)  # it has no lengths of wraps
     assert any('muscle still: it moves no joint' in note for note in result.notes)
+    cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
+    assert import_robot(cardsflow, tmp_path / 'two').robot.muscles == ('front', 'front_')
 
 
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
@@ -163,6 +165,37 @@ def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
     assert result.robot.root_link == 'ground_upright'  # OpenSim's y axis is up
     pose = result.robot.kinematics.link_pose(np.zeros(2), 'humerus')
     assert pose.translation[2] > 0.9
+
+
+COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
+<coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
+</coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
+<dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
+LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<range>0 2</range>', '', 'joint flexion: limits ±3.142'),
+        ('<range>0 2</range>', '<prescribed>true</prescribed>', 'prescribed motion of'),
+        ('name="flexor">', 'name="f"><appliesForce>false</appliesForce>', 'f: it applies no force'),
+        ('<ForceSet><objects>', f'<ForceSet><objects>{LONE}', 'muscle lone: fewer than 2 points'),
+        ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
+        ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
+        ('name="extensor"', 'name="flexor"', 'locked coordinate bend'),
+    ],
+)
+def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
+    if not old:
+        old, new = (
+            '<ForceSet>',
+            f'<ConstraintSet><objects>{new}</objects></ConstraintSet><ForceSet>',
+        )
+    source = read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
+    assert any(told in note for note in source.notes)
+    assert 'flexion' in source.model.names
+    assert len(source.routes) == (2 if told == 'f: it applies no force' else 3)
 
 
 def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
