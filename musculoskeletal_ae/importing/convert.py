@@ -54,7 +54,7 @@ def read_source(file: Path) -> Source:
         told = str(e) if isinstance(e, ValueError) else repr(e)
         raise refuse(file, f'it cannot be imported: {told}') from e
     if not source.routes:
-        raise refuse(file, f'it has no muscle with a route; {"; ".join(source.notes[-3:])}')
+        raise refuse(file, '; '.join(['it has no muscle with a route', *source.notes[-3:]]))
     return source
 
 

@@ -73,7 +73,8 @@ class Source:
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
             return float(low), float(high)
         end = UNLIMITED[slides]
-        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has none')
+        given = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
+        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has {given}')
         return -end, end
 
     def add_joint(
@@ -84,6 +85,8 @@ class Source:
         kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
         if (size := np.linalg.norm(axis)) < 1e-9:
             raise ValueError(f'joint {name}: expected a direction as its axis')
+        if self.model.existJointName(name):
+            raise ValueError(f'joint {name}: expected a name that no other has, nor pinocchio')
         low, high = (np.array([limit]) for limit in self.limited(name, slides, *limits))
         most = np.full(1, 1e3)
         joint: int = self.model.addJoint(parent, kind(axis / size), at, name, most, most, low, high)
@@ -215,7 +218,7 @@ def cut(
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note('chosen', f'tension of {count} muscles: the default, the source has none')
     if not wanted:
-        raise SourceError('no joint is left that moves')
+        raise SourceError('; '.join(['no joint is left that moves', *source.notes[:3]]))
 
 
 def _text(values: Any) -> str:

@@ -135,6 +135,34 @@ def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
 
 
+def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
+    wrap = '<viaPoint type="SPHERICAL" radius="0.02">0 -0.01 0.1</viaPoint>'
+    text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
+    cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
+    result = import_robot(cardsflow, tmp_path / 'out')
+    assert (result.robot.muscles, result.errors) == (('front', 'back'), {})
+    assert 'dropped: muscle front: a wrap before no point' in result.notes
+    assert 'dropped: muscle front: a SPHERICAL via point after no point' in result.notes
+    cardsflow.write_text('<cardsflow/>')
+    with pytest.raises(SourceError, match=r'it has no muscle with a route$'):
+        read_source(cardsflow)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only what SDF 1.6 knows is read'),
+        ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
+        ('"shoulder"', '"universe"', 'joint universe: expected a name that no other has'),
+    ],
+)
+def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, told):
+    (tmp_path / 'model.urdf').unlink()
+    put(tmp_path, 'model.sdf', bodies.SDF.replace(old, new, 1))
+    with pytest.raises(SourceError, match=re.escape(told)):
+        import_robot(cardsflow, tmp_path / 'out')
+
+
 def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
@@ -144,6 +172,9 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
+    put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
+    with pytest.raises(SourceError, match="there is no joint 'moon'"):
+        read_source(file)
 
 
 def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
