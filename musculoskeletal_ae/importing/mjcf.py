@@ -32,11 +32,18 @@ STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stron
 
 def read_mjcf(file: Path, _root: ET.Element) -> Source:
     """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)  # by default it writes a file where it was started
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
-    return _Reader(model, file.stem).source
+    finally:
+        mujoco.set_mju_user_warning(lambda _: None)
+    source = _Reader(model, file.stem).source
+    for warning in warnings:
+        source.note('MuJoCo warns', ' '.join(warning.split()))
+    return source
 
 
 class _Reader:

@@ -16,7 +16,7 @@ import pinocchio as pin
 import yaml
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.robot.description import Route, RoutePoint, written
 from musculoskeletal_ae.robot.kinematics import (
     PRISMATIC,
@@ -65,8 +65,8 @@ class Source:
     end_effector: str = ''
 
     def note(self, kind: str, told: str) -> None:
-        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated'."""
-        self.notes.append(f'{kind}: {told}')
+        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated', in a line."""
+        self.notes.append(f'{kind}: {printable(told)}')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
         """Return limits of a joint, chosen ones where there are none."""
@@ -218,7 +218,8 @@ def cut(
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note('chosen', f'tension of {count} muscles: the default, the source has none')
     if not wanted:
-        raise SourceError('; '.join(['no joint is left that moves', *source.notes[:3]]))
+        held = [note for note in source.notes if note.startswith('held fixed')]
+        raise SourceError('; '.join(['no joint is left that moves', *held[:3]]))
 
 
 def _text(values: Any) -> str:

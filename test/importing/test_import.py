@@ -100,13 +100,16 @@ COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="cu
         ('name="upper"', 'name="upper" gravcomp="1"', 'compensated weight: body upper'),
         ('name="curl"', 'name="curl" stiffness="2" armature="1"', 'armature: joint curl'),
         ('<site site="o3"/>', '<pulley divisor="2"/><site site="o3"/>', 'one is kept, undivided'),
+        ('<site name="o1"', '<site user="nan" name="o1"', 'MuJoCo warns: XML contains a'),
         ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
         ('force="50"', 'force="0.004"', 'tension.limit is what the source says'),
     ],
 )
-def test_what_differs_from_the_source_is_told(mjcf, tmp_path, old, new, told):
+def test_what_differs_from_the_source_is_told(mjcf, tmp_path, monkeypatch, old, new, told):
+    monkeypatch.chdir(tmp_path)
     mjcf.write_text(mjcf.read_text().replace(old, new, 1))
     assert any(told in note for note in import_robot(mjcf, tmp_path / 'out').notes)
+    assert not (tmp_path / 'MUJOCO_LOG.TXT').exists()
 
 
 def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_path):
@@ -215,6 +218,7 @@ LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
         ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
         ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
         ('name="extensor"', 'name="flexor"', 'locked coordinate bend'),
+        ('name="bend"', 'name="a&#10;joints: b"', r'a\njoints: b'),
     ],
 )
 def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
