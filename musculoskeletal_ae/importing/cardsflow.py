@@ -18,7 +18,15 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
-from musculoskeletal_ae.importing.source import KINDS, Source, distinct, numbers, refuse, safe_name
+from musculoskeletal_ae.importing.source import (
+    KINDS,
+    Source,
+    distinct,
+    link_inertia,
+    numbers,
+    refuse,
+    safe_name,
+)
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
@@ -192,7 +200,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         pairs = combinations_with_replacement('xyz', 2)
         xx, xy, xz, yy, yz, zz = (value(parts, f'i{a}{b}')[0] for a, b in pairs)
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        weight = pose(own).act(pin.Inertia(float(value(own, 'mass')[0]), np.zeros(3), tensor))
+        weight = link_inertia(name, float(value(own, 'mass')[0]), np.zeros(3), tensor)
         centres[name] = pose(own).translation
-        source.add_link(name, carrier, at.inverse() * pose(links[name]), weight)
+        source.add_link(name, carrier, at.inverse() * pose(links[name]), pose(own).act(weight))
     return source, centres

@@ -28,6 +28,7 @@ from musculoskeletal_ae.importing.source import (
     Function,
     Source,
     distinct,
+    link_inertia,
     numbers,
     safe_name,
 )
@@ -231,7 +232,7 @@ class _Reader:
                 xx, yy, zz, xy, xz, yz = _vector(bodies[name], 'inertia', 6)
                 tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
                 mass, centre = _number(bodies[name], 'mass'), _vector(bodies[name], 'mass_center')
-                own = pin.Inertia(max(mass, 0.0), centre, tensor)
+                own = link_inertia(name, max(mass, 0.0), centre, tensor)
                 source.add_link(name, carrier, at * after, own)
                 order.append(name)
         if lost := waiting.keys() | bodies.keys() - set(order):
@@ -354,6 +355,9 @@ class _Reader:
         if len(points) < 2:
             source.note('dropped', f'muscle {name}: fewer than 2 points')
             return
+        for _, axes, (condition, *_) in points:
+            for coordinate in (condition, *(name for name, _ in axes)):
+                self._driver(coordinate)  # which says if there is none
         places, active = self._path(points, self.random)
         always = _always_active(places, active)
         stands = [self._standing(f'muscle {name}', *each) for each in zip(points, always)]
@@ -405,7 +409,8 @@ class _Reader:
             if best >= 0:
                 chosen[best] = self.objects[label]
             else:
-                told = f'muscle {muscle}: wrap round {label}, which it does not meet'
+                why = 'it does not meet' if label in self.objects else 'is none that is read'
+                told = f'muscle {muscle}: wrap round {label}, which {why}'
                 self.source.note('dropped', told)
         return chosen
 

@@ -137,6 +137,16 @@ def numbers(text: str | None, count: int, where: str) -> Array:
     return values
 
 
+def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.Inertia:
+    """Return a link's inertia; a ValueError names the link whose is none."""
+    try:
+        return pin.Inertia(mass, centre, tensor)
+    except RuntimeError as error:
+        moments = ', '.join(f'{moment:.4g}' for moment in np.linalg.eigvalsh(tensor))
+        told = f'expected principal moments of inertia >= 0, got {moments} kg·m²'
+        raise ValueError(f'link {link}: {told}') from error
+
+
 def safe_name(text: str | None, fallback: str) -> str:
     """Return a name that URDF and YAML take, made of what the source calls it."""
     return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback

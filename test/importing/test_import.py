@@ -233,6 +233,18 @@ def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
     assert len(source.routes) == (2 if told == 'f: it applies no force' else 3)
 
 
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<inertia>0.01 ', '<inertia>-0.01 ', 'link humerus: expected principal moments'),
+        ('/flexion</socket_x', '/flex</socket_x', "there is no coordinate 'flex'"),
+    ],
+)
+def test_a_wrong_opensim_model_is_refused_by_name(tmp_path, old, new, told):
+    with pytest.raises(SourceError, match=told):
+        read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
+
+
 def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     out = tmp_path / 'out'
     options = ['--base', 'upper', '--end', 'lower', '--out', str(out)]
