@@ -212,6 +212,10 @@ class _Reader:
                 self.source.note('approximated', f'{told}; taken where it is at the start')
         axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
         radius = float(m.geom_size[geom][0])
+        if axis is not None and side is not None:
+            out = side - m.geom_pos[geom]
+            if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
+                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo has it
         return Wrap(self.name('body', body), m.geom_pos[geom].copy(), radius, axis, side)
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:

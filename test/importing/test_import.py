@@ -81,6 +81,13 @@ def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
     assert max(result.errors.values()) < 1e-6
 
 
+@pytest.mark.parametrize('turn', ['0', '3'])
+def test_a_side_site_on_the_axis_means_what_mujoco_makes_of_it(mjcf, tmp_path, turn):
+    text = mjcf.read_text().replace('euler="1.57 0 0.1"', f'euler="0 0 {turn}"')
+    mjcf.write_text(text.replace('pos="-0.06 0 -0.3"', 'pos="0 0 -0.5"'))
+    assert max(import_robot(mjcf, tmp_path / 'out').errors.values()) < 1e-6
+
+
 COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
 
 
