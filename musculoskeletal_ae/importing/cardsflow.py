@@ -18,11 +18,21 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_text
-from musculoskeletal_ae.importing.source import KINDS, Source, numbers, refuse, safe_name
+from musculoskeletal_ae.importing.source import (
+    KINDS,
+    Source,
+    distinct,
+    link_inertia,
+    numbers,
+    refuse,
+    safe_name,
+)
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, parse_xml, read_mimics, read_urdf
+
+FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # what later versions of SDF add
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
@@ -36,6 +46,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
         name = safe_name(muscle.get('name'), f'muscle_{len(source.routes)}')
+        (name,) = distinct([name], source.routes)
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
             if (link := part.get('name', '')) not in centres:
@@ -45,6 +56,9 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                 where, kind = f'muscle {name}: viaPoint', via.get('type', 'FIXPOINT')
                 at = centres[link] + numbers(via.text, 3, where)
                 if kind in ('SPHERICAL', 'CYLINDRICAL'):
+                    if not route or isinstance(route[-1], Wrap):
+                        source.note('dropped', f'muscle {name}: a {kind} via point after no point')
+                        continue
                     radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
                     axis = np.eye(3)[2] if kind == 'CYLINDRICAL' else None
                     route.append(Wrap(body, at, radius, axis, None))
@@ -53,6 +67,9 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                 if kind != 'FIXPOINT':
                     source.note('approximated', f'muscle {name}: a {kind} via point is a point')
                 route.append(RoutePoint(body, at))
+        if route and isinstance(route[-1], Wrap):
+            route.pop()
+            source.note('dropped', f'muscle {name}: a wrap before no point')
         if sum(isinstance(item, RoutePoint) for item in route) < 2:
             source.note('dropped', f'muscle {name}: fewer than 2 points')
         else:
@@ -66,6 +83,8 @@ def _measure(source: Source) -> None:
     """Let a source have the lengths that CARDSflow gives its straight routes."""
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
+    if not straight or not joints:
+        return
     routes = Routes(Kinematics(source.model, joints, source.links[0]), list(straight.values()))
 
     def lengths(values: dict[str, Array]) -> dict[str, Array]:
@@ -73,8 +92,7 @@ def _measure(source: Source) -> None:
         q = np.stack([values.get(name, still) for name in joints], axis=-1)
         return dict(zip(straight, routes.absolute_lengths(q).T))
 
-    if straight and joints:
-        source.lengths = lengths
+    source.lengths = lengths
 
 
 def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
@@ -118,6 +136,9 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
             low[q], high[q] = source.limited(name, source.slides(name), low[q], high[q])
     model.lowerPositionLimit, model.upperPositionLimit = low, high
     source.couplings = read_mimics(root)
+    names = {joint.get('name') for joint in root.findall('joint')}
+    if lost := [c.master for c in source.couplings.values() if c.master not in names]:
+        raise refuse(file, f'there is no joint {lost[0]!r}, which a joint mimics')
     origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}
     centres = {n: '0 0 0' if e is None else e.get('xyz', '0 0 0') for n, e in origins.items()}
     return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}
@@ -129,6 +150,10 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an sdf with a model')
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
+    for element in model.iter():
+        if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
+            told = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'
+            raise refuse(file, f'{told}, poses in radians and in their usual frames')
 
     def value(element: ET.Element | None, tag: str, count: int = 1, default: str = '0') -> Array:
         if element is None:
@@ -156,7 +181,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         if stands:
             joint = carried_by[name]
             label, kind = joint.get('name', ''), joint.get('type', '')
-            here, axis = pose(links[name]) * pose(joint), value(joint, 'axis/xyz', 3, '1 0 0')
+            here, axis = pose(links[name]) * pose(joint), value(joint, 'axis/xyz', 3, '0 0 1')
             if joint.findtext('axis/use_parent_model_frame', '0').strip() in ('1', 'true'):
                 axis = here.rotation.T @ axis
             if kind in ('revolute', 'continuous', 'prismatic'):
@@ -175,7 +200,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         pairs = combinations_with_replacement('xyz', 2)
         xx, xy, xz, yy, yz, zz = (value(parts, f'i{a}{b}')[0] for a, b in pairs)
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        weight = pose(own).act(pin.Inertia(float(value(own, 'mass')[0]), np.zeros(3), tensor))
+        weight = link_inertia(name, float(value(own, 'mass')[0]), np.zeros(3), tensor)
         centres[name] = pose(own).translation
-        source.add_link(name, carrier, at.inverse() * pose(links[name]), weight)
+        source.add_link(name, carrier, at.inverse() * pose(links[name]), pose(own).act(weight))
     return source, centres

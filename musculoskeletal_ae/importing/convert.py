@@ -52,9 +52,9 @@ def read_source(file: Path) -> Source:
         source.couplings = resolved(source.couplings)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
         told = str(e) if isinstance(e, ValueError) else repr(e)
-        raise refuse(file, f'it is not as its format has it: {told}') from e
+        raise refuse(file, f'it cannot be imported: {told}') from e
     if not source.routes:
-        raise refuse(file, f'it has no muscle with a route; {"; ".join(source.notes[-3:])}')
+        raise refuse(file, '; '.join(['it has no muscle with a route', *source.notes[-3:]]))
     return source
 
 

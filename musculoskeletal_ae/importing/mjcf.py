@@ -19,25 +19,41 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import Source, refuse, safe_name
+from musculoskeletal_ae.importing.source import Source, distinct, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
+
+#: where a model says how many it has of each kind
+COUNTS = {
+    'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon',
+    'site': 'nsite', 'actuator': 'nu', 'equality': 'neq',
+}  # fmt: skip
+STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stronger
 
 
 def read_mjcf(file: Path, _root: ET.Element) -> Source:
     """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)  # by default it writes a file where it was started
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
-    return _Reader(model, file.stem).source
+    finally:
+        mujoco.set_mju_user_warning(lambda _: None)
+    source = _Reader(model, file.stem).source
+    for warning in warnings:
+        source.note('MuJoCo warns', ' '.join(warning.split()))
+    return source
 
 
 class _Reader:
     def __init__(self, model: Any, name: str) -> None:
         self.model, self.source = model, Source(safe_name(name, 'robot'))
-        self.source.model.gravity.linear = model.opt.gravity.copy()
+        weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        self.source.model.gravity.linear = model.opt.gravity * (not weightless)
         self.start = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.start)
+        self.names = {kind: self._names(kind) for kind in COUNTS}
         self.balls: dict[int, list[str]] = {}
         #: joint that follows another (−1: none), by which polynomial
         self.polynomials: dict[int, tuple[int, Array]] = {}
@@ -45,11 +61,29 @@ class _Reader:
         self._bodies()
         self._couplings()
         self._tendons()
+        self._not_modelled()
         self.source.lengths = self._lengths
 
+    def _names(self, kind: str) -> list[str]:
+        """Return the name of each thing of a kind, or its kind and number."""
+        get, count = getattr(self.model, kind), getattr(self.model, COUNTS[kind])
+        # Those that differ in MuJoCo may do so only in what is not safe; pinocchio's own is taken.
+        return distinct((safe_name(get(i).name, f'{kind}_{i}') for i in range(count)), ['universe'])
+
     def name(self, kind: str, i: int) -> str:
-        """Return the name of a thing, or its kind and number."""
-        return safe_name(getattr(self.model, kind)(i).name, f'{kind}_{i}')
+        """Return the name of a thing."""
+        return self.names[kind][i]
+
+    def _not_modelled(self) -> None:
+        m = self.model
+        for kind, told, values in (
+            ('joint', 'springs', m.jnt_stiffness),
+            ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
+            ('tendon', 'springs', m.tendon_stiffness),
+            ('body', 'compensated weight', m.body_gravcomp),
+        ):
+            if named := ', '.join(self.name(kind, i) for i in np.flatnonzero(values).tolist()):
+                self.source.note('dropped', f'{told}: {kind} {named}')
 
     def _bodies(self) -> None:
         """Add links and joints; at the start a joint stands as its body does, in its anchor."""
@@ -78,7 +112,12 @@ class _Reader:
         axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
         if kind == types.mjJNT_BALL:
             source.note('approximated', f'ball joint {name}: three hinges, x then y then z')
-            axes, names, rest, low = list(np.eye(3)), [f'{name}_{c}' for c in 'xyz'], 0.0, -high
+            axes, names, rest, low = (
+                list(np.eye(3)),
+                distinct((f'{name}_{c}' for c in 'xyz'), self.names['joint']),
+                0.0,
+                -high,
+            )
             self.balls[j] = names
         for part, axis in zip(names, axes):
             back, still = -axis * rest, np.zeros(3)
@@ -94,8 +133,14 @@ class _Reader:
                 source.note('dropped', f'equality {self.name("equality", e)}: not of joints')
                 continue
             slave, master, terms = int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e][4::-1]
-            self.polynomials[slave] = master, terms.copy()
-            name, zero = self.name('joint', slave), m.qpos0[m.jnt_qposadr[slave]]
+            name, leader = self.name('joint', slave), master
+            while leader in self.polynomials:
+                leader = self.polynomials[leader][0]
+            if slave in self.polynomials or leader == slave:
+                told = f'equality {self.name("equality", e)}: joint {name} is coupled already'
+                source.note('dropped', told)
+                continue
+            self.polynomials[slave], zero = (master, terms.copy()), m.qpos0[m.jnt_qposadr[slave]]
             if master < 0:
                 source.fixed.append(name)
                 source.rest[name] = float(zero + terms[-1])
@@ -122,23 +167,27 @@ class _Reader:
                 self.tendons[name] = t
                 self._route(name, range(first, first + m.tendon_num[t]))
                 source.strength[name] = max(driven.get(t, [0.0]))
+        if self.tendons and not driven:
+            source.note('chosen', 'every tendon is a muscle: no actuator pulls any')
 
     def _strength(self, a: int) -> float:
         m = self.model
-        gain, force = m.actuator_gainprm[a], 0.0
+        gain, force = m.actuator_gainprm[a], np.inf
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
-            force = gain[2] if gain[2] > 0.0 else gain[3] / m.actuator_acc0[a]
-        elif m.actuator_forcelimited[a]:
-            force = np.abs(m.actuator_forcerange[a]).max()
-        return float(force * abs(m.actuator_gear[a][0]))
+            force = gain[2] if gain[2] >= 0.0 else gain[3] / max(m.actuator_acc0[a], 1e-15)
+        if m.actuator_forcelimited[a]:
+            force = min(force, np.abs(m.actuator_forcerange[a]).max())
+        return float(force * abs(m.actuator_gear[a][0])) if force <= STRONGEST else 0.0
 
     def _route(self, name: str, wraps: range) -> None:
         m, types = self.model, mujoco.mjtWrap
         branches: list[list[RoutePoint | Wrap]] = [[]]
+        divided = False
         for w in wraps:
             kind, i = m.wrap_type[w], m.wrap_objid[w]
             if kind == types.mjWRAP_PULLEY:
                 branches.append([])
+                divided |= bool(m.wrap_prm[w] != 1.0)
             elif kind == types.mjWRAP_SITE:
                 body = self.name('body', m.site_bodyid[i])
                 branches[-1].append(RoutePoint(body, m.site_pos[i].copy()))
@@ -146,8 +195,8 @@ class _Reader:
                 round_axis = kind == types.mjWRAP_CYLINDER
                 branches[-1].append(self._wrap(name, i, int(m.wrap_prm[w]), round_axis))
         branches = [branch for branch in branches if branch]
-        if len(branches) > 1:
-            told = f'muscle {name}: of {len(branches)} branches over pulleys one is kept'
+        if divided or len(branches) > 1:
+            told = f'muscle {name}: of {len(branches)} branches over pulleys one is kept, undivided'
             self.source.note('approximated', told)
         # Of several branches the format keeps one: the one that joints move most.
         kept = max(branches, key=lambda branch: len({item.link for item in branch}))
@@ -163,6 +212,10 @@ class _Reader:
                 self.source.note('approximated', f'{told}; taken where it is at the start')
         axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
         radius = float(m.geom_size[geom][0])
+        if axis is not None and side is not None:
+            out = side - m.geom_pos[geom]
+            if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
+                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo has it
         return Wrap(self.name('body', body), m.geom_pos[geom].copy(), radius, axis, side)
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:

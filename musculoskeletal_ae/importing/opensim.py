@@ -23,7 +23,15 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.importing.source import Function, Source, numbers, safe_name
+from musculoskeletal_ae.importing.source import (
+    EARTH,
+    Function,
+    Source,
+    distinct,
+    link_inertia,
+    numbers,
+    safe_name,
+)
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
@@ -111,7 +119,9 @@ class _Reader:
     def __init__(self, model: ET.Element) -> None:
         self.model, self.source = model, Source(safe_name(model.get('name'), 'robot'))
         given = model.find('gravity') is not None
-        self.source.model.gravity.linear = _vector(model, 'gravity') if given else -np.eye(3)[1]
+        self.source.model.gravity.linear = (
+            _vector(model, 'gravity') if given else -EARTH * np.eye(3)[1]
+        )
         #: ranges and defaults of coordinates that are free; which of them ('': none) drives each
         #: coordinate, and by what function
         self.ranges, self.rest = {'': (0.0, 0.0)}, {'': 0.0}
@@ -147,19 +157,33 @@ class _Reader:
                 self.drivers[name] = '', np.poly1d([default])
                 self.source.note('held fixed', f'locked coordinate {name} at {default:.4g}')
             else:
-                free = not 0.0 < high - low < 100.0
-                self.drivers[name] = name, IDENTITY
-                self.ranges[name] = (-np.pi, np.pi) if free else (low, high)
+                self.drivers[name], self.ranges[name] = (name, IDENTITY), (low, high)
                 self.rest[name] = default
+                if _word(item, 'prescribed').lower() == 'true':
+                    self.source.note(
+                        'dropped', f'prescribed motion of coordinate {name}: it is free'
+                    )
         for item in self.model.findall('ConstraintSet/objects/*'):
             master = _word(item, 'independent_coordinate_names')
             slave = _word(item, 'dependent_coordinate_name')
-            if item.tag != 'CoordinateCouplerConstraint' or master not in self.drivers:
+            if _word(item, 'isEnforced').lower() == 'false':
+                continue
+            known = self.drivers.keys() >= {master, slave} and '' not in (master, slave)
+            if item.tag != 'CoordinateCouplerConstraint' or not known:
                 self.source.note('dropped', f'{item.tag} {item.get("name")}')
+                continue
+            if self.drivers[slave][0] != slave or self._driver(master)[0] == slave:
+                told = f'{item.tag} {item.get("name")}: {slave} is coupled or locked already'
+                self.source.note('dropped', told)
                 continue
             scale = 1.0 if item.find('scale_factor') is None else _number(item, 'scale_factor')
             function = _function(item.find('coupled_coordinates_function'))
             self.drivers[slave] = master, _scaled(function, scale)
+        axes = [a for j in self.model.findall('JointSet/objects/*') for a in self._axes(j)]
+        turned = {coordinate for slides, _, coordinate, _ in axes if not slides}
+        for name, span in self.ranges.items():
+            if name and self.drivers[name][0] == name:
+                self.ranges[name] = self.source.limited(name, name not in turned, *span)
 
     def _driver(self, name: str, function: Function = IDENTITY) -> tuple[str, Function]:
         """Return a function of a coordinate as one of the free coordinate that drives it."""
@@ -208,7 +232,7 @@ class _Reader:
                 xx, yy, zz, xy, xz, yz = _vector(bodies[name], 'inertia', 6)
                 tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
                 mass, centre = _number(bodies[name], 'mass'), _vector(bodies[name], 'mass_center')
-                own = pin.Inertia(max(mass, 0.0), centre, tensor)
+                own = link_inertia(name, max(mass, 0.0), centre, tensor)
                 source.add_link(name, carrier, at * after, own)
                 order.append(name)
         if lost := waiting.keys() | bodies.keys() - set(order):
@@ -217,8 +241,6 @@ class _Reader:
     def _axes(self, joint: ET.Element) -> Iterator[Axis]:
         if joint.tag in AXES:
             names = [item.get('name', '') for item in joint.findall('coordinates/Coordinate')]
-            if joint.tag == 'FreeJoint':
-                self.source.note('held fixed', f'free joint {joint.get("name")} at 0')
             for name, letter in zip(names, AXES[joint.tag]):
                 yield letter.isupper(), np.eye(3)['xyz'.index(letter.lower())], name, IDENTITY
         elif joint.tag != 'CustomJoint':
@@ -235,6 +257,8 @@ class _Reader:
         self, body: str, joint: ET.Element, carrier: int, at: pin.SE3
     ) -> tuple[int, pin.SE3]:
         """Add a joint for each axis that moves; return the last one, and what follows in it."""
+        if joint.tag == 'FreeJoint':
+            self.source.note('held fixed', f'free joint {joint.get("name")} at 0')
         for slides, axis, coordinate, own in sorted(self._axes(joint), key=lambda a: not a[0]):
             name, function = self._driver(coordinate, own)
             if not name:
@@ -318,12 +342,22 @@ class _Reader:
         return body, at, (_word(item, 'socket_coordinate'), low, high)
 
     def _muscle(self, item: ET.Element) -> None:
-        source, name = self.source, safe_name(item.get('name'), 'force')
+        source = self.source
+        (name,) = distinct([safe_name(item.get('name'), 'force')], source.routes)
         path = item.find('GeometryPath')
         if path is None or not ('Muscle' in item.tag or item.tag == 'PathActuator'):
             source.note('dropped', f'{item.tag} {name}: no muscle with a path of points')
             return
+        if _word(item, 'appliesForce').lower() == 'false':
+            source.note('dropped', f'muscle {name}: it applies no force')
+            return
         points = [self._point(p) for p in path.findall('PathPointSet/objects/*')]
+        if len(points) < 2:
+            source.note('dropped', f'muscle {name}: fewer than 2 points')
+            return
+        for _, axes, (condition, *_) in points:
+            for coordinate in (condition, *(name for name, _ in axes)):
+                self._driver(coordinate)  # which says if there is none
         places, active = self._path(points, self.random)
         always = _always_active(places, active)
         stands = [self._standing(f'muscle {name}', *each) for each in zip(points, always)]
@@ -375,7 +409,8 @@ class _Reader:
             if best >= 0:
                 chosen[best] = self.objects[label]
             else:
-                told = f'muscle {muscle}: wrap round {label}, which it does not meet'
+                why = 'it does not meet' if label in self.objects else 'is none that is read'
+                told = f'muscle {muscle}: wrap round {label}, which {why}'
                 self.source.note('dropped', told)
         return chosen
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -16,7 +16,7 @@ import pinocchio as pin
 import yaml
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.robot.description import Route, RoutePoint, written
 from musculoskeletal_ae.robot.kinematics import (
     PRISMATIC,
@@ -24,12 +24,14 @@ from musculoskeletal_ae.robot.kinematics import (
     Coupling,
     joint_axis,
     link_placement,
+    reduced,
 )
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # in which lengths are compared
 STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
+EARTH = 9.81  # [m/s²]
 UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
 
 #: absolute lengths [m] (N,) of muscles, for values (N,) of joints that are not at rest
@@ -63,15 +65,16 @@ class Source:
     end_effector: str = ''
 
     def note(self, kind: str, told: str) -> None:
-        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated'."""
-        self.notes.append(f'{kind}: {told}')
+        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated', in a line."""
+        self.notes.append(f'{kind}: {printable(told)}')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
         """Return limits of a joint, chosen ones where there are none."""
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
             return float(low), float(high)
         end = UNLIMITED[slides]
-        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has none')
+        given = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
+        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has {given}')
         return -end, end
 
     def add_joint(
@@ -82,6 +85,8 @@ class Source:
         kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
         if (size := np.linalg.norm(axis)) < 1e-9:
             raise ValueError(f'joint {name}: expected a direction as its axis')
+        if self.model.existJointName(name):
+            raise ValueError(f'joint {name}: expected a name that no other has, nor pinocchio')
         low, high = (np.array([limit]) for limit in self.limited(name, slides, *limits))
         most = np.full(1, 1e3)
         joint: int = self.model.addJoint(parent, kind(axis / size), at, name, most, most, low, high)
@@ -132,9 +137,30 @@ def numbers(text: str | None, count: int, where: str) -> Array:
     return values
 
 
+def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.Inertia:
+    """Return a link's inertia; a ValueError names the link whose is none."""
+    try:
+        return pin.Inertia(mass, centre, tensor)
+    except RuntimeError as error:
+        moments = ', '.join(f'{moment:.4g}' for moment in np.linalg.eigvalsh(tensor))
+        told = f'expected principal moments of inertia >= 0, got {moments} kg·m²'
+        raise ValueError(f'link {link}: {told}') from error
+
+
 def safe_name(text: str | None, fallback: str) -> str:
     """Return a name that URDF and YAML take, made of what the source calls it."""
     return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback
+
+
+def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """Return names with underscores behind those that are given or taken before."""
+    result, seen = [], {*taken}
+    for name in names:
+        while name in seen:
+            name += '_'
+        seen.add(name)
+        result.append(name)
+    return result
 
 
 def cut(
@@ -184,7 +210,7 @@ def cut(
             source.note('held fixed', f'joint {name} at {source.rest.get(name, 0.0):.4g}')
     locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
-    source.model = pin.buildReducedModel(model, locked, at_rest)
+    source.model = reduced(model, locked, at_rest)
     if unknown := [name for name in muscles if name not in source.routes]:
         legal = ', '.join(source.routes)
         raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal}')
@@ -199,8 +225,11 @@ def cut(
         del source.routes[name]
     if any(source.strength.values()):
         source.note('chosen', STRENGTH)
+    if count := sum(not source.strength.get(name) for name in source.routes):
+        source.note('chosen', f'tension of {count} muscles: the default, the source has none')
     if not wanted:
-        raise SourceError('no joint is left that moves')
+        held = [note for note in source.notes if note.startswith('held fixed')]
+        raise SourceError('; '.join(['no joint is left that moves', *held[:3]]))
 
 
 def _text(values: Any) -> str:
@@ -216,9 +245,11 @@ def urdf(source: Source) -> str:
     else:
         down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
+        if abs(size - EARTH) > 0.02:
+            source.note('chosen', f'gravity: {EARTH} m/s², the source has {size:.4g}')
     carriers = {0: root}  # link of each joint
     if not upright.isIdentity(1e-9):
-        carriers[0] = f'{root}_upright'
+        (carriers[0],) = distinct([f'{root}_upright'], source.links)
         source.note('chosen', f'link {carriers[0]}: the root, upright; {root} as it rests')
     for link in source.links:
         joint, at = source.place(link)
@@ -234,7 +265,8 @@ def urdf(source: Source) -> str:
         parts.append(f'  <joint name={quoteattr(name)} type="{kind}">{ends}{origin}{more}</joint>')
 
     for i, name in enumerate(model.names[1:], 1):
-        link, own = carriers.setdefault(i, f'{name}_link'), model.inertias[i]
+        (spare,) = distinct([f'{name}_link'], {*source.links, *carriers.values()})
+        link, own = carriers.setdefault(i, spare), model.inertias[i]
         pairs = combinations_with_replacement(range(3), 2)
         tensor = ' '.join(f'i{"xyz"[j]}{"xyz"[k]}="{own.inertia[j, k]:.12g}"' for j, k in pairs)
         mass = f'<origin xyz="{_text(own.lever)}"/><mass value="{_text(own.mass)}"/>'
@@ -245,10 +277,10 @@ def urdf(source: Source) -> str:
         more = f'<axis xyz="{_text(joint_axis(model.joints[i]))}"/><limit {limits}/>'
         kind = 'prismatic' if source.slides(name) else 'revolute'
         attach(name, kind, link, model.parents[i], model.jointPlacements[i], more)
-    for link in source.links:
-        if link not in carriers.values():
-            parts.append(f'  <link name={quoteattr(link)}/>')
-            attach(f'to_{link}', 'fixed', link, *source.place(link))
+    others = [link for link in source.links if link not in carriers.values()]
+    for link, name in zip(others, distinct([f'to_{link}' for link in others], model.names)):
+        parts.append(f'  <link name={quoteattr(link)}/>')
+        attach(name, 'fixed', link, *source.place(link))
     return '\n'.join([*parts, '</robot>', ''])
 
 
@@ -261,7 +293,7 @@ def write(source: Source, out: Path) -> None:
         muscles.append({'name': name, 'route': [written(item) for item in route]})
         if (force := source.strength.get(name, 0.0)) > 0.0:
             tension = {'bias': min(30.0, 0.1 * force), 'limit': force, 'max': 1.5 * force}
-            muscles[-1]['tension'] = {k: round(v, 3) for k, v in tension.items()}
+            muscles[-1]['tension'] = {k: float(f'{v:.6g}') for k, v in tension.items()}
     joints = [name for name in source.model.names[1:] if name not in source.couplings]
     document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
     if source.end_effector:

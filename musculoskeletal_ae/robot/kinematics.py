@@ -70,6 +70,22 @@ def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
     return int(frame.parentJoint), frame.placement
 
 
+def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
+    """Return a model with joints locked; a link may have the name of a joint, or be 'universe'.
+
+    Pinocchio looks frames up by name alone there, and refuses or mistakes those that share one.
+    """
+    named, names = model.copy(), dict[str, str]()
+    for i, frame in enumerate(named.frames):
+        if i and frame.type != pin.FrameType.JOINT:
+            names[f'{i} {frame.name}'] = frame.name
+            frame.name = f'{i} {frame.name}'
+    result = pin.buildReducedModel(named, locked, at)
+    for frame in result.frames:
+        frame.name = names.get(frame.name, frame.name)
+    return result
+
+
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
     """Return M [kg·m² or kg] (J−1, J−1); pinocchio fills its upper half only."""
     upper = np.triu(pin.crba(model, data, q))
@@ -104,7 +120,7 @@ class Kinematics:
             if name not in followers:
                 still[full_model.joints[full_model.getJointId(name)].idx_q] = coupling.offset
         locked = [full_model.getJointId(name) for name in full_model.names[1:] if name not in kept]
-        self.model = pin.buildReducedModel(full_model, locked, still)
+        self.model = reduced(full_model, locked, still)
         self.data = self.model.createData()
         ids = [self.model.getJointId(name) for name in joints]
         #: index into pinocchio's q and v for each entry of θ

@@ -19,7 +19,8 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.kinematics import Coupling
 
 # A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
-MOST_PARTS, DEEPEST = 2000, 50  # links and joints; levels of elements
+# MuJoCo's and pinocchio's parser goes down 500 levels.
+MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
 LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
 AXES = ('x', 'y', 'z')
 
@@ -51,8 +52,13 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         where = f'{file}: {part.tag} {part.get("name")!r}'
         if printable(name := part.get('name', '')) != name:
             raise RobotDescriptionError(f'{where}: expected a name that can be printed')
+        if part.tag == 'joint' and name == 'universe':
+            raise RobotDescriptionError(f'{where}: expected another name, pinocchio uses this one')
         for element in part.iter():
             _check(where, element)
+        axis, turns = part.find('axis'), part.get('type') in ('revolute', 'continuous', 'prismatic')
+        if turns and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
+            raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
     try:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:

@@ -67,6 +67,58 @@ def test_what_the_format_cannot_express_is_told_and_measured(
     assert max(result.errors.values()) < 1e-6
 
 
+def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
+    text = mjcf.read_text()
+    for old, new in {
+        'front': 'a/b', 'back': 'a b', 'swing': 'to_base', 'lift': 'universe',
+        'finger': 'swing_link', 'upper': 'elbow',
+    }.items():  # fmt: skip
+        text = text.replace(f'"{old}"', f'"{new}"')
+    mjcf.write_text(text)
+    result = import_robot(mjcf, tmp_path / 'out')
+    assert result.robot.muscles == ('a_b', 'a_b_', 'out', 'in', 'bend', 'stretch', 'curler')
+    assert result.robot.joints == ('to_base', 'universe_', 'elbow')
+    assert max(result.errors.values()) < 1e-6
+
+
+@pytest.mark.parametrize('turn', ['0', '3'])
+def test_a_side_site_on_the_axis_means_what_mujoco_makes_of_it(mjcf, tmp_path, turn):
+    text = mjcf.read_text().replace('euler="1.57 0 0.1"', f'euler="0 0 {turn}"')
+    mjcf.write_text(text.replace('pos="-0.06 0 -0.3"', 'pos="0 0 -0.5"'))
+    assert max(import_robot(mjcf, tmp_path / 'out').errors.values()) < 1e-6
+
+
+COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        (
+            '<equality>',
+            f'<equality>{COUPLED}',
+            'equality equality_1: joint elbow is coupled already',
+        ),
+        (
+            '<worldbody>',
+            '<option gravity="0 0 -1.6"/><worldbody>',
+            'gravity: 9.81 m/s², the source',
+        ),
+        ('name="upper"', 'name="upper" gravcomp="1"', 'compensated weight: body upper'),
+        ('name="curl"', 'name="curl" stiffness="2" armature="1"', 'armature: joint curl'),
+        ('<site site="o3"/>', '<pulley divisor="2"/><site site="o3"/>', 'one is kept, undivided'),
+        ('<site name="o1"', '<site user="nan" name="o1"', 'MuJoCo warns: XML contains a'),
+        ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
+        ('force="50"', 'force="0.004"', 'tension.limit is what the source says'),
+    ],
+)
+def test_what_differs_from_the_source_is_told(mjcf, tmp_path, monkeypatch, old, new, told):
+    monkeypatch.chdir(tmp_path)
+    mjcf.write_text(mjcf.read_text().replace(old, new, 1))
+    assert any(told in note for note in import_robot(mjcf, tmp_path / 'out').notes)
+    assert not (tmp_path / 'MUJOCO_LOG.TXT').exists()
+
+
 def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_path):
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.muscles == ('front', 'back')
@@ -74,6 +126,8 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
     assert result.errors == pytest.approx({'front': 0.0}, abs=1e-9)  # it has no lengths of wraps
     assert any('muscle still: it moves no joint' in note for note in result.notes)
+    cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
+    assert import_robot(cardsflow, tmp_path / 'two').robot.muscles == ('front', 'front_')
 
 
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
@@ -91,6 +145,34 @@ def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
 
 
+def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
+    wrap = '<viaPoint type="SPHERICAL" radius="0.02">0 -0.01 0.1</viaPoint>'
+    text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
+    cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
+    result = import_robot(cardsflow, tmp_path / 'out')
+    assert (result.robot.muscles, result.errors) == (('front', 'back'), {})
+    assert 'dropped: muscle front: a wrap before no point' in result.notes
+    assert 'dropped: muscle front: a SPHERICAL via point after no point' in result.notes
+    cardsflow.write_text('<cardsflow/>')
+    with pytest.raises(SourceError, match=r'it has no muscle with a route$'):
+        read_source(cardsflow)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only what SDF 1.6 knows is read'),
+        ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
+        ('"shoulder"', '"universe"', 'joint universe: expected a name that no other has'),
+    ],
+)
+def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, told):
+    (tmp_path / 'model.urdf').unlink()
+    put(tmp_path, 'model.sdf', bodies.SDF.replace(old, new, 1))
+    with pytest.raises(SourceError, match=re.escape(told)):
+        import_robot(cardsflow, tmp_path / 'out')
+
+
 def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
@@ -100,6 +182,9 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
+    put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
+    with pytest.raises(SourceError, match="there is no joint 'moon'"):
+        read_source(file)
 
 
 def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
@@ -121,6 +206,50 @@ def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
     assert result.robot.root_link == 'ground_upright'  # OpenSim's y axis is up
     pose = result.robot.kinematics.link_pose(np.zeros(2), 'humerus')
     assert pose.translation[2] > 0.9
+
+
+COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
+<coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
+</coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
+<dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
+LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<range>0 2</range>', '', 'joint flexion: limits ±3.142'),
+        ('<range>0 2</range>', '<prescribed>true</prescribed>', 'prescribed motion of'),
+        ('name="flexor">', 'name="f"><appliesForce>false</appliesForce>', 'f: it applies no force'),
+        ('<ForceSet><objects>', f'<ForceSet><objects>{LONE}', 'muscle lone: fewer than 2 points'),
+        ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
+        ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
+        ('name="extensor"', 'name="flexor"', 'locked coordinate bend'),
+        ('name="bend"', 'name="a&#10;joints: b"', r'a\njoints: b'),
+    ],
+)
+def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
+    if not old:
+        old, new = (
+            '<ForceSet>',
+            f'<ConstraintSet><objects>{new}</objects></ConstraintSet><ForceSet>',
+        )
+    source = read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
+    assert any(told in note for note in source.notes)
+    assert 'flexion' in source.model.names
+    assert len(source.routes) == (2 if told == 'f: it applies no force' else 3)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'told'),
+    [
+        ('<inertia>0.01 ', '<inertia>-0.01 ', 'link humerus: expected principal moments'),
+        ('/flexion</socket_x', '/flex</socket_x', "there is no coordinate 'flex'"),
+    ],
+)
+def test_a_wrong_opensim_model_is_refused_by_name(tmp_path, old, new, told):
+    with pytest.raises(SourceError, match=told):
+        read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
 
 
 def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):

@@ -233,6 +233,8 @@ STRANGE = {
     'a product too large': (with_inertia(0.01, 0.02, 0.01, 0.01), 'principal moments'),
     'an absurd moment': (with_inertia(1e300, 0, 0.01, 0.01), 'of at most'),
     'an absurd place': (in_arm26('xyz="0 0 ', 'xyz="0 1e300 '), 'of at most'),
+    'an axis of no direction': (in_arm26('<axis xyz="0 1 0"', '<axis xyz="0 0 0"'), 'a direction'),
+    "pinocchio's own name": (in_arm26('<joint name="', '<joint name="universe" id="'), 'another'),
     'an escape in a name': (in_arm26('<link name="', '<link name="\x9b1m'), 'printed'),
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import write_robot
+from robots import JOINTS, write_robot
 
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -113,6 +113,19 @@ def test_an_unlisted_joint_is_locked_and_its_link_still_weighs(tmp_path):
     theta = np.array([-1.0, 0.1, -0.5])
     extra = fingered.kinematics.holding_torque(theta) - bare.kinematics.holding_torque(theta)
     assert np.abs(extra).max() > 0.01
+
+
+@pytest.mark.parametrize('joints', [JOINTS, ('bend',)])
+def test_links_may_have_the_names_of_joints(tmp_path, joints):
+    one, two = (write_robot(tmp_path / name, joints=joints) for name in 'ab')
+    for old, new in {'pillar': 'mount', 'shoulder': 'lift', 'upper': 'swing'}.items():
+        for file in two.iterdir():
+            text = file.read_text().replace(f'"{old}"', f'"{new}"')
+            file.write_text(text.replace(f'link: {old}', f'link: {new}'))
+    one, two = Robot.load(one), Robot.load(two)
+    theta = one.random_postures(10, np.random.default_rng(8))
+    for ask in (lambda r: r.routes.absolute_lengths, lambda r: r.kinematics.holding_torque):
+        np.testing.assert_array_equal(ask(one)(theta), ask(two)(theta))
 
 
 @pytest.mark.parametrize('name', ['musashi_left_arm', 'arm26'])
