@@ -45,7 +45,7 @@ TORQUE = 0.3
 LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 #: from a limit, where a joint that muscles push there is taken to be at its stop, how many such
 #: spreads that takes, and how far such a joint is from the limit [rad]
-NEAR_STOP, PUSHED, STOP = 0.15, 3.0, 0.01
+NEAR_STOP, PUSHED, STOP = 0.05, 3.0, 0.01
 ROUNDS = 12
 #: decrease that a step should bring, in variances, that ends the rounds: the step is then far
 #: shorter than what the samples leave open, and the noise has settled
@@ -187,8 +187,9 @@ class _GroupFit:
         score = rows.torque / sigma
         own = theta[:, self._joints]
         # What is left of the torque on a joint pushes it; at a stop that is the stop's own.
-        # One that leans on it does until it would have to be held there.
-        enough = np.where(np.isnan(self._at), PUSHED, 0.0)
+        # One that a sensor sees lean on it does until it would have to be held there; another would
+        # be held by a stop that it was taken to once, and all others bent after it.
+        enough = np.where(self._own & np.isfinite(self._at), 0.0, PUSHED)
         above = self._balanced & (own > self._upper - self._near) & (score > enough)
         below = self._balanced & (own < self._lower + self._near) & (score < -enough)
         self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
