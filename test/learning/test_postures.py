@@ -11,7 +11,7 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
+from musculoskeletal_ae.learning.body import PRIOR, CorrectedBody, fit_body
 from musculoskeletal_ae.learning.postures import _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
@@ -152,3 +152,17 @@ def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
             expected = rows.torque_by_body[:, :, column + k]
             np.testing.assert_allclose(expected, slope, atol=1e-2 + 1e-3 * np.abs(slope).max())
         column += layout.size
+
+
+def test_a_joint_leans_on_a_stop_while_it_is_near_and_pushed(arm26, seen):
+    part, body, upper = blind(seen[np.arange(8)]), CorrectedBody(arm26), arm26.upper
+    means, spreads = zip(*((PRIOR.mean(o), PRIOR.spread(o)) for o in body.layouts))
+    fit = _GroupFit(body, part, np.arange(2), np.arange(6), [*means], [*spreads], 3e-4)
+    theta = np.tile(0.5 * (arm26.lower + upper), (8, 1))
+    theta[:2, 1] = upper[1] - [0.02, 0.1]
+    rows = fit.rows(theta, np.zeros(2))
+    for pushed, leaning in ((10.0, [0]), (0.1, [])):
+        torque = np.full_like(rows.torque, 0.1)
+        torque[:2, 1] = pushed
+        fit.weigh(rows._replace(torque=torque), theta, np.zeros(6))
+        assert np.flatnonzero(fit._stops(theta)[1][:, 1]).tolist() == leaning
