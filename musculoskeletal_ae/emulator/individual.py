@@ -127,10 +127,10 @@ def _objects(
             least = np.linalg.norm(away, axis=-1).min()
             objects.radius[s] = min(objects.radius[s] * described[s], 0.95 * least)
             continue
-        moved = kin.moved_by[routes.joint[ends[0]]] ^ kin.moved_by[routes.joint[ends[1]]]
+        between = kin.hangs_on[routes.joint[ends[0]]] ^ kin.hangs_on[routes.joint[ends[1]]]
         best = np.inf
         for joint in range(1, len(kin.parent)):
-            if kin.prismatic[joint] or not moved[kin.theta_index[joint]]:
+            if kin.prismatic[joint] or not between[joint]:
                 continue
             start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start

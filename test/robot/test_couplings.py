@@ -59,6 +59,21 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
 
 
+def test_a_muscle_at_a_coupled_joint_crosses_its_master(tmp_path):
+    coupled_arm(tmp_path, couplings=[COUPLED])
+    document = read_muscles(tmp_path)
+    route = [
+        {'link': 'lower', 'xyz': [0.0, 0.02, -0.2]},
+        {'link': 'fingertip', 'xyz': [0.02, 0, 0]},
+    ]
+    document['muscles'].append({'name': 'closer', 'route': route})
+    robot = Robot.load(write_muscles(tmp_path, document))
+    theta = robot.random_postures(5, np.random.default_rng(0))
+    moves = np.abs(robot.routes.muscle_jacobian(theta)).max(axis=0) > 1e-9
+    np.testing.assert_array_equal(robot.routes.crossed[-1], moves[-1])
+    assert robot.routes.crossed[-1].tolist() == [True, False, False]
+
+
 def test_the_emulated_joint_follows_its_master(robot):
     arm = EmulatedArm(robot, 0)
     before = arm.theta
