@@ -125,7 +125,9 @@ def _objects(
             axis = (turn @ objects.axis[s])[:, None]
             away -= (away * axis).sum(axis=-1, keepdims=True) * axis
             least = np.linalg.norm(away, axis=-1).min()
-            objects.radius[s] = min(objects.radius[s] * described[s], 0.95 * least)
+            scale = min(described[s], 0.95 * least / objects.radius[s])
+            objects.radius[s] *= scale
+            objects.side[s] *= scale  # a ring stays one
             continue
         between = kin.hangs_on[routes.joint[ends[0]]] ^ kin.hangs_on[routes.joint[ends[1]]]
         best = np.inf

@@ -87,11 +87,12 @@ def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
             if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
                 # Described ones are a little off as well.
-                radius = item.radius * (rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0)
-                _add_round(bodies[joint], name, place, axis, radius)
+                scale = rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0
+                _add_round(bodies[joint], name, place, axis, scale * item.radius)
                 if item.side is not None:
                     side = f'{name} side'
-                    bodies[joint].add_site(name=side, pos=at.act(item.side))
+                    beside = item.xyz + scale * (item.side - item.xyz)  # a ring stays one
+                    bodies[joint].add_site(name=side, pos=at.act(beside))
                 tendon.wrap_geom(name, side)
                 before = []
                 continue
