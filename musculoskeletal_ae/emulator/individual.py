@@ -68,8 +68,11 @@ class Individual:
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
         pulls = np.abs(nominal.muscle_jacobian(theta)) * robot.tension.bias[:, None]
-        load = np.abs(kin.holding_torque(theta)).max(axis=0) + pulls.sum(axis=1).max(axis=0)
-        self.joint_friction: Array = spread.joint_friction * load * rng.uniform(0.5, 1.5, len(load))
+        #: what weight and muscles at T_bias put on each joint [N·m], (D,)
+        self.load: Array = np.abs(kin.holding_torque(theta)).max(axis=0)
+        self.load = self.load + pulls.sum(axis=1).max(axis=0)
+        rubs = rng.uniform(0.5, 1.5, len(self.load))
+        self.joint_friction: Array = spread.joint_friction * self.load * rubs
         #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)

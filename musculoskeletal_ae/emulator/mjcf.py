@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import STEP
+from musculoskeletal_ae.emulator.modules import RACK, STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
@@ -58,7 +58,9 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
         axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.local_axis[i]
         kinds = mujoco.mjtJoint
         kind = kinds.mjJNT_SLIDE if kin.prismatic[i] else kinds.mjJNT_HINGE
-        joint = body.add_joint(name=name, type=kind, axis=axis, armature=ARMATURE, damping=DAMPING)
+        gear = RACK**-2 if kin.prismatic[i] else 1.0
+        module = {'armature': gear * ARMATURE, 'damping': gear * DAMPING}
+        joint = body.add_joint(name=name, type=kind, axis=axis, **module)
         if name in robot.joints:
             k = robot.joints.index(name)
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
