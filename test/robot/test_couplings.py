@@ -101,6 +101,19 @@ def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(robot, tmp_path
     np.testing.assert_array_equal(mimic.routes.absolute_lengths(theta), expected)
 
 
+def test_a_mimic_is_followed_in_a_default_namespace_and_wheels_elsewhere_are_held(tmp_path):
+    urdf = coupled_arm(tmp_path) / 'robot.urdf'
+    wheels = ''.join(
+        f'<link name="{name}"/><joint name="{name}" type="continuous"><parent link="base"/>'
+        f'<child link="{name}"/>{mimic}</joint>'
+        for name, mimic in {'left': '', 'right': '<mimic joint="left"/>'}.items()
+    )
+    text = urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC).replace('</robot>', wheels)
+    urdf.write_text(text.replace('<robot', '<robot xmlns="http://any"') + '</robot>')
+    notes = Robot.load(tmp_path).description.joint_notes
+    assert notes == ['finger = -0.5 · bend +0.2', 'held fixed at 0: left, right']
+
+
 BAD = {
     'follows itself': ([COUPLED, {'joint': 'bend', 'master': 'finger'}], 'follows itself'),
     'listed as free': ([{'joint': 'bend', 'master': 'lift'}], "joint 'bend' follows 'lift'"),
