@@ -204,19 +204,34 @@ def from_file(robot: Robot, file: Path) -> Any:
         spec = mujoco.MjSpec.from_file(str(file))
     except (OSError, ValueError, mujoco.FatalError) as error:
         raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
-    followers = robot.kinematics.model.names[1:]
+    followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
+    tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
     for kind, present, wanted in (
         ('joint', spec.joints, [*followers]),
-        ('spatial tendon', spec.tendons, robot.muscles),
+        ('spatial tendon', tendons, robot.muscles),
         ('body', spec.bodies, [robot.description.end_effector]),
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
+    for name, slides in zip(followers, robot.kinematics.prismatic[1:], strict=True):
+        due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, spec.joint(name).type
+        if given != due:
+            what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))
+            told = f'joint {name!r} is a {what}, of {robot.description.directory} a {legal}'
+            raise _refusal(file, f'{told}; import_robot')
     for thing in [*spec.actuators, *spec.sensors, *spec.keys]:
         spec.delete(thing)
-    for joint in [joint for joint in spec.joints if joint.name not in followers]:
+    held = [joint for joint in spec.joints if joint.name not in followers]
+    gone = {joint.name for joint in held if joint.name}
+    for tie in [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]:
+        if not gone.isdisjoint([tie.name1, tie.name2]):
+            spec.delete(tie)
+    for tie in [tendon for tendon in spec.tendons if tendon not in tendons]:
+        if not gone.isdisjoint(wrap.target.name for wrap in tie.path):
+            spec.delete(tie)
+    for joint in held:
         spec.delete(joint)
     _add_hand(spec.body(robot.description.end_effector), pin.SE3.Identity())
     return _pulled(spec, robot)
