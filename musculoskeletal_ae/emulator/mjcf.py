@@ -28,6 +28,9 @@ LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.li
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
 THICKEST = 0.045  # [m] radius of a bone's head or a muscle
 POSTURES = 300  # in which they are fitted
+# MuJoCo makes a coupling as soft as either joint alone moves, whatever the ratio: by default, a
+# slider that follows a joint that turns would lag by centimetres.
+STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 HAND = 'hand of the emulator'
 
 Place = tuple[int, Array]  # joint, and where in its frame [m]
@@ -68,7 +71,8 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
             coupling, data = robot.description.couplings[name], np.zeros(11)
             data[:2] = coupling.offset, coupling.ratio
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
-            spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, data=data, **link)
+            link |= {'data': data, 'solimp': STIFF}
+            spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, **link)
         bodies.append(body)
     _add_routes(robot, draw, spec, bodies)
     joint, at = kin.placement(robot.description.end_effector)

@@ -88,6 +88,16 @@ def test_a_coupled_joint_follows_its_master(coupled):
     assert finger == pytest.approx(-0.5 * bend + 0.2, abs=0.02)
 
 
+def test_a_slider_that_follows_a_turning_joint_does_not_lag(tmp_path):
+    document = read_muscles(write_robot(tmp_path, slider=True))
+    document['joints'].remove('wrist')
+    document['couplings'] = [{'joint': 'wrist', 'master': 'bend', 'ratio': -0.03}]
+    arm = ForeignArm(Robot.load(write_muscles(tmp_path, document)), 0, NONE)
+    drive(arm, 2.0)
+    wrist, bend = (arm._data.joint(name).qpos[0] for name in ('wrist', 'bend'))
+    assert wrist == pytest.approx(-0.03 * bend, abs=5e-4)
+
+
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_alone_makes_another_arm_of_it(robot, name, monkeypatch):
     monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
