@@ -9,7 +9,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.modules import RACK, Arm
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -25,7 +25,9 @@ class EmulatedArm(Arm):
         super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
-        self._model.armature = np.full(self._model.nv, ARMATURE)
+        #: [1/m²] what drag, stops and inertia of a joint module are multiplied by where it slides
+        self._gear: Array = np.where(robot.kinematics.prismatic[1:], RACK**-2, 1.0)
+        self._model.armature = ARMATURE * self._gear
         self._data = self._model.createData()
         frame = self._model.frames[robot.kinematics.end_effector_frame]
         self._effector_joint = int(frame.parentJoint)
@@ -49,9 +51,12 @@ class EmulatedArm(Arm):
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
         friction[self._order] = true.joint_friction
         lower[self._order], upper[self._order] = robot.lower, robot.upper
+        firmness = self._gear.copy()
+        load = true.load / mechanics.STOP_LOAD
+        firmness[self._order] = np.maximum(firmness[self._order], load)
         return mechanics.Body(
             unit.force, unit.rate, unit.wire_stretch, true.length_at_zero, true.cable_friction,
-            true.tension_gain, true.tension_bias, friction, lower, upper,
+            true.tension_gain, true.tension_bias, friction, lower, upper, self._gear, firmness,
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:

@@ -68,8 +68,11 @@ class Individual:
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
         pulls = np.abs(nominal.muscle_jacobian(theta)) * robot.tension.bias[:, None]
-        load = np.abs(kin.holding_torque(theta)).max(axis=0) + pulls.sum(axis=1).max(axis=0)
-        self.joint_friction: Array = spread.joint_friction * load * rng.uniform(0.5, 1.5, len(load))
+        #: what weight and muscles at T_bias put on each joint [N·m], (D,)
+        self.load: Array = np.abs(kin.holding_torque(theta)).max(axis=0)
+        self.load = self.load + pulls.sum(axis=1).max(axis=0)
+        rubs = rng.uniform(0.5, 1.5, len(self.load))
+        self.joint_friction: Array = spread.joint_friction * self.load * rubs
         #: of the sensors [m], [N], a factor; each (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
@@ -125,12 +128,14 @@ def _objects(
             axis = (turn @ objects.axis[s])[:, None]
             away -= (away * axis).sum(axis=-1, keepdims=True) * axis
             least = np.linalg.norm(away, axis=-1).min()
-            objects.radius[s] = min(objects.radius[s] * described[s], 0.95 * least)
+            scale = min(described[s], 0.95 * least / objects.radius[s])
+            objects.radius[s] *= scale
+            objects.side[s] *= scale  # a ring stays one
             continue
-        moved = kin.moved_by[routes.joint[ends[0]]] ^ kin.moved_by[routes.joint[ends[1]]]
+        between = kin.hangs_on[routes.joint[ends[0]]] ^ kin.hangs_on[routes.joint[ends[1]]]
         best = np.inf
         for joint in range(1, len(kin.parent)):
-            if kin.prismatic[joint] or not moved[kin.theta_index[joint]]:
+            if kin.prismatic[joint] or not between[joint]:
                 continue
             start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start

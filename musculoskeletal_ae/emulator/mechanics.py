@@ -31,16 +31,18 @@ from musculoskeletal_ae.emulator.wrapping import (
 SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
 # Joints.
 STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up
-VISCOUS = 0.5  # [N·m·s/rad] or [N·s/m]
+VISCOUS = 0.5  # [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
+STOP_LOAD = 40.0  # [N·m] of weight and muscles at T_bias; stops of a joint with more are firmer
 
 
 #: Constants of one individual, as the compiled step wants them: elastic units, wires and sensors of
-#: M muscles, friction and stops of the J−1 joints of the tree.
+#: M muscles, friction and stops of the J−1 joints of the tree; gear and firmness are what viscous
+#: friction and stops are multiplied by.
 Body = namedtuple(
     'Body',
     'force rate wire_stretch length_at_zero cable_friction sensor_gain sensor_offset '
-    'joint_friction lower upper',
+    'joint_friction lower upper gear firmness',
 )
 #: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
 JointState = namedtuple('JointState', 'q velocity sticking torque')
@@ -141,10 +143,11 @@ def _friction_and_stops(body: Body, joint: JointState) -> None:
         keep = math.exp(-abs(turned) / STICKING_ANGLE)
         joint.sticking[i] = direction + (joint.sticking[i] - direction) * keep
         joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
-        joint.torque[i] -= VISCOUS * joint.velocity[i]
+        joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])
         beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])
         if beyond != 0.0:
-            joint.torque[i] -= STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
+            stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
+            joint.torque[i] -= body.firmness[i] * stop
 
 
 @njit(cache=True)

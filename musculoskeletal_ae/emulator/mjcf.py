@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import STEP
+from musculoskeletal_ae.emulator.modules import RACK, STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
@@ -28,6 +28,9 @@ LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.li
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
 THICKEST = 0.045  # [m] radius of a bone's head or a muscle
 POSTURES = 300  # in which they are fitted
+# MuJoCo makes a coupling as soft as either joint alone moves, whatever the ratio: by default, a
+# slider that follows a joint that turns would lag by centimetres.
+STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 HAND = 'hand of the emulator'
 
 Place = tuple[int, Array]  # joint, and where in its frame [m]
@@ -58,7 +61,9 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
         axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.local_axis[i]
         kinds = mujoco.mjtJoint
         kind = kinds.mjJNT_SLIDE if kin.prismatic[i] else kinds.mjJNT_HINGE
-        joint = body.add_joint(name=name, type=kind, axis=axis, armature=ARMATURE, damping=DAMPING)
+        gear = RACK**-2 if kin.prismatic[i] else 1.0
+        module = {'armature': gear * ARMATURE, 'damping': gear * DAMPING}
+        joint = body.add_joint(name=name, type=kind, axis=axis, **module)
         if name in robot.joints:
             k = robot.joints.index(name)
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
@@ -66,7 +71,8 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
             coupling, data = robot.description.couplings[name], np.zeros(11)
             data[:2] = coupling.offset, coupling.ratio
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
-            spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, data=data, **link)
+            link |= {'data': data, 'solimp': STIFF}
+            spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, **link)
         bodies.append(body)
     _add_routes(robot, draw, spec, bodies)
     joint, at = kin.placement(robot.description.end_effector)
@@ -87,11 +93,12 @@ def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
             if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
                 # Described ones are a little off as well.
-                radius = item.radius * (rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0)
-                _add_round(bodies[joint], name, place, axis, radius)
+                scale = rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0
+                _add_round(bodies[joint], name, place, axis, scale * item.radius)
                 if item.side is not None:
                     side = f'{name} side'
-                    bodies[joint].add_site(name=side, pos=at.act(item.side))
+                    beside = item.xyz + scale * (item.side - item.xyz)  # a ring stays one
+                    bodies[joint].add_site(name=side, pos=at.act(beside))
                 tendon.wrap_geom(name, side)
                 before = []
                 continue
@@ -201,19 +208,34 @@ def from_file(robot: Robot, file: Path) -> Any:
         spec = mujoco.MjSpec.from_file(str(file))
     except (OSError, ValueError, mujoco.FatalError) as error:
         raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
-    followers = robot.kinematics.model.names[1:]
+    followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
+    tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
     for kind, present, wanted in (
         ('joint', spec.joints, [*followers]),
-        ('spatial tendon', spec.tendons, robot.muscles),
+        ('spatial tendon', tendons, robot.muscles),
         ('body', spec.bodies, [robot.description.end_effector]),
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
+    for name, slides in zip(followers, robot.kinematics.prismatic[1:], strict=True):
+        due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, spec.joint(name).type
+        if given != due:
+            what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))
+            told = f'joint {name!r} is a {what}, of {robot.description.directory} a {legal}'
+            raise _refusal(file, f'{told}; import_robot')
     for thing in [*spec.actuators, *spec.sensors, *spec.keys]:
         spec.delete(thing)
-    for joint in [joint for joint in spec.joints if joint.name not in followers]:
+    held = [joint for joint in spec.joints if joint.name not in followers]
+    gone = {joint.name for joint in held if joint.name}
+    for tie in [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]:
+        if not gone.isdisjoint([tie.name1, tie.name2]):
+            spec.delete(tie)
+    for tie in [tendon for tendon in spec.tendons if tendon not in tendons]:
+        if not gone.isdisjoint(wrap.target.name for wrap in tie.path):
+            spec.delete(tie)
+    for joint in held:
         spec.delete(joint)
     _add_hand(spec.body(robot.description.end_effector), pin.SE3.Identity())
     return _pulled(spec, robot)

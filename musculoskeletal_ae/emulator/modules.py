@@ -24,6 +24,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # [s]
+RACK = 0.06  # [m] radius of the pinion by which a joint module moves what slides; chosen
 
 # What a module follows.
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,10 +32,13 @@ def make_arm(robot: Robot, seed: int = 0, reality: str = KIN, friction: bool = T
             individual.cable_friction[:] = 0.0
             individual.joint_friction[:] = 0.0
         return EmulatedArm(robot, seed, individual)
-    file = None if reality == FOREIGN else Path(reality).expanduser()
-    if file is not None and not file.is_file():
-        legal = f'{KIN}, {FOREIGN} or an MJCF file'
-        raise MusculoskeletalError(f'reality {reality!r} is no such file; legal: {legal}')
+    file = None
+    if reality != FOREIGN:
+        with suppress(RuntimeError, OSError):  # no such home, a name too long
+            file = path if (path := Path(reality).expanduser()).is_file() else None
+        if file is None:
+            legal = f'{KIN}, {FOREIGN} or an MJCF file'
+            raise MusculoskeletalError(f'reality {reality[:80]!r} is no such file; legal: {legal}')
     # Only here, so that the first body does not wait for MuJoCo.
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm

@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
@@ -99,9 +100,9 @@ class RobotDescription:
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are in neither θ nor a coupling to it: held fixed."""
-        moving = {slave for slave, c in self.couplings.items() if c.master in self.joints}
-        return tuple(n for n in self.model.names[1:] if n not in moving | set(self.joints))
+        """Movable joints of the URDF that are in neither θ nor a coupling: held fixed."""
+        known = {*self.couplings, *self.joints}
+        return tuple(name for name in self.model.names[1:] if name not in known)
 
     @property
     def joint_notes(self) -> list[str]:
@@ -144,6 +145,9 @@ def load_description(robot: str | Path) -> RobotDescription:
     for item in top['muscles'].items(1, 'muscles'):
         entry = item.mapping('name', 'route', 'series_elastic', 'stiffness', 'tension')
         names.append(entry['name'].name())
+        if names[-1] != names[-1].strip() or ',' in names[-1]:
+            told = f'without a comma or spaces around it, got {names[-1]!r}'
+            raise entry['name'].fail(f'expected a name {told}: lists of muscles have commas')
         muscle = entry.called(f'muscle {names[-1]!r}')
         routes.append(_read_route(muscle['route'], links, warnings))
         elastic.append(_read_elastic(muscle.get('series_elastic'), default))
@@ -208,7 +212,6 @@ def _read_couplings(
         links[names[-1]] = Coupling(given['master'].name(), ratio, offset)
     entry.unique(names)
     for slave in links:
-        _one_axis_joint(entry, slave, model)
         if slave in joints:
             source = 'couplings' if slave in names else 'its <mimic> in robot.urdf'
             raise entry.fail(
@@ -219,8 +222,18 @@ def _read_couplings(
         couplings = resolved(links)
     except ValueError as error:
         raise entry.fail(str(error)) from error
-    for coupling in couplings.values():
-        _one_axis_joint(entry, coupling.master, model)
+    for slave, coupling in list(couplings.items()):
+        try:
+            for name in (slave, coupling.master):
+                _one_axis_joint(entry, name, model)
+        except RobotDescriptionError:
+            if (
+                slave in names
+                or coupling.master in joints
+                or not model.existJointName(coupling.master)
+            ):
+                raise
+            del couplings[slave]  # of wheels that the URDF has elsewhere: held as well
     return couplings
 
 

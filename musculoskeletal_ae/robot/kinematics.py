@@ -164,10 +164,6 @@ class Kinematics:
         self.hangs_on = np.eye(count, dtype=bool)
         for i in range(1, count):
             self.hangs_on[i] |= self.hangs_on[self.parent[i]]
-        #: moved_by[i, k]: joint i of the tree hangs on joint k of θ, or on one that follows it
-        self.moved_by = np.zeros((count, len(ids)), dtype=bool)
-        for j in range(1, count):
-            self.moved_by[:, self.theta_index[j]] |= self.hangs_on[:, j]
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
         """Return the joint of the tree that carries a link's point, and the point in its frame."""

@@ -52,9 +52,12 @@ class Routes:
         """Attach the routes of a description to the tree."""
         self._kinematics = kinematics
         links = ([kinematics.placement(item.link)[0] for item in route] for route in routes)
-        moved = [kinematics.moved_by[joints] for joints in links]
-        #: joints that each muscle crosses: they move some of its route and not all, (M, D)
-        self.crossed: Bools = np.array([some.any(axis=0) & ~some.all(axis=0) for some in moved])
+        hangs = [kinematics.hangs_on[joints, 1:] for joints in links]
+        # Joints of the tree: where two that turn together carry all of a route, it still changes.
+        parted = np.array([some.any(axis=0) & ~some.all(axis=0) for some in hangs])
+        of_theta = np.eye(len(kinematics.lower), dtype=bool)[kinematics.theta_index[1:]]
+        #: joints that each muscle crosses: they or what follows them move some of it, (M, D)
+        self.crossed: Bools = parted @ of_theta
         pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
         attached = [kinematics.attach(*point) for points in pieces for point in points]
         #: joint of the tree that carries each point, (P,), and the point in its frame [m], (P, 3)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading robot.urdf by pinocchio, after a check of every number in it.
 
-The check is ours because the URDF parser only warns about a mass or an inertia that is no number,
-drops the whole inertial element and goes on with a link that weighs nothing.
+The check is ours because the URDF parser only warns about a mass or an inertia that is no number
+or missing, drops the whole inertial element and goes on with a link that weighs nothing.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -23,6 +24,11 @@ from musculoskeletal_ae.robot.kinematics import Coupling
 MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
 LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
 AXES = ('x', 'y', 'z')
+
+#: whether a joint of that type needs limits
+KINDS = {'revolute': True, 'prismatic': True} | dict.fromkeys(
+    ('continuous', 'fixed', 'floating', 'planar'), False
+)
 
 #: how many numbers an attribute holds, by element
 NUMBERS = {
@@ -59,6 +65,8 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         axis, turns = part.find('axis'), part.get('type') in ('revolute', 'continuous', 'prismatic')
         if turns and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
             raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
+    if parts:
+        _check_tree(file, parts)
     try:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
@@ -76,6 +84,10 @@ def parse_xml(file: Path, text: str) -> ET.Element:
         root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
         if max(_levels(root)) > DEEPEST:
             raise ValueError(f'more than {DEEPEST} levels')
+        # A default namespace, which the URDF parser does not look at.
+        if space := root.tag.rpartition('}')[0]:
+            for element in root.iter():
+                element.tag = element.tag.removeprefix(space + '}')
     except (ET.ParseError, ValueError) as error:
         raise RobotDescriptionError(f'{file}: not valid XML: {error}') from error
     return root
@@ -101,13 +113,46 @@ def _levels(root: ET.Element) -> Iterator[int]:
         waiting += [(child, level + 1) for child in element]
 
 
+def _check_tree(file: Path, parts: list[ET.Element]) -> None:
+    """Refuse what is no tree; the parser says why on stderr only, and takes a link's last joint."""
+    links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
+    for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():
+        if not name or count > 1:
+            problem = f'comes {count} times' if name else 'has no name'
+            raise RobotDescriptionError(f'{file}: {tag} {name!r} {problem}; expected unique names')
+    for part in parts:
+        if part.tag == 'joint':
+            where, kind = f'{file}: joint {part.get("name")!r}', part.get('type')
+            if kind not in KINDS:
+                legal = ', '.join(KINDS)
+                raise RobotDescriptionError(f'{where}: type: expected one of {legal}, got {kind!r}')
+            limit = part.find('limit')
+            given = set() if limit is None else set(limit.keys())
+            if KINDS[kind] and (lacking := {'effort', 'velocity'} - given):
+                told = f'{", ".join(sorted(lacking))}, which a {kind} joint needs'
+                raise RobotDescriptionError(f'{where}: limit: expected {told}')
+            for end in ('parent', 'child'):
+                link = '' if (found := part.find(end)) is None else found.get('link', '')
+                if link not in links or (end == 'child' and link in held):
+                    told = f'{link!r} has a joint above it already' if link in held else repr(link)
+                    raise RobotDescriptionError(
+                        f'{where}: {end}: expected a link of this file, each below one joint, '
+                        f'got {told}'
+                    )
+            held.add(link)
+    if len(roots := sorted(map(str, links - held))) != 1:
+        told = ', '.join(roots) or 'none'
+        raise RobotDescriptionError(f'{file}: expected one link that is below no joint, got {told}')
+
+
 def _check(part: str, element: ET.Element) -> None:
     for attribute, count in NUMBERS.get(element.tag, {}).items():
         text = element.get(attribute)
         if text is None:
             continue
         try:
-            values = [float(word) for word in text.split()]
+            # Python reads 1_000 and other alphabets' digits, the URDF parser does not.
+            values = [float(word) for word in text.split() if word.isascii() and '_' not in word]
         except ValueError:
             values = []
         expected = 'a finite number' if count == 1 else f'{count} finite numbers'
@@ -124,6 +169,12 @@ def _check(part: str, element: ET.Element) -> None:
             raise RobotDescriptionError(
                 f'{part}: {element.tag} {attribute}: expected {expected}, got {text!r}'
             )
+    if element.tag == 'inertial':
+        for tag in ('mass', 'inertia'):
+            given = set() if (found := element.find(tag)) is None else set(found.keys())
+            if lacking := NUMBERS[tag].keys() - given:
+                told = f'{", ".join(sorted(lacking))}; links without mass have no <inertial>'
+                raise RobotDescriptionError(f'{part}: {tag}: expected {told}')
     if element.tag == 'inertia':
         inertia = [
             [float(element.get('i' + ''.join(sorted(a + b)), 0.0)) for b in AXES] for a in AXES

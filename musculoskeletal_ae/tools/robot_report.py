@@ -127,13 +127,17 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     arms = 1e3 * result.moment_arms.transpose(2, 1, 0)
-    for panel, name, angle, of_joint in zip(axes, robot.joints, result.setting.theta.T, arms):
+    slides = robot.kinematics.prismatic[robot.kinematics.tree]
+    for panel, name, angle, of_joint, slide in zip(
+        axes, robot.joints, result.setting.theta.T, arms, slides
+    ):
+        label, shown_as = ('position [mm]', 1e3) if slide else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
             if np.abs(of_joint[m]).max() >= 1e3 * MATTERS:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}
-                panel.scatter(np.rad2deg(angle), of_joint[m], **look)
+                panel.scatter(shown_as * angle, of_joint[m], **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
-        panel.set(title=name, xlabel='joint angle [deg]', ylabel='moment arm −G [mm]')
+        panel.set(title=name, xlabel=label, ylabel='moment arm −G [mm]')
         if panel.collections:
             panel.legend(fontsize=6, ncols=2, markerscale=2, loc='best')
     last, held = axes[robot.joint_count], result.held

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from robots import write_robot
 
 from musculoskeletal_ae.emulator import mechanics, modules
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -227,3 +228,20 @@ def test_no_wrench_that_is_taken_breaks_it_and_reset_mends_one_that_does(name, r
     arm.step(1.0)
     assert not arm.broken
     assert np.abs(arm.velocity).max() < 10.0
+
+
+@pytest.mark.parametrize('reality', ['kin', 'foreign'])
+def test_a_joint_that_slides_stops_at_its_limits(tmp_path, reality):
+    """As firmly as a joint that turns, driven by a pinion: 200 N go some millimetres beyond."""
+    urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
+    urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # the tool
+    robot = Robot.load(tmp_path)
+    arm, pull = make_arm(robot, 0, reality), robot.tension.bias.copy()
+    for name in ('slider_in', 'slider_out'):
+        pull[robot.muscles.index(name)] = robot.tension.limit[0]
+        for _ in range(10):
+            arm.command_tension(pull)
+            arm.step(0.1)
+            beyond = np.maximum(arm.theta - robot.upper, robot.lower - arm.theta)
+            assert beyond[-1] < 0.01
+        pull[:] = robot.tension.bias

@@ -88,6 +88,16 @@ def test_a_coupled_joint_follows_its_master(coupled):
     assert finger == pytest.approx(-0.5 * bend + 0.2, abs=0.02)
 
 
+def test_a_slider_that_follows_a_turning_joint_does_not_lag(tmp_path):
+    document = read_muscles(write_robot(tmp_path, slider=True))
+    document['joints'].remove('wrist')
+    document['couplings'] = [{'joint': 'wrist', 'master': 'bend', 'ratio': -0.03}]
+    arm = ForeignArm(Robot.load(write_muscles(tmp_path, document)), 0, NONE)
+    drive(arm, 2.0)
+    wrist, bend = (arm._data.joint(name).qpos[0] for name in ('wrist', 'bend'))
+    assert wrist == pytest.approx(-0.03 * bend, abs=5e-4)
+
+
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_alone_makes_another_arm_of_it(robot, name, monkeypatch):
     monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
@@ -215,6 +225,12 @@ def test_a_users_model_plays_the_robot(imported):
         ('name="swing"', 'name="swung"', "joint 'swing'"),
         ('name="front"', 'name="ahead"', "tendon 'front'"),
         ('<mujoco', '<mujoko', 'MuJoCo does not load it'),
+        ('name="lift"', 'type="slide" name="lift"', "joint 'lift' is a slide, .* a hinge"),
+        (
+            '<spatial name="out"><site site="o3"/><site site="u3"/></spatial>',
+            '<fixed name="out"><joint joint="elbow" coef="1"/></fixed>',
+            "spatial tendon 'out'",
+        ),
     ],
 )
 def test_a_model_that_does_not_fit_the_robot_is_refused(imported, tmp_path, old, new, told):
@@ -223,6 +239,22 @@ def test_a_model_that_does_not_fit_the_robot_is_refused(imported, tmp_path, old,
     other.write_text(text, encoding='utf-8')
     with pytest.raises(MusculoskeletalError, match=told):
         make_arm(imported[1], 0, str(other))
+
+
+def test_what_ties_joints_that_are_held_is_left_out(imported, tmp_path):
+    other = tmp_path / 'other.xml'
+    more = '<body><joint name="more"/><geom size="0.01" mass="0.01"/></body><body name="finger"'
+    text = bodies.MJCF.replace('<body name="finger"', more)
+    text = text.replace('<equality>', '<equality><joint joint1="more" joint2="elbow"/>')
+    text = text.replace('joint="elbow" coef="1"/>', 'joint="more" coef="1"/>')
+    other.write_text(text, encoding='utf-8')
+    assert make_arm(imported[1], 0, str(other))._model.neq == 1
+
+
+@pytest.mark.parametrize('reality', ['~nobody at all/arm.xml', 'x' * 5000])
+def test_a_path_that_cannot_be_is_no_reality(robot, reality):
+    with pytest.raises(MusculoskeletalError, match='is no such file'):
+        make_arm(robot, 0, reality)
 
 
 def test_no_such_reality_is_refused(robot):

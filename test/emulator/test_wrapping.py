@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual, Spread
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -45,3 +47,19 @@ def test_a_seed_is_one_individual_and_another_seed_is_another():
     np.testing.assert_array_equal(one, same)
     assert np.abs(one - other).max() > 1e-3
     assert np.abs(one - robot.routes.absolute_lengths(theta)).max() > 1e-3
+
+
+def test_a_thicker_or_thinner_drum_is_no_ring_and_a_ring_no_drum(tmp_path):
+    document = read_muscles(write_robot(tmp_path))
+    for m, share in ((6, 1.02), (7, 0.98)):
+        side = {'side': [-0.03 * share, 0.0, -0.3]}
+        drum = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, -0.3], 'axis': [0, 1, 0]}
+        document['muscles'][m]['route'][1:2] = [{**drum, 'radius': 0.03, **side}]
+    robot = Robot.load(write_muscles(tmp_path, document))
+    for seed in range(6):
+        true, model = Individual(robot, seed).routes.objects, ForeignArm(robot, seed)._model
+        away = [np.linalg.norm(true.side[s]) / true.radius[s] for s in robot.routes.wrapping]
+        for name in robot.muscles[6:]:
+            geom, site = model.geom(f'{name}, 1'), model.site(f'{name}, 1 side')
+            away.append(np.linalg.norm(site.pos - geom.pos) / geom.size[0])
+        np.testing.assert_allclose(away, [1.02, 0.98] * 2)

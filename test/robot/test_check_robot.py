@@ -7,12 +7,14 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.check_robot import main
+from musculoskeletal_ae.tools.robot_report import plot
 
 SHIPPED = ['musashi_left_arm', 'musashi_upper_body', 'arm26']
 
@@ -85,6 +87,14 @@ def test_the_same_seed_gives_the_same_postures_and_another_seed_others():
     one, two, three = (check_robot(robot, 20, seed).setting.theta for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, three)
+
+
+def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path, monkeypatch):
+    robot, figures = Robot.load(write_robot(tmp_path, slider=True)), list[Figure]()
+    monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: figures.append(figure))
+    plot(robot, check_robot(robot, 5), tmp_path / 'plot.png')
+    labels = [panel.get_xlabel() for panel in figures[0].axes[:4]]
+    assert labels == ['joint angle [deg]'] * 3 + ['position [mm]']
 
 
 @pytest.mark.parametrize('name', SHIPPED)

@@ -59,6 +59,21 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
 
 
+def test_a_muscle_at_a_coupled_joint_crosses_its_master(tmp_path):
+    coupled_arm(tmp_path, couplings=[COUPLED])
+    document = read_muscles(tmp_path)
+    route = [
+        {'link': 'lower', 'xyz': [0.0, 0.02, -0.2]},
+        {'link': 'fingertip', 'xyz': [0.02, 0, 0]},
+    ]
+    document['muscles'].append({'name': 'closer', 'route': route})
+    robot = Robot.load(write_muscles(tmp_path, document))
+    theta = robot.random_postures(5, np.random.default_rng(0))
+    moves = np.abs(robot.routes.muscle_jacobian(theta)).max(axis=0) > 1e-9
+    np.testing.assert_array_equal(robot.routes.crossed[-1], moves[-1])
+    assert robot.routes.crossed[-1].tolist() == [True, False, False]
+
+
 def test_the_emulated_joint_follows_its_master(robot):
     arm = EmulatedArm(robot, 0)
     before = arm.theta
@@ -84,6 +99,19 @@ def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(robot, tmp_path
     theta = mimic.random_postures(5, np.random.default_rng(0))
     expected = robot.routes.absolute_lengths(theta)
     np.testing.assert_array_equal(mimic.routes.absolute_lengths(theta), expected)
+
+
+def test_a_mimic_is_followed_in_a_default_namespace_and_wheels_elsewhere_are_held(tmp_path):
+    urdf = coupled_arm(tmp_path) / 'robot.urdf'
+    wheels = ''.join(
+        f'<link name="{name}"/><joint name="{name}" type="continuous"><parent link="base"/>'
+        f'<child link="{name}"/>{mimic}</joint>'
+        for name, mimic in {'left': '', 'right': '<mimic joint="left"/>'}.items()
+    )
+    text = urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC).replace('</robot>', wheels)
+    urdf.write_text(text.replace('<robot', '<robot xmlns="http://any"') + '</robot>')
+    notes = Robot.load(tmp_path).description.joint_notes
+    assert notes == ['finger = -0.5 · bend +0.2', 'held fixed at 0: left, right']
 
 
 BAD = {

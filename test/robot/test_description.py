@@ -68,6 +68,7 @@ BAD = {
     'elastic key': (put(['series_elastic', 'k'], 1.0), ["'k'", 'force, rate, wire_stretch']),
     'elastic zero': (put(['series_elastic', 'force'], 0.0), ['series_elastic.force', '> 0']),
     'negative stretch': (put(['series_elastic', 'wire_stretch'], -1e-5), ['wire_stretch', '>= 0']),
+    'name with a comma': (put(['muscles', 0, 'name'], 'a, b'), ['muscles[0].name', "'a, b'"]),
     'stiffness zero': (put(['stiffness'], 0.0), ['stiffness', '> 0']),
     'stiffness empty': (put(['stiffness'], None), ['stiffness', 'None']),
     'tension key': (put(['tension', 'min'], 1.0), ["'min'", 'bias, limit, max']),
@@ -122,7 +123,19 @@ BAD_URDF = {
     'limit nan': ('lower="-1.9199"', 'lower="nan"', ["joint 'elbow'", 'limit lower']),
     'limits crossed': ('lower="-1.9199"', 'lower="1.0"', ["'elbow'", 'lower < upper']),
     'continuous': ('type="revolute"', 'type="continuous"', ['revolute or prismatic', 'limits']),
-    'no such parent': ('parent link="upper_arm"', 'parent link="x"', ['not a valid URDF']),
+    'no such parent': (
+        'parent link="upper_arm"',
+        'parent link="x"',
+        ["joint 'elbow': parent", "'x'"],
+    ),
+    'mass missing': ('<mass value="0.8"/>', '', ["'forearm'", 'mass: expected value']),
+    'moment missing': ('ixx="0.0050"', '', ["'forearm'", 'inertia: expected ixx']),
+    'no number to all': ('<mass value="0.8"/>', '<mass value="0_8"/>', ["'forearm'", '0_8']),
+    'effort missing': ('effort="', 'force="', ["joint 'shoulder'", 'limit: expected effort']),
+    'joint type': ('type="revolute"', 'type="hinge"', ["joint 'shoulder'", 'prismatic', 'hinge']),
+    'two joints above': ('child link="hand"', 'child link="forearm"', ["'forearm'", 'already']),
+    'link twice': ('<link name="hand"', '<link name="torso"', ["link 'torso' comes 2 times"]),
+    'two roots': ('<link name="hand"', '<link name="x"/><link name="hand"', ['torso, x']),
 }
 
 
