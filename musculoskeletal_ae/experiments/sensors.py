@@ -108,8 +108,10 @@ def sensors(_: Study, rows: Rows) -> Plot:
     """Draw the error that is left with less and less sensors."""
     figure, (panel,) = plots.new_figure(9.0, 4.2)
     values = np.array([[row.numbers[key] for key in BARS] for row in rows.values()])
-    bars = panel.bar(range(len(BARS)), values.mean(axis=0), 0.6, color=plots.AFTER)
-    panel.bar_label(bars, fmt='%.3f', fontsize=9)
+    means = values.mean(axis=0)
+    panel.bar(range(len(BARS)), means, 0.6, color=plots.AFTER)
+    for place, (mean, top) in enumerate(zip(means, values.max(axis=0))):
+        panel.annotate(f'{mean:.3f}', (place, top), (0, 5), textcoords='offset points', ha='center')
     for each in values:
         panel.plot(range(len(BARS)), each, 'o', color=plots.MARK, ms=3)
     panel.set_xticks(range(len(BARS)), BARS.values(), rotation=15)
