@@ -18,9 +18,9 @@ What a marker and an accelerometer are worth is told by `experiment sensors`.
 
 from __future__ import annotations
 
-import argparse
-import tempfile
+import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
@@ -34,11 +34,13 @@ from musculoskeletal_ae.experiments.recording import (
     Recording,
     end_tensions,
     estimation_error,
+    judge,
     record,
 )
 from musculoskeletal_ae.learning import postures
 from musculoskeletal_ae.learning.learner import MARKER, NONE, Learner
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 300.0  # [s]
@@ -76,35 +78,38 @@ def measure(robot: Robot, seed: int, folder: Path, minutes: float) -> dict[str, 
     """Return the errors of one individual [rad]."""
     arm = learned_arm(robot, seed, folder, minutes)
     held_out = record(EmulatedArm(robot, seed), arm.driver, HELD_OUT_STREAM, HELD_OUT)
+    error = judge(held_out)
     none = taught(arm, robot, seed)
     with patch.object(postures, 'NEAR_STOP', -np.inf):
         no_stops = taught(arm, robot, seed)
-    errors = {'before': arm.driver, 'all joint sensors': arm.mae, 'none': none}
-    errors |= {'no stops': no_stops, 'stated': taught(arm, robot, seed, stated=True)}
+    networks = {'before': arm.driver, 'all joint sensors': arm.mae, 'none': none}
+    networks |= {'no stops': no_stops, 'stated': taught(arm, robot, seed, stated=True)}
     return {
-        **{title: estimation_error(mae, held_out) for title, mae in errors.items()},
+        **{title: error(mae) for title, mae in networks.items()},
         'zeroed': zeroed(none, arm.exploring, held_out, seed),
     }
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> int:
     """Print a line for each individual."""
-    parser = argparse.ArgumentParser(
-        prog='anchors', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0,1', help='individuals')
-    parser.add_argument('--minutes', type=float, default=10.0, help='of exploration')
+    parser = Parser('anchors', 'What stops and a stated posture are worth without joint sensors.')
+    parser.add_robot()
+    parser.add_seeds((0, 1))
+    parser.add_minutes('duration of the exploration', 10.0)
     parser.add_argument('--folder', type=Path, help='keeps what was learned for the next run')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    robot = Robot.load(args.robot)
-    with tempfile.TemporaryDirectory() as scratch:
-        for seed in map(int, args.seeds.split(',')):
-            errors = measure(robot, seed, args.folder or Path(scratch), args.minutes)
-            said = ', '.join(f'{title} {error:.4f}' for title, error in errors.items())
-            print(f'individual {seed}: {said} rad', flush=True)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        with TemporaryDirectory() as scratch:
+            for seed in args.seeds:
+                errors = measure(robot, seed, args.folder or Path(scratch), args.minutes)
+                said = ', '.join(f'{title} {error:.4f}' for title, error in errors.items())
+                print(f'individual {seed}: {said} rad', flush=True)
+
+    return exit_status(work)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -196,8 +196,9 @@ def main(argv: list[str] | None = None) -> int:
     def measure() -> None:
         robot, rows = Robot.load(args.robot), []
         with TemporaryDirectory() as folder:
-            how = args.seeds, args.minutes, args.quick, Path(folder), args.reality
-            study = Study(robot, 'paper', *how)
+            study = Study(
+                robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder), args.reality
+            )
             checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
             for seed in args.seeds:
                 rows.append(individual(study, seed))

@@ -12,7 +12,7 @@ the lengths have told G already, and far more exactly than the torques could.
 
 from __future__ import annotations
 
-import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.robot import Robot
 
 FITS = 3  # each goes on fitting from where the last one ended
@@ -61,20 +62,24 @@ def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog='torque_residual', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0', help='individuals')
-    parser.add_argument('--minutes', type=float, default=10.0, help='of exploration')
+    parser = Parser('torque_residual', 'The torque balance at rest of what was learned.')
+    parser.add_robot()
+    parser.add_seeds((0,))
+    parser.add_minutes('duration of the exploration', 10.0)
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    robot = Robot.load(args.robot)
-    mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
-    for seed in map(int, args.seeds.split(',')):
-        print(table(robot, mae, seed, args.minutes), flush=True)
+
+    def work() -> None:
+        robot = Robot.load(args.robot)
+        mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
+        for seed in args.seeds:
+            print(table(robot, mae, seed, args.minutes), flush=True)
+
+    return exit_status(work)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

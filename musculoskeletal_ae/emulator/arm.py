@@ -9,7 +9,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.modules import RACK, Arm
+from musculoskeletal_ae.emulator.modules import Arm, joint_gear
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -25,8 +25,7 @@ class EmulatedArm(Arm):
         super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
-        #: [1/m²] what drag, stops and inertia of a joint module are multiplied by where it slides
-        self._gear: Array = np.where(robot.kinematics.prismatic[1:], RACK**-2, 1.0)
+        self._gear = joint_gear(robot.kinematics)[1:]
         self._model.armature = ARMATURE * self._gear
         self._data = self._model.createData()
         frame = self._model.frames[robot.kinematics.end_effector_frame]

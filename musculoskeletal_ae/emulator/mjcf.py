@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import RACK, STEP
+from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
@@ -47,7 +47,7 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
     spec.compiler.boundmass = 1e-6  # of links that weigh nothing
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
-    bodies = [spec.worldbody]
+    bodies, gear = [spec.worldbody], joint_gear(kin)
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
         long = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD  # two axes in one place stay so
@@ -61,8 +61,7 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
         axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.local_axis[i]
         kinds = mujoco.mjtJoint
         kind = kinds.mjJNT_SLIDE if kin.prismatic[i] else kinds.mjJNT_HINGE
-        gear = RACK**-2 if kin.prismatic[i] else 1.0
-        module = {'armature': gear * ARMATURE, 'damping': gear * DAMPING}
+        module = {'armature': gear[i] * ARMATURE, 'damping': gear[i] * DAMPING}
         joint = body.add_joint(name=name, type=kind, axis=axis, **module)
         if name in robot.joints:
             k = robot.joints.index(name)

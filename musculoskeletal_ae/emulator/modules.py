@@ -21,6 +21,7 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # [s]
@@ -48,6 +49,15 @@ TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 ACCELERATION_NOISE = 0.05  # [m/s²]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
+
+
+def joint_gear(kinematics: Kinematics) -> Array:
+    """Return what drag, stops and inertia of joint modules are multiplied by, (J,) of the tree.
+
+    It is 1 where they turn a joint, and that of the pinion [1/m²] where they slide it.
+    """
+    gear: Array = np.where(kinematics.prismatic, RACK**-2, 1.0)
+    return gear
 
 
 class Modules(NamedTuple):

@@ -30,7 +30,7 @@ from musculoskeletal_ae.importing.source import (
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
-from musculoskeletal_ae.robot.urdf import MOST_PARTS, parse_xml, read_mimics, read_urdf
+from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_mimics, read_urdf
 
 FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # what later versions of SDF add
 
@@ -184,7 +184,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
             here, axis = pose(links[name]) * pose(joint), value(joint, 'axis/xyz', 3, '0 0 1')
             if joint.findtext('axis/use_parent_model_frame', '0').strip() in ('1', 'true'):
                 axis = here.rotation.T @ axis
-            if kind in ('revolute', 'continuous', 'prismatic'):
+            if kind in ONE_AXIS:
                 limit = joint.find('axis/limit') if kind != 'continuous' else None
                 if limit is not None and _endless(limit.findtext('lower'), limit.findtext('upper')):
                     limit = None

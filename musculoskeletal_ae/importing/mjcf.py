@@ -22,10 +22,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.importing.source import Source, distinct, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 
-#: where a model says how many it has of each kind
+#: where a model says how many it has of each kind that has names here
 COUNTS = {
-    'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon',
-    'site': 'nsite', 'actuator': 'nu', 'equality': 'neq',
+    'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
 STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stronger
 
@@ -112,12 +111,8 @@ class _Reader:
         axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
         if kind == types.mjJNT_BALL:
             source.note('approximated', f'ball joint {name}: three hinges, x then y then z')
-            axes, names, rest, low = (
-                list(np.eye(3)),
-                distinct((f'{name}_{c}' for c in 'xyz'), self.names['joint']),
-                0.0,
-                -high,
-            )
+            axes, rest, low = list(np.eye(3)), 0.0, -high
+            names = distinct((f'{name}_{c}' for c in 'xyz'), self.names['joint'])
             self.balls[j] = names
         for part, axis in zip(names, axes):
             back, still = -axis * rest, np.zeros(3)

@@ -223,15 +223,12 @@ def _read_couplings(
     except ValueError as error:
         raise entry.fail(str(error)) from error
     for slave, coupling in list(couplings.items()):
+        elsewhere = slave not in names and coupling.master not in joints
         try:
             for name in (slave, coupling.master):
                 _one_axis_joint(entry, name, model)
         except RobotDescriptionError:
-            if (
-                slave in names
-                or coupling.master in joints
-                or not model.existJointName(coupling.master)
-            ):
+            if not (elsewhere and model.existJointName(coupling.master)):
                 raise
             del couplings[slave]  # of wheels that the URDF has elsewhere: held as well
     return couplings

@@ -25,10 +25,9 @@ MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
 LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
 AXES = ('x', 'y', 'z')
 
-#: whether a joint of that type needs limits
-KINDS = {'revolute': True, 'prismatic': True} | dict.fromkeys(
-    ('continuous', 'fixed', 'floating', 'planar'), False
-)
+LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
+ONE_AXIS = *LIMITED, 'continuous'
+KINDS = *ONE_AXIS, 'fixed', 'floating', 'planar'
 
 #: how many numbers an attribute holds, by element
 NUMBERS = {
@@ -62,9 +61,6 @@ def read_urdf(file: Path, text: str) -> pin.Model:
             raise RobotDescriptionError(f'{where}: expected another name, pinocchio uses this one')
         for element in part.iter():
             _check(where, element)
-        axis, turns = part.find('axis'), part.get('type') in ('revolute', 'continuous', 'prismatic')
-        if turns and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
-            raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
     if parts:
         _check_tree(file, parts)
     try:
@@ -122,15 +118,8 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
             raise RobotDescriptionError(f'{file}: {tag} {name!r} {problem}; expected unique names')
     for part in parts:
         if part.tag == 'joint':
-            where, kind = f'{file}: joint {part.get("name")!r}', part.get('type')
-            if kind not in KINDS:
-                legal = ', '.join(KINDS)
-                raise RobotDescriptionError(f'{where}: type: expected one of {legal}, got {kind!r}')
-            limit = part.find('limit')
-            given = set() if limit is None else set(limit.keys())
-            if KINDS[kind] and (lacking := {'effort', 'velocity'} - given):
-                told = f'{", ".join(sorted(lacking))}, which a {kind} joint needs'
-                raise RobotDescriptionError(f'{where}: limit: expected {told}')
+            where = f'{file}: joint {part.get("name")!r}'
+            _check_joint(where, part)
             for end in ('parent', 'child'):
                 link = '' if (found := part.find(end)) is None else found.get('link', '')
                 if link not in links or (end == 'child' and link in held):
@@ -143,6 +132,19 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     if len(roots := sorted(map(str, links - held))) != 1:
         told = ', '.join(roots) or 'none'
         raise RobotDescriptionError(f'{file}: expected one link that is below no joint, got {told}')
+
+
+def _check_joint(where: str, joint: ET.Element) -> None:
+    kind, axis, limit = joint.get('type'), joint.find('axis'), joint.find('limit')
+    if kind not in KINDS:
+        legal = ', '.join(KINDS)
+        raise RobotDescriptionError(f'{where}: type: expected one of {legal}, got {kind!r}')
+    if kind in ONE_AXIS and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
+        raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
+    given = set() if limit is None else set(limit.keys())
+    if kind in LIMITED and (lacking := {'effort', 'velocity'} - given):
+        told = f'{", ".join(sorted(lacking))}, which a {kind} joint needs'
+        raise RobotDescriptionError(f'{where}: limit: expected {told}')
 
 
 def _check(part: str, element: ET.Element) -> None:
