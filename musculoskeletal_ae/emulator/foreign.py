@@ -33,6 +33,8 @@ from musculoskeletal_ae.emulator.wires import (
     wires_step,
 )
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.description import Wrap
+from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
 from musculoskeletal_ae.robot.robot import Robot
 
 GUIDES_EVERY = 5  # steps
@@ -89,6 +91,29 @@ class ForeignBody:
         return relative - self.elastic.elongation(tension)
 
 
+def _directory(robot: Robot, draw: Draw) -> Any:
+    """Return the model of a robot directory, individually off.
+
+    Route points are drawn again until no wire slips over the end of what it is described to wrap
+    round, by centimetres: nobody lays it there.
+    """
+    again = np.zeros(robot.muscle_count, dtype=np.int64)
+    model = mjcf.from_directory(robot, draw, again).compile()
+    if not any(isinstance(item, Wrap) for route in robot.description.routes for item in route):
+        return model
+
+    def jump(model: Any) -> Bools:
+        body = ForeignBody(robot, model, draw)
+        return jumps(body.absolute_lengths, robot.lower, robot.upper)[0] > JUMP
+
+    exact = mjcf.from_directory(robot, Draw(0, NONE), again).compile()
+    smooth = ~jump(exact)
+    while again.max() < REDRAWN and (jumping := jump(model) & smooth).any():
+        again += jumping
+        model = mjcf.from_directory(robot, draw, again).compile()
+    return model
+
+
 class ForeignArm(Arm):
     """An arm of MuJoCo."""
 
@@ -104,13 +129,13 @@ class ForeignArm(Arm):
         """
         self.effects = (effects or Effects()) if file is None else NONE
         draw = self._draw = Draw(seed, self.effects)
-        spec = mjcf.from_file(robot, file) if file else mjcf.from_directory(robot, draw)
         try:
-            model = self._model = spec.compile()
+            model = mjcf.from_file(robot, file).compile() if file else _directory(robot, draw)
         except ValueError as error:
             told = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
-        data = self._data = mujoco.MjData(model)
+        self._model, data = model, mujoco.MjData(model)
+        self._data = data
         self.individual = body = ForeignBody(robot, copy.copy(model), draw)
         super().__init__(robot, seed, body.length_bias)
         if file is None:

@@ -8,12 +8,15 @@ bias. Masses and link lengths are the model's (paper, Introduction: assumed corr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
+from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -52,15 +55,19 @@ class Individual:
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles = robot.muscle_count
         kin = robot.kinematics
-        self._kinematics = kin
+        self._kinematics, self._muscles = kin, muscles
         # In one order of memory: code is compiled for each.
         placements = np.ascontiguousarray(kin.placement_rotation), kin.placement_translation
         self.tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
         nominal = robot.routes
-        point = nominal.point + rng.normal(0.0, spread.attachment, nominal.point.shape)
-        segments = nominal.first, nominal.second, nominal.muscle
-        objects = _objects(robot, point, spread.wrap, seed, rng)
-        self.routes = WrappedRoutes(nominal.joint, point, *segments, objects)
+        off = rng.normal(0.0, spread.attachment, nominal.point.shape)
+        thickness = rng.uniform(0.8, 1.2, len(nominal.first))
+        routes = partial(_routes, robot, spread.wrap, seed, thickness)
+        self.routes = routes(off)
+        if nominal.objects is not None:
+            again = np.random.default_rng([seed, 0x1A7])
+            redrawn = again.normal(0.0, spread.attachment, (REDRAWN, *off.shape))
+            self._lay(robot, off, redrawn, routes)
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         constants = zip(vars(robot.series_elastic).values(), factor, strict=True)
         self.elastic = SeriesElastic(*(each * off for each, off in constants))
@@ -79,9 +86,28 @@ class Individual:
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
 
+    def _lay(
+        self, robot: Robot, off: Array, again: Array, routes: Callable[[Array], WrappedRoutes]
+    ) -> None:
+        """Draw points' deviations (P, 3) `again` until wires jump only where the model's do.
+
+        One jumps, by centimetres, where it would slip over the end of what it wraps round: nobody
+        lays it there.
+        """
+        nominal, limits = robot.routes, (robot.lower, robot.upper)
+        smooth = jumps(nominal.absolute_lengths, *limits)[0] <= JUMP
+        for drawn in again:
+            jumping = smooth & (jumps(self.absolute_lengths, *limits)[0] > JUMP)
+            if not jumping.any():
+                return
+            places = jumping[nominal.muscle]
+            ends = np.unique(np.concatenate([nominal.first[places], nominal.second[places]]))
+            off[ends] = drawn[ends]
+            self.routes = routes(off)
+
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
         q = np.ascontiguousarray(self._kinematics.tree_angles(theta))
-        return wrapped_lengths(self.tree, self.routes, len(self.cable_friction), q)
+        return wrapped_lengths(self.tree, self.routes, self._muscles, q)
 
     def absolute_lengths(self, theta: Array) -> Array:
         """Return the true route lengths [m], θ (N, D) gives (N, M)."""
@@ -97,8 +123,18 @@ class Individual:
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
 
+def _routes(
+    robot: Robot, quantile: float, seed: int, thickness: Array, off: Array
+) -> WrappedRoutes:
+    """Return the true routes of points that are off by so much [m], (P, 3)."""
+    nominal, point = robot.routes, robot.routes.point + off
+    objects = _objects(robot, point, quantile, seed, thickness)
+    segments = nominal.first, nominal.second, nominal.muscle
+    return WrappedRoutes(nominal.joint, point, *segments, objects)
+
+
 def _objects(
-    robot: Robot, point: Array, quantile: float, seed: int, rng: np.random.Generator
+    robot: Robot, point: Array, quantile: float, seed: int, thickness: Array
 ) -> WrapObjects:
     """Return what each segment wraps round: as described, a little thicker or thinner, or a head.
 
@@ -119,7 +155,6 @@ def _objects(
         return objects
     poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
     points, true = routes.placed(poses), routes.placed(poses, point)
-    thickness = rng.uniform(0.8, 1.2, count)
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
         if objects.radius[s] > 0.0:

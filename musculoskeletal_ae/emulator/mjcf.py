@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -39,8 +39,11 @@ Obstacle = tuple[int, Array, Array]  # the same of its middle, and its axis
 mujoco.set_mju_user_warning(lambda _: None)  # by default it writes a file where it was started
 
 
-def from_directory(robot: Robot, draw: Draw) -> Any:
-    """Return the body that a robot directory describes, individually off, as an MjSpec."""
+def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
+    """Return the body that a robot directory describes, individually off, as an MjSpec.
+
+    By how much the route points of muscles are off is drawn `again` so often (M,).
+    """
     kin, spec = robot.kinematics, mujoco.MjSpec()
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
@@ -73,19 +76,20 @@ def from_directory(robot: Robot, draw: Draw) -> Any:
             link |= {'data': data, 'solimp': STIFF}
             spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, **link)
         bodies.append(body)
-    _add_routes(robot, draw, spec, bodies)
+    _add_routes(robot, draw, again, spec, bodies)
     joint, at = kin.placement(robot.description.end_effector)
     _add_hand(bodies[joint], at)
     return _pulled(spec, robot)
 
 
-def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
+def _add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
     """Add the wires: route points that are off, what is described to wrap round, and heads."""
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
     bellies = _bellies(robot)
-    for muscle, route in zip(robot.muscles, robot.description.routes):
+    for muscle, route, times in zip(robot.muscles, robot.description.routes, again):
         tendon, before = spec.add_tendon(name=muscle), list[Place]()
+        redrawn = draw.rng(f'attachment of {muscle}, {times}') if times else None
         for n, item in enumerate(route):
             joint, at = kin.placement(item.link)
             place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
@@ -101,7 +105,10 @@ def _add_routes(robot: Robot, draw: Draw, spec: Any, bodies: list[Any]) -> None:
                 tendon.wrap_geom(name, side)
                 before = []
                 continue
-            here = joint, place + draw.sizes.attachment * off.normal(size=3)
+            shift = off.normal(size=3)
+            if redrawn is not None:
+                shift = redrawn.normal(size=3)
+            here = joint, place + draw.sizes.attachment * shift
             kink, cylinder = draw.sizes.kinks * rng.uniform(0.75, 1.0), rng.uniform() < 0.5
             for last in before if kink > 0.0 else ():
                 others = [belly for owner, belly in bellies if owner != muscle]

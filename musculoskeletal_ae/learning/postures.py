@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 DIFFERENCE = 1e-6  # [rad]
 ZERO = np.deg2rad(2.0)  # spread of the joint sensors' zeros [rad]
 #: What the body does not know is common to all samples, so that they count as no more than these
-#: in what they say of a zero.
-ZERO_SAMPLES = 10.0
+#: in what they say of a zero; and torque and stops of joints that no sensor reads, in how much all
+#: that leaves open.
+ALIKE = 10.0
 SENSOR = 0.002  # σ_y of a joint sensor [rad]
 GRAVITY = 0.02  # σ_u: an accelerometer's error and how it is mounted [rad]
 #: σ of a length at first, and at least in what it says of postures: what no body explains [m]
@@ -106,8 +107,9 @@ class _GroupFit:
         self._tilted = np.isfinite(seen.gravity)
         self._tilt = np.where(self._tilted, seen.gravity, 0.0)
         self.noise = np.full(len(muscles), FIRST_NOISE)
-        self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ZERO_SAMPLES)
+        self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ALIKE)
         self._zero_precision = self._repeated / ZERO**2
+        self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
         self._near = np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
 
@@ -333,6 +335,10 @@ class _GroupFit:
             wide[self._columns[i]] = rows.by_body[i].T
             unknown = np.square(solve_triangular(self.root, wide, trans='T')).sum(axis=0)
             self.noise[i] = np.hypot(self.noise[i], np.sqrt(unknown.mean()))
+        if (self._unread > 1.0).any():
+            self._by_torque /= self._unread
+            self._repeated *= self._unread
+            self.solve(self.system(rows, theta, zero[joints]), 0.0)
         return body.parameters
 
 

@@ -91,9 +91,8 @@ class Updater(ABC):
             mae = replace(mae, touch=touch)
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
-            rng, tension = np.random.default_rng(self._seed), job.seen.end_tension(mae.friction)
-            judging = job.healthy.judging
-            covariance = estimate_covariance(mae, self.body, fit, tension, rng, judging)
+            tension, judging = job.seen.end_tension(mae.friction), job.healthy.judging
+            covariance = estimate_covariance(mae, self.body, fit, tension, self._seed, judging)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
@@ -337,7 +336,9 @@ def synthetic_samples(
     return TrainingData(seen.scaled(), true.scaled())
 
 
-BODIES, EACH = 10, 100  # bodies that the samples allow, and samples of each
+#: bodies that the samples allow, many more than joints (of few, an ellipsoid holds what it was made
+#: of, and less of others), and samples of each
+BODIES, EACH = 100, 10
 INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
 
 
@@ -346,7 +347,7 @@ def estimate_covariance(
     body: CorrectedBody,
     fit: Fit,
     tension: Array,
-    rng: np.random.Generator,
+    seed: int,
     judging: Observations | None,
 ) -> Array:
     """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
@@ -355,12 +356,17 @@ def estimate_covariance(
     far drawn errors are too large or too small is told by messages that judge, if there are MANY:
     by their own errors beside those drawn in their postures, most of which are near the samples.
     """
-    theta = body.robot.random_postures(BODIES * EACH, rng)
-    covariance = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
+    rng = np.random.default_rng(seed)
+
+    def expected(theta: Array) -> Array:
+        # The same bodies and errors of lengths in all postures, or chance would tell them apart.
+        same = np.random.default_rng(seed)
+        return _spread(_drawn_errors(mae, body, fit, theta, tension, same))
+
+    covariance = expected(body.robot.random_postures(BODIES * EACH, rng))
     if judging is None or len(judging) < MANY:
         return covariance
-    theta = judging.theta[rng.integers(len(judging), size=BODIES * EACH)]
-    here = _spread(_drawn_errors(mae, body, fit, theta, tension, rng))
+    here = expected(judging.theta[rng.integers(len(judging), size=BODIES * EACH)])
     return covariance * _excess(here, _estimate(mae, judging) - judging.theta)
 
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription, shown
 from musculoskeletal_ae.robot.entries import refusal
+from musculoskeletal_ae.robot.jumps import JUMP, jumps
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -105,7 +106,8 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
     """
     theta = robot.random_postures(postures, np.random.default_rng(seed))
-    return judge(Setting.of(robot, theta))
+    result = judge(Setting.of(robot, theta))
+    return replace(result, warnings=(*result.warnings, *_jumping_muscles(robot)))
 
 
 def judge(setting: Setting) -> RobotCheck:
@@ -243,6 +245,22 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
                 f'at joint {robot.joints[joint]!r}, in {100 * against:.0f} % of postures',
                 'lead it further from the axis of that joint',
             )
+
+
+def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
+    """Muscles whose wire slips to the other side of what it wraps round."""
+    if robot.routes.objects is None:
+        return
+    largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
+    for m in np.flatnonzero(largest > JUMP):
+        turns = np.flatnonzero(robot.routes.crossed[m])
+        place = ', '.join(f'{robot.joints[j]} {where[m, j]:.2f}' for j in turns)
+        yield Finding(
+            'jumping_muscle',
+            f'the length of muscle {robot.muscles[m]!r} jumps by {1e3 * largest[m]:.1f} mm where '
+            f'its wire slips to the other side of what it wraps round, at {place}',
+            'move its side, or a point beside it, until the wire stays on one side everywhere',
+        )
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:

@@ -44,8 +44,10 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
 
     still = np.zeros((len(robot.routes.point), 3))
 
+    theta = robot.random_postures(postures, np.random.default_rng(seed + 1))
+
     def check(change: Array) -> checks.RobotCheck:
-        return checks.check_robot(moved(robot, change), postures, seed + 1)
+        return checks.judge(checks.Setting.of(moved(robot, change), theta))
 
     flips = np.maximum(checks.main_actions(check(still).moment_arms)[1], FORGIVEN)
 

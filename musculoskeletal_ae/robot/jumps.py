@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wires whose length jumps where the arm moves smoothly.
+
+A wire with a `side` that comes to lie beyond the end of what it wraps round slips to the other
+side of it, as MuJoCo's do: at once, and by centimetres. No network restores such a length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+
+LINES, STEPS = 60, 400  # between postures, that lengths are followed along
+JUMP = 0.001  # [m] within such a step: lengths that change smoothly bend by a hundredth of that
+REDRAWN = 50  # times that a jumping wire's points are drawn again for an individual, at most
+
+
+def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the largest jump of each length [m] (M,), and at which θ [rad] (M, D).
+
+    `lengths` gives (N, M) of θ (N, D); they are followed between postures within the limits (D,).
+    """
+    joints = len(lower)
+    ends = np.random.default_rng(0).uniform(lower, upper, (2, LINES, 1, joints))
+    theta = ends[0] + np.linspace(0.0, 1.0, STEPS)[:, None] * (ends[1] - ends[0])
+    along = lengths(theta.reshape(-1, joints)).reshape(LINES, STEPS, -1)
+    bends = np.abs(np.diff(along, 2, axis=1)).reshape(LINES * (STEPS - 2), -1)
+    where = bends.argmax(axis=0)
+    return bends.max(axis=0), theta[:, 1:-1].reshape(-1, joints)[where]

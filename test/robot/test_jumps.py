@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wires that slip to the other side of what they wrap round: found, and in no individual."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import read_muscles, write_muscles, write_robot
+
+from musculoskeletal_ae.emulator import foreign, individual
+from musculoskeletal_ae.emulator.foreign import ForeignArm
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.jumps import JUMP, jumps
+from musculoskeletal_ae.robot.robot import Robot
+
+DRUM = {
+    'wrap': 'cylinder', 'link': 'upper', 'axis': [0.1, 2.0, 0.0], 'xyz': [0.0, 0.0, -0.3],
+    'radius': 0.03, 'side': [-0.2, 0.0, -0.3],
+}  # fmt: skip
+BEYOND, BESIDE = [0.035, 0.0, 0.0], [0.035, 0.0, -0.008]  # the end of the drum's far side
+
+
+def arm(directory, end):
+    """An arm whose straightener ends behind the drum that it wraps round."""
+    document = read_muscles(write_robot(directory))
+    route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
+    route[1:] = [DRUM, {'link': 'lower', 'xyz': end}]
+    return Robot.load(write_muscles(directory, document))
+
+
+def jumping(lengths, robot):
+    return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
+
+
+def test_a_jump_is_found_where_it_is():
+    def lengths(theta):
+        return np.stack([theta[:, 0] ** 2, np.where(theta[:, 1] > 0.4, 0.01, 0.0)], axis=1)
+
+    largest, where = jumps(lengths, -np.ones(2), np.ones(2))
+    assert largest[0] < JUMP
+    assert largest[1] == pytest.approx(0.01)
+    assert where[1, 1] == pytest.approx(0.4, abs=0.02)
+
+
+def test_a_jump_of_the_model_is_a_warning_that_names_the_muscle(tmp_path):
+    (warning,) = check_robot(arm(tmp_path, BEYOND)).warnings
+    assert warning.kind == 'jumping_muscle'
+    assert "'straightener' jumps by 17" in warning.message
+    assert warning.message.endswith('wraps round, at bend -1.57')
+
+
+@pytest.mark.parametrize(
+    ('module', 'body', 'seed'),
+    [
+        (individual, Individual, 7),
+        (foreign, lambda robot, seed: ForeignArm(robot, seed).individual, 0),
+    ],
+    ids=['kin', 'foreign'],
+)
+def test_wires_of_individuals_jump_only_where_the_models_do(
+    tmp_path, monkeypatch, module, body, seed
+):
+    robot, odd = arm(tmp_path / 'beside', BESIDE), arm(tmp_path / 'beyond', BEYOND)
+    m, laid = robot.muscles.index('straightener'), body(robot, seed)
+    monkeypatch.setattr(module, 'REDRAWN', 0)
+    assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # the premise
+    assert not jumping(laid.absolute_lengths, robot).any()
+    monkeypatch.undo()
+    np.testing.assert_array_equal(
+        jumping(body(odd, seed).absolute_lengths, odd), np.arange(odd.muscle_count) == m
+    )
