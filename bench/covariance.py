@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether arms without joint sensors know how wrong they are, over many individuals.
+
+python -m bench covariance [--robot …] [--seeds 20,…,31] [--minutes 10] [--folder DIR]
+
+Each individual explores as the geometric model's network drives it; what its rests tell without a
+joint angle is learned at the end, in a few long updates. Printed are the error [rad] on a minute of
+motion never learned from and the share of its messages whose true angles lie in the ellipsoid of
+95 % that the network tells. Most of an error is one offset that an individual has everywhere, so
+that nearly all of a motion lies inside or outside: only the mean over individuals says something.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from bench.learned_arm import initial
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.experiments.sensors import ellipsoid_share
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.learner import NONE, Learner
+from musculoskeletal_ae.learning.training import Job, Training
+from musculoskeletal_ae.learning.update import make_updater
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.presets import DEFAULT
+from musculoskeletal_ae.robot.robot import Robot
+
+HELD_OUT = 60.0  # [s]
+UPDATES, STEPS = 3, 1500
+
+
+class Never(Training):
+    """Training that waits."""
+
+    ready = False
+
+
+def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: float) -> Mae:
+    """Return what an individual's rests tell without a joint angle."""
+    learner = Learner(robot, driver, seed=seed, training=Never, joint_source=NONE)
+    exploring = record(arm, driver, EXPLORATION_STREAM + seed, 60.0 * minutes)
+    for n, (tension, length) in enumerate(zip(exploring.tension, exploring.length)):
+        learner.step(n * SAMPLE_TIME, None, tension, length)
+    nothing = Healthy(np.empty((0, 3 * robot.muscle_count), np.float32), 0.0, 0)
+    job, mae = Job(learner.samples.observations(), nothing, True, STEPS), driver
+    updater = make_updater(robot, driver, DEFAULT, seed)
+    for _ in range(UPDATES):
+        mae = updater.update(job).mae
+    return mae
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print a line for each individual, and the means."""
+    parser = Parser('covariance', 'Whether arms without joint sensors know how wrong they are.')
+    parser.add_robot()
+    parser.add_seeds(tuple(range(20, 32)))
+    parser.add_minutes('duration of the exploration', 10.0)
+    parser.add_argument('--folder', type=Path, help='keeps the initial network for the next run')
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+
+    def work() -> None:
+        robot, rows = Robot.load(args.robot), list[tuple[float, float]]()
+        with TemporaryDirectory() as scratch:
+            folder = args.folder or Path(scratch)
+            folder.mkdir(parents=True, exist_ok=True)
+            driver = initial(robot, folder)
+        for seed in args.seeds:
+            arm = EmulatedArm(robot, seed)
+            mae = taught(robot, driver, arm, seed, args.minutes)
+            held_out = record(arm, driver, HELD_OUT_STREAM, HELD_OUT)
+            rows.append((estimation_error(mae, held_out), ellipsoid_share(mae, held_out)))
+            print(f'individual {seed}: {rows[-1][0]:.3f} rad, {rows[-1][1]:.3f} inside', flush=True)
+        error, inside = np.mean(rows, axis=0)
+        print(f'mean of {len(rows)}: {error:.3f} rad, {inside:.3f} inside (goal: 0.93 to 0.97)')
+
+    return exit_status(work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
