@@ -48,10 +48,11 @@ LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 #: spreads that takes, and how far such a joint is from the limit [rad]
 NEAR_STOP, PUSHED, STOP = 0.05, 3.0, 0.01
 ROUNDS = 12
-#: decrease that a step should bring, in variances, that ends the rounds: the step is then far
-#: shorter than what the samples leave open, and the noise has settled
+#: decrease, in variances, that ends the rounds: the step was then far shorter than what the samples
+#: leave open, and the noise has settled
 ENOUGH = 0.1
-DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # of a step, tried until one lowers the cost
+#: of a step, tried until one lowers the cost; from one below the last that did
+DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)
 EXPECTED = 0.3  # step of a posture [rad]
 FREEDOM = 4.0  # of the Student distribution
 SMALL = 1e-6
@@ -272,8 +273,8 @@ class _GroupFit:
         self.leverage = np.einsum('nmi,nij,nmj->nm', slope, np.linalg.inv(inner), slope) * a
         return inner, mixed, outer, pulled, right
 
-    def solve(self, system: tuple[Array, ...], damping: float) -> tuple[Array, Array, Array]:
-        """Return how w, θ and z change; undamped, note by how much that should lower the cost.
+    def solve(self, system: tuple[Array, ...], damping: float = 0.0) -> tuple[Array, ...]:
+        """Return how w, θ and z change; note the root of the equations of w and z.
 
         The damping counts steps in units of what is expected: s of w and z, `EXPECTED` of θ.
         """
@@ -286,12 +287,10 @@ class _GroupFit:
         last = reduced[:, :, -1]
         tall = reduced[:, :, :-1].reshape(-1, len(right))
         schur = outer + np.diag(SMALL + damping * usual) - tall.T @ tall
-        root = cholesky(schur)
-        solved = cho_solve((root, False), right - tall.T @ last.ravel())
+        self.root = cholesky(schur)
+        solved = cho_solve((self.root, False), right - tall.T @ last.ravel())
         back = last - reduced[:, :, :-1] @ solved
         posture = np.linalg.solve(lower.swapaxes(1, 2), back[:, :, None])[:, :, 0]
-        if not damping:
-            self.root, self.gain = root, right @ solved + (pulled * posture).sum()
         return solved[:size], posture, solved[size:]
 
     def determined(self) -> Array:
@@ -306,39 +305,40 @@ class _GroupFit:
         """Bring θ (N, D) and zeros (D,) of all joints in line, in place; return the parameters."""
         body, joints = self._body, self._joints
         rows = self.rows(theta, zero[joints])
-        determined = np.zeros(len(self.noise))
+        determined, first = np.zeros(len(self.noise)), 0
         for _ in range(ROUNDS):
             self.weigh(rows, theta, determined)
             before = self.cost(rows, theta, zero[joints])
             system = self.system(rows, theta, zero[joints])
             old = body.parameters, theta.copy(), zero.copy()
             determined = self.determined()
-            for damping in DAMPING:
-                change, turn, shift = self.solve(system, damping)
+            for level in range(first, len(DAMPING)):
+                change, turn, shift = self.solve(system, DAMPING[level])
                 steps = (change[column] for column in self._columns)
                 body.parameters = [at + step for at, step in zip(old[0], steps)]
                 theta[:, joints] = old[1][:, joints] + turn
                 zero[joints] = old[2][joints] + shift
                 rows = self.rows(theta, zero[joints])
-                if self.cost(rows, theta, zero[joints]) <= before:
+                now = self.cost(rows, theta, zero[joints])
+                if now <= before:
                     break
             else:
                 body.parameters, theta[:], zero[:] = old
                 rows = self.rows(theta, zero[joints])
                 break
-            if self.gain < ENOUGH:
+            if before - now < ENOUGH:
                 break
+            first = max(0, level - 1)
         self.weigh(rows, theta, determined)
+        self._by_torque /= self._unread
+        self._repeated *= self._unread
+        self.solve(self.system(rows, theta, zero[joints]))
         for i in np.flatnonzero((self._known == 0.0).any(axis=0)):
             # A muscle that is learned anew is trusted no more than it is known.
             wide = np.zeros((len(self.root), len(theta)))
             wide[self._columns[i]] = rows.by_body[i].T
             unknown = np.square(solve_triangular(self.root, wide, trans='T')).sum(axis=0)
             self.noise[i] = np.hypot(self.noise[i], np.sqrt(unknown.mean()))
-        if (self._unread > 1.0).any():
-            self._by_torque /= self._unread
-            self._repeated *= self._unread
-            self.solve(self.system(rows, theta, zero[joints]), 0.0)
         return body.parameters
 
 

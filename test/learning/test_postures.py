@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.learning.body import PRIOR, CorrectedBody, fit_body
 from musculoskeletal_ae.learning.postures import _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -166,3 +168,19 @@ def test_a_joint_leans_on_a_stop_while_it_is_near_and_pushed(arm26, seen):
         torque[:2, 1] = pushed
         fit.weigh(rows._replace(torque=torque), theta, np.zeros(6))
         assert np.flatnonzero(fit._stops(theta)[1][:, 1]).tolist() == leaning
+
+
+def test_where_no_sensor_reads_a_joint_the_ellipsoid_holds_what_errs_alike_in_all_samples(arm26):
+    inside = []
+    for seed in (0, 2, 4):  # bodies that are found worst
+        resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
+        seen, test = resting.observations(60), resting.observations(40)
+        body = CorrectedBody(arm26)
+        fit = fit_body(body, blind(seen), guess=learned(arm26, body).estimate(*seen.state()[1:]))
+        estimate = learned(arm26, body).estimate
+        exact = SimpleNamespace(estimate=lambda *seen, e=estimate: SimpleNamespace(theta=e(*seen)))
+        tension = seen.end_tension(body.frictions())
+        covariance = estimate_covariance(exact, body, fit, tension, seed, None)
+        error = estimate(test.end_tension(body.frictions()), test.length) - test.theta
+        inside.append((ellipsoids(covariance, error) <= 1.0).mean())
+    assert np.mean(inside) > 0.65  # 0.76; counted sample by sample 0.55
