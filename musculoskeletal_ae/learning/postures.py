@@ -330,9 +330,10 @@ class _GroupFit:
                 break
             first = max(0, level - 1)
         self.weigh(rows, theta, determined)
-        self._by_torque /= self._unread
-        self._repeated *= self._unread
-        self.solve(self.system(rows, theta, zero[joints]))
+        if level or (self._unread > 1.0).any():
+            self._by_torque /= self._unread
+            self._repeated *= self._unread
+            self.solve(self.system(rows, theta, zero[joints]))
         for i in np.flatnonzero((self._known == 0.0).any(axis=0)):
             # A muscle that is learned anew is trusted no more than it is known.
             wide = np.zeros((len(self.root), len(theta)))
