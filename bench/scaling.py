@@ -156,8 +156,8 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
             with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
                 rows[body] = pool.submit(measure, body, out / f'{body}_learned', minutes).result()
             print(body, rows[body], flush=True)
-            rows = dict(sorted(rows.items(), key=lambda row: int(row[0].split('x')[0])))
             file.write_text(json.dumps(rows, indent=1))
+    rows = dict(sorted(rows.items(), key=lambda row: int(row[0].split('x')[0])))
     print(table(rows))
     draw(rows, out / 'scaling.png')
 

@@ -130,12 +130,13 @@ class ForeignArm(Arm):
         self.effects = (effects or Effects()) if file is None else NONE
         draw = self._draw = Draw(seed, self.effects)
         try:
-            model = mjcf.from_file(robot, file).compile() if file else _directory(robot, draw)
+            model = self._model = (
+                mjcf.from_file(robot, file).compile() if file else _directory(robot, draw)
+            )
         except ValueError as error:
             told = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
-        self._model, data = model, mujoco.MjData(model)
-        self._data = data
+        data = self._data = mujoco.MjData(model)
         self.individual = body = ForeignBody(robot, copy.copy(model), draw)
         super().__init__(robot, seed, body.length_bias)
         if file is None:

@@ -43,7 +43,6 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     import cma
 
     still = np.zeros((len(robot.routes.point), 3))
-
     theta = robot.random_postures(postures, np.random.default_rng(seed + 1))
 
     def check(change: Array) -> checks.RobotCheck:
