@@ -36,8 +36,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-FEATURES = 60  # of the smooth rest, per muscle
+FEATURES = 60  # of the smooth rest that are drawn, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges
+#: share of what they vary by that is left out, with the half of them that says no more, and the
+#: postures that this is taken over: less than 0.1 mm at the prior's spread
+LEFT_OUT, POSTURES = 1e-3, 500
 # More than twice the tension at the elastic unit than at the motor is no friction.
 LARGEST_FRICTION = 0.5
 LARGEST_LOG = 1.5
@@ -56,6 +59,39 @@ class Layout:
         self.rest = slice(end + 6, self.size)  # v [m]
 
 
+class Smooth(NamedTuple):
+    """ψ of one muscle: K random Fourier features, in the F directions in which they vary."""
+
+    frequency: Array  # [1/rad], (K, D); 0 for joints that the muscle does not cross
+    phase: Array  # (K,)
+    basis: Array  # (K, F)
+
+    @classmethod
+    def drawn(cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator) -> Smooth:
+        """Draw those of a muscle which crosses some joints (D,); they vary over θ (N, D)."""
+        count = FEATURES if crossed.any() else 0
+        frequency = rng.normal(0.0, 1.0, (count, robot.joint_count))
+        frequency = frequency * crossed / (WIDTH * (robot.upper - robot.lower))
+        every = cls(frequency, rng.uniform(0.0, 2.0 * np.pi, count), np.eye(count))
+        values = every.at(theta)
+        power, basis = np.linalg.eigh(values.T @ values)
+        return every._replace(basis=basis[:, power.cumsum() > LEFT_OUT * power.sum()])
+
+    def at(self, theta: Array) -> Array:
+        """Return ψ(θ) − ψ(0), shape (N, F)."""
+        values = np.cos(theta @ self.frequency.T + self.phase) - np.cos(self.phase)
+        return values @ self._scaled
+
+    def slope(self, theta: Array, joints: Ints) -> Array:
+        """Return ∂ψ/∂θ of some joints [1/rad], shape (joints, N, F)."""
+        values = -np.sin(theta @ self.frequency.T + self.phase)
+        return (values * self.frequency.T[joints, None]) @ self._scaled
+
+    @property
+    def _scaled(self) -> Array:
+        return np.sqrt(2.0 / max(1, len(self.phase))) * self.basis
+
+
 class Poses(NamedTuple):
     """Of pinocchio's joints in the root link's frame, and what wrapping adds to straight lines."""
 
@@ -67,34 +103,36 @@ class Poses(NamedTuple):
 class CorrectedBody:
     """Lengths of the corrected body, and how they change with its `parameters`."""
 
-    def __init__(self, robot: Robot, parameters: list[Array] | None = None, seed: int = 0) -> None:
-        """Correct `robot` by one vector per muscle, zero by default; `seed` draws the features."""
-        self.robot = robot
-        routes = robot.routes
-        span = robot.upper - robot.lower
-        rng = np.random.default_rng([seed, 0xF0])
-        self.layouts: list[Layout] = []
-        self._frequency: list[Array] = []
-        self._phase: list[Array] = []
-        for m in range(robot.muscle_count):
+    def __init__(
+        self,
+        robot: Robot,
+        parameters: list[Array] | None = None,
+        seed: int = 0,
+        smooth: list[Smooth] | None = None,
+    ) -> None:
+        """Correct `robot` by one vector per muscle, zero by default; `seed` draws the smooth rest.
+
+        Unless it is given, too.
+        """
+        self.robot, routes = robot, robot.routes
+        if smooth is None:
+            rng = np.random.default_rng([seed, 0xF0])
+            theta = robot.random_postures(POSTURES, np.random.default_rng([seed, 0xF1]))
+            smooth = [Smooth.drawn(robot, crossed, theta, rng) for crossed in routes.crossed]
+        self.smooth, self.layouts = smooth, list[Layout]()
+        for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.append(routes.first[segments], routes.second[segments[-1]])
-            crossed = routes.crossed[m]
-            features = FEATURES if crossed.any() else 0
-            self.layouts.append(Layout(points, features))
-            frequency = rng.normal(0.0, 1.0, (features, robot.joint_count))
-            self._frequency.append(frequency * crossed / (WIDTH * span))
-            self._phase.append(rng.uniform(0.0, 2.0 * np.pi, features))
+            self.layouts.append(Layout(points, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         self.zero = np.zeros(robot.joint_count)  # of the joint sensors, where a fit starts [rad]
 
     def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
         """Return the body of one group, with the parameters of its muscles."""
+        of_group = [self.smooth[m] for m in muscles]
+        smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
-        part = CorrectedBody(self.robot.limb(joints, muscles), parameters)
-        part._frequency = [self._frequency[m][:, joints] for m in muscles]
-        part._phase = [self._phase[m] for m in muscles]
-        return part
+        return CorrectedBody(self.robot.limb(joints, muscles), parameters, smooth=smooth)
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the constants of one muscle, arrays of shape ()."""
@@ -134,12 +172,6 @@ class CorrectedBody:
         local = routes.point[layout.points] + shift
         return (turn @ local[:, :, None])[..., 0] + poses.translation[:, joint], turn
 
-    def _smooth(self, theta: Array, m: int) -> Array:
-        """Return ψ(θ) − ψ(0) of one muscle, shape (N, features)."""
-        scale = np.sqrt(2.0 / max(1, len(self._phase[m])))
-        values = np.cos(theta @ self._frequency[m].T + self._phase[m]) - np.cos(self._phase[m])
-        return scale * values
-
     def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
         """Return l [m] (N, M) at θ [rad] (N, D) and the motors' T [N] (N, M).
 
@@ -153,7 +185,7 @@ class CorrectedBody:
             absolute += poses.detour[:, m]
             absolute, at_zero = absolute[:-1], absolute[-1]
             fixed = absolute - at_zero + self.parameters[m][layout.offset]
-            fixed += self._smooth(theta, m) @ self.parameters[m][layout.rest]
+            fixed += self.smooth[m].at(theta) @ self.parameters[m][layout.rest]
             elastic, friction = self.elastic(m), self.friction(m)
             for lengths, s in zip(result, direction, strict=True):
                 end = end_tension(friction, tension[:, m], s[:, m])
@@ -161,12 +193,12 @@ class CorrectedBody:
         return result
 
     def linearised(
-        self, poses: Poses, theta: Array, tension: Array, direction: Array, m: int,
+        self, poses: Poses, smooth: Array, tension: Array, direction: Array, m: int,
         age: Array | float = 0.0,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
-        θ [rad] (N, D) comes with its `poses`; T_i [N] and s_i are the muscle's own, shape (N,).
+        Of θ come the `poses` and ψ (N, F), `smooth`; T_i [N] and s_i are the muscle's own, (N,).
         """
         layout, parameters = self.layouts[m], self.parameters[m]
         world, turn = self._world(poses, m)
@@ -181,12 +213,11 @@ class CorrectedBody:
         absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)
         end = np.maximum(end_tension(self.friction(m), tension, direction), 0.0)
-        smooth = self._smooth(theta, m)
         length = absolute - at_zero - elastic.elongation(absolute, end)
         length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
         length -= age * parameters[layout.creep]
         slope = 1.0 - elastic.length_slope(end)
-        jacobian = np.empty((len(theta), layout.size))
+        jacobian = np.empty((len(smooth), layout.size))
         jacobian[:, layout.attachment] = slope[:, None] * by_point[:-1] - by_point[-1]
         jacobian[:, layout.elastic] = np.stack(
             [
@@ -304,10 +335,12 @@ def _fit_muscle(
     precision, known = 1.0 / spread**2, used.astype(float)
     noise, weight = FIRST_NOISE, known
 
+    smooth = body.smooth[m].at(seen.theta)
+
     def linearised(parameters: Array) -> tuple[Array, Array]:
         body.parameters[m] = parameters
         tension, direction = seen.tension[:, m], seen.direction[:, m]
-        length, jacobian = body.linearised(poses, seen.theta, tension, direction, m, seen.age)
+        length, jacobian = body.linearised(poses, smooth, tension, direction, m, seen.age)
         return seen.length[:, m] - length, jacobian
 
     def cost() -> float:

@@ -49,11 +49,13 @@ LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 NEAR_STOP, PUSHED, STOP = 0.05, 3.0, 0.01
 ROUNDS = 12
 #: decrease, in variances, that ends the rounds: the step was then far shorter than what the samples
-#: leave open, and the noise has settled
+#: leave open, and the noise has settled (at 1, a slipped joint sensor is taken for a changed muscle
+#: twice as often)
 ENOUGH = 0.1
 #: of a step, tried until one lowers the cost; from one below the last that did
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)
 EXPECTED = 0.3  # step of a posture [rad]
+BENT = 0.05  # turn of a joint over which Σ T ∂²l/∂θ² of the geometric model is as it was [rad]
 FREEDOM = 4.0  # of the Student distribution
 SMALL = 1e-6
 
@@ -113,6 +115,8 @@ class _GroupFit:
         self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
         self._near = np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
+        self._bent_at = self._at.copy()  # where `_bend` was taken last [rad]
+        self._bend = np.empty((*self._own.shape, len(joints)))  # Σ T ∂²l/∂θ² [N·m/rad]
 
     # -- one point ------------------------------------------------------------------------------
 
@@ -134,7 +138,10 @@ class _GroupFit:
             at = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(at, -1)] for part in poses))
             pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, seen.age))
-            l_m, j_m = body.linearised(placed, flat[at], pulls, ways, m, age)
+            still = body.smooth[m].at(own)
+            turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
+            smooth = np.concatenate([still, *turned])
+            l_m, j_m = body.linearised(placed, smooth, pulls, ways, m, age)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
             length[:, m] = seen.length[:, m] - l_m[0]
             by_body.append(j_m[0])
@@ -230,8 +237,7 @@ class _GroupFit:
         joints, (count, places), size = self._joints, self._seen.theta.shape, len(self._mean)
         stiffness = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
         stiffness = stiffness[:, joints[:, None], joints]
-        bend = muscle_hessian(self._body.robot.routes.muscle_jacobian, theta[:, joints])
-        stiffness += np.einsum('nm,nmij->nij', self._seen.tension, bend)
+        stiffness += self._bend_stiffness(theta[:, joints])
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian
         turned, e = rows.gravity_by_posture, self._by_gravity
         inner = np.einsum('nmi,nm,nmj->nij', slope, a, slope)
@@ -273,6 +279,14 @@ class _GroupFit:
         self.leverage = np.einsum('nmi,nij,nmj->nm', slope, np.linalg.inv(inner), slope) * a
         return inner, mixed, outer, pulled, right
 
+    def _bend_stiffness(self, own: Array) -> Array:
+        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
+        moved = ~(np.abs(own - self._bent_at) < BENT).all(axis=1)
+        bend = muscle_hessian(self._body.robot.routes.muscle_jacobian, own[moved])
+        self._bend[moved] = np.einsum('nm,nmij->nij', self._seen.tension[moved], bend)
+        self._bent_at[moved] = own[moved]
+        return self._bend
+
     def solve(self, system: tuple[Array, ...], damping: float = 0.0) -> tuple[Array, ...]:
         """Return how w, θ and z change; note the root of the equations of w and z.
 
@@ -283,14 +297,13 @@ class _GroupFit:
         size = len(right) - places
         usual = np.append(self._precision, self._zero_precision)
         lower = np.linalg.cholesky(inner + damping / EXPECTED**2 * np.eye(places))
-        reduced = np.linalg.solve(lower, np.concatenate([mixed, pulled[:, :, None]], axis=2))
-        last = reduced[:, :, -1]
-        tall = reduced[:, :, :-1].reshape(-1, len(right))
+        inverse = np.linalg.inv(lower)  # of few rows and well scaled: its products are cheaper
+        reduced, last = inverse @ mixed, (inverse @ pulled[:, :, None])[:, :, 0]
+        tall = reduced.reshape(-1, len(right))
         schur = outer + np.diag(SMALL + damping * usual) - tall.T @ tall
         self.root = cholesky(schur)
         solved = cho_solve((self.root, False), right - tall.T @ last.ravel())
-        back = last - reduced[:, :, :-1] @ solved
-        posture = np.linalg.solve(lower.swapaxes(1, 2), back[:, :, None])[:, :, 0]
+        posture = (inverse.swapaxes(1, 2) @ (last - reduced @ solved)[:, :, None])[:, :, 0]
         return solved[:size], posture, solved[size:]
 
     def determined(self) -> Array:

@@ -392,7 +392,8 @@ def _drawn_errors(
         steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
         ends = np.cumsum([body.layouts[m].size for m in muscles])
         for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
-            seen, slope = body.linearised(poses, theta, tension[:, m], direction[:, m], m)
+            smooth = body.smooth[m].at(theta)
+            seen, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
             length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
     error: Array = mae.estimate(tension, length).theta - theta
     return error

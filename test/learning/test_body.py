@@ -44,18 +44,27 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
     theta, tension = arm26.random_postures(5, rng), rng.uniform(20.0, 200.0, 5)
     direction = rng.uniform(-1.0, 1.0, 5)
     body = CorrectedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
-    poses = body.poses(theta)
-    _, jacobian = body.linearised(poses, theta, tension, direction, m)
+    poses, smooth = body.poses(theta), body.smooth[m].at(theta)
+    _, jacobian = body.linearised(poses, smooth, tension, direction, m)
     step = 1e-6
     for k in range(body.layouts[m].size):
         at = body.parameters[m][k]
         values = []
         for sign in (1.0, -1.0):
             body.parameters[m][k] = at + sign * step
-            values.append(body.linearised(poses, theta, tension, direction, m)[0])
+            values.append(body.linearised(poses, smooth, tension, direction, m)[0])
         body.parameters[m][k] = at
         slope = (values[0] - values[1]) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6)
+
+
+@pytest.mark.parametrize('joint', range(2))
+def test_the_slope_of_the_smooth_rest_is_its_derivative(other_body, arm26, joint):
+    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
+    for smooth in other_body.smooth:
+        (slope,) = smooth.slope(theta, np.array([joint]))
+        difference = smooth.at(theta + step) - smooth.at(theta - step)
+        np.testing.assert_allclose(slope, difference / 2e-6, atol=1e-7)
 
 
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):
@@ -113,7 +122,6 @@ def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_k
     store = stage.store(60)
     body = CorrectedBody(arm26)
     fit_body(body, store.observations())
-    before = [p.copy() for p in body.parameters]
     states = stage.states(100)
     (known,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
     store.forget(2)
@@ -122,9 +130,9 @@ def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_k
         shift = 0.01 * (np.arange(6) == 2)
         store.add(sample._replace(length=sample.length + shift))
     fit_body(body, store.observations())
-    offset = body.layouts[2].offset
-    assert abs(body.parameters[2][offset] - before[2][offset] - 0.01) < 0.001
     (found,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
+    # Over 24 drawn bodies it is off by 0.2 mm (one standard deviation).
+    assert abs((found - known)[:, 2].mean() - 0.01) < 0.001
     np.testing.assert_allclose(found[:, 0], known[:, 0], atol=5e-4)
 
 
