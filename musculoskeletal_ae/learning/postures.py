@@ -30,7 +30,8 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CorrectedBody
 
-DIFFERENCE = 1e-6  # [rad]
+DIFFERENCE = 1e-6  # [rad] or [m]
+# Where a joint slides, [rad] below are times RACK [m].
 ZERO = np.deg2rad(2.0)  # spread of the joint sensors' zeros [rad]
 #: What the body does not know is common to all samples, so that they count as no more than these
 #: in what they say of a zero; and torque and stops of joints that no sensor reads, in how much all
@@ -93,6 +94,7 @@ class _GroupFit:
         ends = np.cumsum([0, *(layout.size for layout in self._body.layouts)])
         self._columns = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._least, seen, robot = least_noise, self._seen, self._body.robot
+        self._radian = robot.kinematics.radian
         self._known = seen.known.astype(float)
         self._crossed = robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
@@ -102,16 +104,16 @@ class _GroupFit:
         self._balanced = ~(changed @ self._crossed)
         self._read = np.isfinite(seen.theta)
         self._own = self._read & (seen.spread == 0.0)  # read by a joint sensor
-        spread_y = np.where(self._own, SENSOR, seen.spread)
+        spread_y = np.where(self._own, SENSOR * self._radian, seen.spread)
         self._angle_precision = np.where(self._read, 1.0 / np.maximum(spread_y, SMALL) ** 2, 0.0)
         self._lower, self._upper = robot.lower, robot.upper
         self._tilted = np.isfinite(seen.gravity)
         self._tilt = np.where(self._tilted, seen.gravity, 0.0)
         self.noise = np.full(len(muscles), FIRST_NOISE)
         self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ALIKE)
-        self._zero_precision = self._repeated / ZERO**2
+        self._zero_precision = self._repeated / (ZERO * self._radian) ** 2
         self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
-        self._near = np.where(self._own, 2.0 * ZERO, NEAR_STOP)
+        self._near = self._radian * np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
 
     # -- one point ------------------------------------------------------------------------------
@@ -208,7 +210,7 @@ class _GroupFit:
         own = theta[:, self._joints]
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         leaning = ~np.isnan(self._at) | (goal != own)
-        return goal - own, leaning / STOP**2 / self._repeated
+        return goal - own, leaning / (STOP * self._radian) ** 2 / self._repeated
 
     def cost(self, rows: _Rows, theta: Array, zero: Array) -> float:
         """Return what is to be minimised, with the weights as they are."""
@@ -238,7 +240,7 @@ class _GroupFit:
         inner += np.einsum('nki,nk,nkj->nij', stiffness, b, stiffness)
         inner += np.einsum('nki,nk,nkj->nij', turned, e, turned)
         stop, by_stop = self._stops(theta)
-        diagonal = self._by_angle + by_stop + SMALL / STOP**2
+        diagonal = self._by_angle + by_stop + SMALL / (STOP * self._radian) ** 2
         inner += diagonal[:, :, None] * np.eye(places)
         pulled = np.einsum('nmi,nm->ni', slope, a * rows.length)
         pulled += np.einsum('nki,nk->ni', stiffness, b * rows.torque)
@@ -282,7 +284,8 @@ class _GroupFit:
         places = pulled.shape[1]
         size = len(right) - places
         usual = np.append(self._precision, self._zero_precision)
-        lower = np.linalg.cholesky(inner + damping / EXPECTED**2 * np.eye(places))
+        step = damping / (EXPECTED * self._radian) ** 2
+        lower = np.linalg.cholesky(inner + np.diag(step))
         reduced = np.linalg.solve(lower, np.concatenate([mixed, pulled[:, :, None]], axis=2))
         last = reduced[:, :, -1]
         tall = reduced[:, :, :-1].reshape(-1, len(right))
