@@ -32,7 +32,7 @@ class Imported(NamedTuple):
     """A robot that was imported."""
 
     robot: Robot
-    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed or approximated
+    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed, renamed or approximated
     errors: dict[str, float] | None  # largest length error of each muscle [m]; None: not computed
 
 
