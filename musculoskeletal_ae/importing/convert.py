@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
@@ -41,7 +42,9 @@ def read_source(file: Path) -> Source:
 
     A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
     """
-    root = parse_xml(file, read_text(file, refuse, LARGEST))
+    text = read_text(file, refuse, LARGEST)
+    # OpenSim writes names of C++ as tags, as HuntCrossleyForce::ContactParameters.
+    root = parse_xml(file, re.sub(r'(</?\w+)::(?=\w)', r'\1.', text))
     if root.tag not in READERS:
         told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')

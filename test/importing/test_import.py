@@ -225,6 +225,7 @@ COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
 <coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
 </coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
 <dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
+CONTACT = '<HuntCrossleyForce name="c"><HuntCrossleyForce::Parts/></HuntCrossleyForce>'
 LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
 
 
@@ -235,6 +236,7 @@ LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
         ('<range>0 2</range>', '<prescribed>true</prescribed>', 'prescribed motion of'),
         ('name="flexor">', 'name="f"><appliesForce>false</appliesForce>', 'f: it applies no force'),
         ('<ForceSet><objects>', f'<ForceSet><objects>{LONE}', 'muscle lone: fewer than 2 points'),
+        ('<ForceSet><objects>', f'<ForceSet><objects>{CONTACT}', 'HuntCrossleyForce c: no muscle'),
         ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
         ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
         ('name="extensor"', 'name="flexor"', 'renamed: muscle flexor is flexor_ here'),
