@@ -94,9 +94,9 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
         theta[:, joint] += (1.0 - factor) * (middle - theta[:, joint])
         low, high = (middle + factor * (end[joint] - middle) for end in (robot.lower, robot.upper))
-        digits = 4 if robot.kinematics.slides[joint] else 2
-        text = f'limits of {robot.joints[joint]} [{low:.{digits}f}, {high:.{digits}f}]'
-        return Setting.of(robot, theta), text
+        text = f'[{low:.4f}, {high:.4f}] m'
+        text = text if robot.kinematics.slides[joint] else f'[{low:.2f}, {high:.2f}]'
+        return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot
     values = factor * getattr(of, part)

@@ -206,6 +206,8 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) ->
     grid.scale(0.8, 2.2)
     for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
         one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
+        if output == 'theta':  # 'rad', 'm' or both
+            unit = ' or '.join(sorted({each.theta for each in robot.units}, reverse=True))
         place = np.arange(len(names))
         for i, error in enumerate(e for e in errors if e.output == output):
             label = f'from {ENTERED[error.mask]}'

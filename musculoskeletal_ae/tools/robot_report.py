@@ -107,10 +107,11 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     arms = scale * result.moment_arms
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
     sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
+    moves = 'moves' if sliders else 'turns'
     sliding = f'of what slides ({sliders}): the share of the tension along it [%], "." = below '
     lines = [
         '',
-        'moment arms [mm]: min, median, max; + turns the joint in its positive direction',
+        f'moment arms [mm]: min, median, max; + {moves} the joint in its positive direction',
         f'"." = below {1e3 * MATTERS:g} mm in every posture',
         *[f'{sliding}{100 * MATTERS / RACK:g} %'] * bool(sliders),
         ' ' * first + ''.join(name.rjust(width) for name in robot.joints),

@@ -98,6 +98,10 @@ def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path, monkeypatch):
     plot(robot, check_robot(robot, 5), tmp_path / 'plot.png')
     labels = [panel.get_xlabel() for panel in figures[0].axes[:4]]
     assert labels == ['joint angle [deg]'] * 3 + ['position [mm]']
+    assert [panel.get_ylabel() for panel in figures[0].axes[2:4]] == [
+        'moment arm −G [mm]',
+        'pull −G [%]',
+    ]
 
 
 def test_what_slides_is_as_stiff_as_a_pinion_that_moves_it(tmp_path):
