@@ -111,8 +111,9 @@ class Plausibility:
         if not beyond.max() > share:
             return None
         j = int(beyond.argmax())
-        told = f'{self._robot.joints[j]} {theta[j]:.3g} rad, limits {low[j]:.2f} to {high[j]:.2f}'
-        return MessageError('θ far outside the joint limits', told)
+        told = f'{self._robot.joints[j]} {theta[j]:.3g} {self._robot.units[j].theta}'
+        limits = f'limits {low[j]:.2f} to {high[j]:.2f}'
+        return MessageError('θ far outside the joint limits', f'{told}, {limits}')
 
     def levels(
         self,

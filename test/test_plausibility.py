@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import write_robot
 
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.plausibility import SLACK, WOUND, Plausibility, longest_lengths
@@ -33,3 +34,12 @@ def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
     row[0] = 1.01 * -longest_lengths(ROBOT)[0]
     with pytest.raises(MessageError, match='length beyond what the joints allow'):
         Plausibility(ROBOT).check_muscles(tension, row, WARM, 0.0)
+
+
+def test_what_slides_is_told_in_metres(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    assert (
+        robot.told(np.full(4, 0.5)) == 'bend 0.50 rad, lift 0.50 rad, swing 0.50 rad, wrist 0.50 m'
+    )
+    error = Plausibility(robot).outside(np.append(robot.lower[:3], 2.0))
+    assert error is not None and 'wrist 2 m, limits 0.00 to 0.05' in str(error)

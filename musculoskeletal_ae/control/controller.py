@@ -196,7 +196,8 @@ class Controller:
             if beyond.any():
                 k, j = np.argwhere(beyond)[0]
                 told = f'{robot.joints[points.joints[j]]} {points.position[k, j]:.3f}'
-                limits = f'legal: {low[j]:.3f} to {high[j]:.3f} rad'
+                unit = robot.units[points.joints[j]].theta
+                limits = f'legal: {low[j]:.3f} to {high[j]:.3f} {unit}'
                 raise MessageError('beyond the joint limits', f'{told}, {limits}')
         start, _ = self._ready(max(delay, 0.0))
         if points is None:
@@ -237,8 +238,8 @@ class Controller:
         nearest, short = reach.nearest_held(self.robot, self.mae, self.estimate, theta)
         if not short:
             return theta, ''
-        angles = ', '.join(f'{n} {a:.2f}' for n, a in zip(self.robot.joints, nearest))
-        short = f'{short} without {self._left_out}; nearest posture held: {angles} rad'
+        short = f'{short} without {self._left_out}; nearest posture held: '
+        short += self.robot.told(nearest)
         if self.settings.unreachable == 'refuse':
             raise MessageError('out of reach', short)
         return nearest, f'{short}; nearest approached'

@@ -66,4 +66,6 @@ class FollowedGoal:
         m = int((off - bounds).argmax())
         if off[m] <= bounds[m]:
             return None
-        return code, f'{self._joints[m]} is off by {off[m]:.3f} rad, tolerance {bounds[m]:.3g} rad'
+        unit = self._core.robot.units[m].theta
+        told = f'is off by {off[m]:.3f} {unit}, tolerance {bounds[m]:.3g} {unit}'
+        return code, f'{self._joints[m]} {told}'

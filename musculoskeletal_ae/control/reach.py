@@ -40,7 +40,8 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     jacobian = mae.muscle_jacobian(theta, limits.bias)
     lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
     joint = int(lacks.argmax())
-    return f'{lacks[joint]:.2f} N·m at {robot.joints[joint]}' if lacks[joint] > NOTABLE else ''
+    told = f'{lacks[joint]:.2f} {robot.units[joint].torque} at {robot.joints[joint]}'
+    return told if lacks[joint] > NOTABLE else ''
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:

@@ -22,7 +22,7 @@ class Settings:
     joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
         'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
-        'N·m/rad',
+        'N·m/rad or N/m',
         0.0,
         1000.0,
     )
@@ -85,6 +85,6 @@ class Settings:
             return (0.0,) * joints
         if len(values) != joints or not all(0.0 <= value < math.inf for value in values):
             raise MusculoskeletalError(
-                f'{list(values)}; legal: {joints} numbers of at least 0 [N·m/rad], or []'
+                f'{list(values)}; legal: {joints} numbers of at least 0 [N·m/rad or N/m], or []'
             )
         return values

@@ -27,9 +27,9 @@ def report(core: Controller, now: float) -> Report:
     if solution is not None and solution.stiffness is not None:
         expected, *reachable = solution.stiffness
         desired = chosen.desired_stiffness(robot.joint_count)
-        for row in zip(robot.joints, desired, expected.diagonal(), *reachable):
-            name, wanted, planned, low, high = row
-            text = f'{planned:.2f} N·m/rad, reachable {low:.2f} to {high:.2f}'
+        for row in zip(robot.joints, robot.units, desired, expected.diagonal(), *reachable):
+            name, unit, wanted, planned, low, high = row
+            text = f'{planned:.2f} {unit.stiffness}, reachable {low:.2f} to {high:.2f}'
             if wanted > 0.0 and not low <= wanted <= high:
                 text += f', desired {wanted:.2f} clamped'
             values[f'joint stiffness {name}'] = text
@@ -40,8 +40,8 @@ def report(core: Controller, now: float) -> Report:
         if motion.moving and (slow := slowed(motion)):
             warnings.append(f'trajectory {slow}')
     if np.abs(missing).max(initial=0.0) > reach.NOTABLE:
-        lacks = (f'{name} {torque:.2f} N·m' for name, torque in zip(robot.joints, missing))
-        values['missing torque'] = ', '.join(lacks)
+        lacks = zip(robot.joints, missing, robot.units)
+        values['missing torque'] = ', '.join(f'{n} {lack:.2f} {u.torque}' for n, lack, u in lacks)
         warnings.append('the target needs more torque than the muscles have')
     if core.short:
         warnings.append(f'out of reach: {core.short}')
@@ -87,9 +87,10 @@ def slowed(motion: MotionControl) -> str:
 
 def _lying(core: Controller) -> str:
     """Return how far from its target an arm rests that fell, and what keeps it there."""
-    mae, estimate, off = core.mae, core.estimate, core.motion.error
+    mae, estimate, off, robot = core.mae, core.estimate, core.motion.error, core.robot
     assert mae is not None and estimate is not None  # it has moved
     joint = int(np.abs(off).argmax())
-    told = f'fallen: {core.robot.joints[joint]} rests {abs(off[joint]):.2f} rad off its target'
-    lacks = reach.lacking(core.robot, mae, estimate)
+    far = f'{abs(off[joint]):.2f} {robot.units[joint].theta}'
+    told = f'fallen: {robot.joints[joint]} rests {far} off its target'
+    lacks = reach.lacking(robot, mae, estimate)
     return f'{told}, where the muscles lack {lacks}; lift it by hand' if lacks else told

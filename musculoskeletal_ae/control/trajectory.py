@@ -139,8 +139,9 @@ class Trajectory:
         theta = self.sample(np.linspace(0.0, self.duration, SAMPLES)).theta
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         if (out > BEYOND).any():
-            joint = robot.joints[int(out.argmax())]
-            raise MessageError('leaves the joint limits', f'{joint} by {out.max():.3g} rad')
+            j = int(out.argmax())
+            told = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
+            raise MessageError('leaves the joint limits', told)
 
     @property
     def duration(self) -> float:

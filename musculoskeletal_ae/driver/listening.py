@@ -157,9 +157,10 @@ class Listening:
         """Judge l beside the model at θ (N, D), l and T (N, M)."""
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
-        if beyond.max() > BEYOND_JOINT:
-            j = int(beyond.argmax())
-            verdict.failed('joint', name=robot.joints[j], theta=theta[0, j], beyond=beyond[j])
+        j = int((beyond / robot.kinematics.radian).argmax())
+        if beyond[j] > BEYOND_JOINT * robot.kinematics.radian[j]:
+            values = {'theta': theta[0, j], 'beyond': beyond[j], 'unit': robot.units[j].theta}
+            verdict.failed('joint', name=robot.joints[j], **values)
             return
         model = robot.muscle_lengths(theta, tension)
         moved: Bools = np.ptp(model, axis=0) > MOVED

@@ -53,9 +53,9 @@ class Effects:
     eccentricity: float = 0.0008  # of the spool [m]
     spool_slip: float = 0.0011  # of the wire on its spool, once in five hours [m]
     length_drift: float = 0.001  # σ [m/h]
-    joint_zero: float = np.radians(2.0)  # σ [rad]
+    joint_zero: float = np.radians(2.0)  # σ [rad]; times RACK [m] of what slides
     joint_bend: float = 0.01  # non-linearity, share of the joint's range
-    backlash: float = np.radians(1.0)  # of the joint sensor's gear [rad]
+    backlash: float = np.radians(1.0)  # of the joint sensor's gear [rad], or times RACK [m]
     # Messages
     delay: float = 0.02  # of joint angles, and of lengths and tensions [s]
     jitter: float = 0.005  # range of the delay [s]

@@ -187,9 +187,10 @@ class ForeignArm(Arm):
     def _draw_sensors(self) -> None:
         """Draw what is wrong with joint sensors and messages, and when wires slip."""
         draw, joints, muscles = self._draw, self.robot.joint_count, self.robot.muscle_count
-        self._joint_zero = draw.normal('joint_zero', joints)
+        radian = self.robot.kinematics.radian
+        self._joint_zero = radian * draw.normal('joint_zero', joints)
         self._joint_bend = draw.about('joint_bend', joints, signed=True)
-        self._backlash = draw.about('backlash', joints)
+        self._backlash = radian * draw.about('backlash', joints)
         self._delays = draw.about('delay', 2)
         self._drift = draw.normal('length_drift', muscles) / HOUR
         self._bedding = draw.about('bedding', muscles)

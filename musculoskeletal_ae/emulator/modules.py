@@ -21,11 +21,10 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.kinematics import RACK, Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # [s]
-RACK = 0.06  # [m] radius of the pinion by which a joint module moves what slides; chosen
 
 # What a module follows.
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
@@ -43,7 +42,7 @@ HEAT_SPREAD = 0.15  # standard deviation of the logarithm of each of the five, a
 
 # Sensors; chosen: noise is one standard deviation, then rounded to the
 # resolution, a power of two as a converter's counts are.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]; times RACK [m] of what slides
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
@@ -159,7 +158,9 @@ def felt_at_rest(robot: Robot, theta: Array, link: str, rng: np.random.Generator
     return held + rng.normal(0.0, ACCELERATION_NOISE, 3)
 
 
-def noisy(value: Array, noise: float, resolution: float, rng: np.random.Generator) -> Array:
+def noisy(
+    value: Array, noise: Array | float, resolution: Array | float, rng: np.random.Generator
+) -> Array:
     """Return a value as a sensor reads it."""
     read: Array = value + rng.normal(0.0, noise, value.shape)
     return np.round(read / resolution) * resolution
@@ -321,11 +322,11 @@ class Arm(ABC):
     def sense(self) -> Readings:
         """Read all sensors once, with their noise, bias, resolution and faults."""
         theta, length, tension, housing = self._sensed()
-        cut, rng = self._muscle.ruptured > 0.0, self._rng
+        cut, rng, radian = self._muscle.ruptured > 0.0, self._rng, self.robot.kinematics.radian
         # A cut wire pulls on no sensor, and a tension unit does not read below zero.
         pull = noisy(np.where(cut, 0.0, tension), TENSION_NOISE, TENSION_RESOLUTION, rng)
         readings = Readings(
-            noisy(theta, ANGLE_NOISE, ANGLE_RESOLUTION, rng),
+            noisy(theta, ANGLE_NOISE * radian, ANGLE_RESOLUTION * radian, rng),
             noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION, rng),
             np.where(cut, 0.0, np.maximum(pull, 0.0)),
             noisy(housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),

@@ -134,8 +134,9 @@ class Estimator:
         inside = len(posture) == len(limits)
         inside = inside and all(low <= t <= high for t, (low, high) in zip(posture, limits))
         if posture and not inside:
-            legal = ', '.join(f'{low:.2f} to {high:.2f}' for low, high in limits)
-            raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal} [rad]')
+            units = (unit.theta for unit in self._robot.units)
+            legal = (f'{low:.2f} to {high:.2f} {u}' for u, (low, high) in zip(units, limits))
+            raise MusculoskeletalError(f'{list(posture)}; legal: none, or {", ".join(legal)}')
 
     def zero(self, posture: tuple[float, ...] = ()) -> None:
         """Begin to find the zeros of the length sensors; the arm stands in `posture` [rad] (D,).
@@ -335,8 +336,7 @@ class Estimator:
         }
         if self.mae.covariance is not None:
             spread = np.sqrt(np.diag(self.mae.covariance))
-            told = (f'{name} {s:.3f}' for name, s in zip(self._robot.joints, spread, strict=True))
-            values['joint uncertainty'] = ', '.join(told) + ' rad'
+            values['joint uncertainty'] = self._robot.told(spread, 3)
         if isolated := self._robot.names(self._robot.isolated):
             values['isolated muscles'] = isolated
         if self.verified:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from musculoskeletal_ae.robot.robot import Robot
 
 ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
@@ -21,7 +23,7 @@ def shoulder(robot: Robot) -> int:
 
 
 def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
-    turning = [index for index in range(robot.joint_count) if not slides(robot, index)]
+    turning = np.flatnonzero(~robot.kinematics.slides).tolist()
     for name in names:
         for index in turning:
             if name in robot.joints[index]:
@@ -29,15 +31,9 @@ def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
     return (turning or range(robot.joint_count))[otherwise]
 
 
-def slides(robot: Robot, joint: int) -> bool:
-    """Return whether a joint is prismatic, so that its θ is in metres."""
-    kin = robot.kinematics
-    return bool(kin.prismatic[kin.tree[joint]])
-
-
 def plotted(robot: Robot, joint: int) -> tuple[float, str]:
     """Return by what a joint's θ is multiplied in plots, and the unit it then has."""
-    return (1000.0, 'mm') if slides(robot, joint) else (math.degrees(1.0), 'deg')
+    return (1000.0, 'mm') if robot.kinematics.slides[joint] else (math.degrees(1.0), 'deg')
 
 
 def within(robot: Robot, joint: int, degrees: float) -> float:

@@ -21,11 +21,11 @@ from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.source import (
     KINDS,
     Source,
-    distinct,
     link_inertia,
     numbers,
     refuse,
     safe_name,
+    unique,
 )
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
@@ -45,8 +45,8 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
         raise refuse(file, 'there is no model.urdf and no model.sdf beside it')
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
-        name = safe_name(muscle.get('name'), f'muscle_{len(source.routes)}')
-        (name,) = distinct([name], source.routes)
+        fallback = f'muscle_{len(source.routes)}'
+        name = source.rename('muscle', muscle.get('name'), fallback, source.routes)
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
             if (link := part.get('name', '')) not in centres:
@@ -164,8 +164,9 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         values = value(element, 'pose', 6, '0 0 0 0 0 0')
         return pin.SE3(pin.rpy.rpyToMatrix(*values[3:]), values[:3])
 
-    links = {e.get('name', ''): e for e in model.findall('link')}
-    carried_by = {e.findtext('child', '').strip(): e for e in model.findall('joint')}
+    links = unique('link', ((e.get('name', ''), e) for e in model.findall('link')))
+    hung = ((e.findtext('child', '').strip(), e) for e in model.findall('joint'))
+    carried_by = unique('child of a joint', hung, 'one joint for each link')
     above = {name: e.findtext('parent', '').strip() for name, e in carried_by.items()}
     order = [name for name in links if above.get(name, 'world') == 'world'][:MOST_PARTS]
     if len(order) == 1:

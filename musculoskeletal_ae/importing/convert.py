@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
@@ -32,7 +33,7 @@ class Imported(NamedTuple):
     """A robot that was imported."""
 
     robot: Robot
-    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed or approximated
+    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed, renamed or approximated
     errors: dict[str, float] | None  # largest length error of each muscle [m]; None: not computed
 
 
@@ -41,7 +42,9 @@ def read_source(file: Path) -> Source:
 
     A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
     """
-    root = parse_xml(file, read_text(file, refuse, LARGEST))
+    text = read_text(file, refuse, LARGEST)
+    # OpenSim writes names of C++ as tags, as HuntCrossleyForce::ContactParameters.
+    root = parse_xml(file, re.sub(r'(</?\w+)::(?=\w)', r'\1.', text))
     if root.tag not in READERS:
         told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')

@@ -67,7 +67,10 @@ class _Reader:
         """Return the name of each thing of a kind, or its kind and number."""
         get, count = getattr(self.model, kind), getattr(self.model, COUNTS[kind])
         # Those that differ in MuJoCo may do so only in what is not safe; pinocchio's own is taken.
-        return distinct((safe_name(get(i).name, f'{kind}_{i}') for i in range(count)), ['universe'])
+        names = ['universe']
+        for i in range(count):
+            names.append(self.source.rename(kind, get(i).name, f'{kind}_{i}', names))
+        return names[1:]
 
     def name(self, kind: str, i: int) -> str:
         """Return the name of a thing."""

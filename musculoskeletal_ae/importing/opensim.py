@@ -27,10 +27,10 @@ from musculoskeletal_ae.importing.source import (
     EARTH,
     Function,
     Source,
-    distinct,
     link_inertia,
     numbers,
     safe_name,
+    unique,
 )
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
@@ -150,8 +150,11 @@ class _Reader:
     # -- bodies and joints -----------------------------------------------------------------------
 
     def _coordinates(self) -> None:
-        for item in self.model.iter('Coordinate'):
-            name, default = item.get('name', ''), _number(item, 'default_value')
+        named = ((c.get('name', ''), c) for c in self.model.iter('Coordinate'))
+        given = unique('coordinate', [('', None), *named])  # '' is none
+        del given['']
+        for name, item in given.items():
+            default = _number(item, 'default_value')
             low, high = _vector(item, 'range', 2)
             if _word(item, 'locked').lower() == 'true':
                 self.drivers[name] = '', np.poly1d([default])
@@ -209,19 +212,24 @@ class _Reader:
 
     def _tree(self) -> None:
         """Make links of the bodies, parents first, and joints of the axes between them."""
-        bodies = {b.get('name', ''): b for b in self.model.findall('BodySet/objects/Body')}
-        joints = {j.get('name', ''): j for j in self.model.findall('JointSet/objects/*')}
-        self.frames |= {name: (name, pin.SE3.Identity()) for name in bodies}
+        bodies, joints = (
+            unique(kind, ((e.get('name', ''), e) for e in self.model.findall(where)))
+            for kind, where in (('body', 'BodySet/objects/Body'), ('joint', 'JointSet/objects/*'))
+        )
+        own = [(name, (name, pin.SE3.Identity())) for name in bodies]
+        self.frames = unique('frame', [*self.frames.items(), *own])
         for path, owner in [*bodies.items(), *joints.items()]:
             for frame in owner.iter('PhysicalOffsetFrame'):
                 parent, pose = self._frame(frame, 'socket_parent', path)
                 at = pose * _offset(frame, 'orientation')
-                self.frames[f'{path}/{frame.get("name")}'] = parent, at
-        waiting = {}
+                own = [(f'{path}/{frame.get("name")}', (parent, at))]
+                self.frames = unique('frame', [*self.frames.items(), *own])
+        hung = []
         for name, joint in joints.items():
             parent, before = self._frame(joint, 'socket_parent_frame', name)
             child, after = self._frame(joint, 'socket_child_frame', name)
-            waiting[child] = parent, before, joint, after.inverse()
+            hung.append((child, (parent, before, joint, after.inverse())))
+        waiting = unique('child of a joint', hung, 'one joint for each body')
         source, order = self.source, ['ground']
         source.add_link('ground', 0, pin.SE3.Identity())
         for above in order:
@@ -297,10 +305,17 @@ class _Reader:
         objects = {}
         owners = [*self.model.findall('Ground'), *self.model.findall('BodySet/objects/Body')]
         items = [(b, item) for b in owners for item in b.findall('WrapObjectSet/objects/*')]
+        seen = set[str]()
         for body, item in items:
+            kind, name = item.tag, item.get('name', '')
+            if name in seen:
+                told = f'{kind} {name} of {body.get("name")}: OpenSim leads muscles round the first'
+                self.source.note('dropped', f'{told} of that name')
+                continue
+            seen.add(name)
             if _word(item, 'active', 'true').lower() != 'true':
                 continue
-            kind, name, pose = item.tag, item.get('name', ''), _offset(item, 'xyz_body_rotation')
+            pose = _offset(item, 'xyz_body_rotation')
             axis, side, told, radius = pose.rotation[:, 2], None, '', 0.0
             if kind in ('WrapSphere', 'WrapCylinder'):
                 radius = _number(item, 'radius')
@@ -343,7 +358,7 @@ class _Reader:
 
     def _muscle(self, item: ET.Element) -> None:
         source = self.source
-        (name,) = distinct([safe_name(item.get('name'), 'force')], source.routes)
+        name = source.rename('muscle', item.get('name'), 'force', source.routes)
         path = item.find('GeometryPath')
         if path is None or not ('Muscle' in item.tag or item.tag == 'PathActuator'):
             source.note('dropped', f'{item.tag} {name}: no muscle with a path of points')

@@ -65,8 +65,15 @@ class Source:
     end_effector: str = ''
 
     def note(self, kind: str, told: str) -> None:
-        """Remember what was 'chosen', 'dropped', 'held fixed' or 'approximated', in a line."""
+        """Remember, in a line, what was 'chosen', 'dropped', 'held fixed', 'renamed' and so on."""
         self.notes.append(f'{kind}: {printable(told)}')
+
+    def rename(self, kind: str, given: str | None, fallback: str, taken: Iterable[str]) -> str:
+        """Return a safe name that is not taken, and say so where it is not the given one."""
+        (name,) = distinct([safe_name(given, fallback)], taken)
+        if given and name != given:
+            self.note('renamed', f'{kind} {given} is {name} here')
+        return name
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
         """Return limits of a joint, chosen ones where there are none."""
@@ -161,6 +168,18 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
         seen.add(name)
         result.append(name)
     return result
+
+
+def unique(
+    kind: str, items: Iterable[tuple[str, Any]], legal: str = 'unique names: rename one'
+) -> dict[str, Any]:
+    """Return what others refer to by name; a ValueError says which name comes twice."""
+    named: dict[str, Any] = {}
+    for name, item in items:
+        if name in named:
+            raise ValueError(f'{kind} {name!r} comes twice; expected {legal}')
+        named[name] = item
+    return named
 
 
 def cut(

@@ -43,7 +43,7 @@ from musculoskeletal_ae.robot.robot import Robot
 LEAST_INTERVAL = 1.0
 #: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
-SPREAD = 0.02  # of θ as a camera sees it [rad]
+SPREAD = 0.02  # of θ as a camera sees it [rad]; where it slides, times RACK [m]
 TILT_AGE = 0.5  # [s] that what an IMU says holds
 LEAST_BLIND = 20  # samples to begin with where no θ is known
 
@@ -81,7 +81,7 @@ class Learner:
         self.updates = self.published = 0  # updates made, checkpoints given out
         self._pairing = Pairing(period)
         self._healthy = Reservoir(robot.muscle_count, seed, settings)
-        spread = np.full(robot.joint_count, SPREAD) if joint_source == MARKER else NOTHING
+        spread = SPREAD * robot.kinematics.radian if joint_source == MARKER else NOTHING
         blind = joint_source != SENSOR
         self._rests = RestCollector(robot, settings, self._healthy, blind, spread)
         self._tilted = -math.inf  # when an IMU was heard last [s]

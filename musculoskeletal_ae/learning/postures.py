@@ -30,7 +30,8 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CorrectedBody
 
-DIFFERENCE = 1e-6  # [rad]
+DIFFERENCE = 1e-6  # [rad] or [m]
+# Where a joint slides, [rad] below are times RACK [m].
 ZERO = np.deg2rad(2.0)  # spread of the joint sensors' zeros [rad]
 #: What the body does not know is common to all samples, so that they count as no more than these
 #: in what they say of a zero; and torque and stops of joints that no sensor reads, in how much all
@@ -95,6 +96,7 @@ class _GroupFit:
         ends = np.cumsum([0, *(layout.size for layout in self._body.layouts)])
         self._columns = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._least, seen, robot = least_noise, self._seen, self._body.robot
+        self._radian = robot.kinematics.radian
         self._known = seen.known.astype(float)
         self._crossed = robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
@@ -104,16 +106,16 @@ class _GroupFit:
         self._balanced = ~(changed @ self._crossed)
         self._read = np.isfinite(seen.theta)
         self._own = self._read & (seen.spread == 0.0)  # read by a joint sensor
-        spread_y = np.where(self._own, SENSOR, seen.spread)
+        spread_y = np.where(self._own, SENSOR * self._radian, seen.spread)
         self._angle_precision = np.where(self._read, 1.0 / np.maximum(spread_y, SMALL) ** 2, 0.0)
         self._lower, self._upper = robot.lower, robot.upper
         self._tilted = np.isfinite(seen.gravity)
         self._tilt = np.where(self._tilted, seen.gravity, 0.0)
         self.noise = np.full(len(muscles), FIRST_NOISE)
         self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ALIKE)
-        self._zero_precision = self._repeated / ZERO**2
+        self._zero_precision = self._repeated / (ZERO * self._radian) ** 2
         self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
-        self._near = np.where(self._own, 2.0 * ZERO, NEAR_STOP)
+        self._near = self._radian * np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
         self._bent_at = self._at.copy()  # where `_bend` was taken last [rad]
         self._bend = np.empty((*self._own.shape, len(joints)))  # Σ T ∂²l/∂θ² [N·m/rad]
@@ -215,7 +217,7 @@ class _GroupFit:
         own = theta[:, self._joints]
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         leaning = ~np.isnan(self._at) | (goal != own)
-        return goal - own, leaning / STOP**2 / self._repeated
+        return goal - own, leaning / (STOP * self._radian) ** 2 / self._repeated
 
     def cost(self, rows: _Rows, theta: Array, zero: Array) -> float:
         """Return what is to be minimised, with the weights as they are."""
@@ -244,7 +246,7 @@ class _GroupFit:
         inner += np.einsum('nki,nk,nkj->nij', stiffness, b, stiffness)
         inner += np.einsum('nki,nk,nkj->nij', turned, e, turned)
         stop, by_stop = self._stops(theta)
-        diagonal = self._by_angle + by_stop + SMALL / STOP**2
+        diagonal = self._by_angle + by_stop + SMALL / (STOP * self._radian) ** 2
         inner += diagonal[:, :, None] * np.eye(places)
         pulled = np.einsum('nmi,nm->ni', slope, a * rows.length)
         pulled += np.einsum('nki,nk->ni', stiffness, b * rows.torque)
@@ -281,7 +283,7 @@ class _GroupFit:
 
     def _bend_stiffness(self, own: Array) -> Array:
         """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
-        moved = ~(np.abs(own - self._bent_at) < BENT).all(axis=1)
+        moved = ~(np.abs(own - self._bent_at) < BENT * self._radian).all(axis=1)
         bend = muscle_hessian(self._body.robot.routes.muscle_jacobian, own[moved])
         self._bend[moved] = np.einsum('nm,nmij->nij', self._seen.tension[moved], bend)
         self._bent_at[moved] = own[moved]
@@ -296,8 +298,8 @@ class _GroupFit:
         places = pulled.shape[1]
         size = len(right) - places
         usual = np.append(self._precision, self._zero_precision)
-        lower = np.linalg.cholesky(inner + damping / EXPECTED**2 * np.eye(places))
-        inverse = np.linalg.inv(lower)  # of few rows and well scaled: its products are cheaper
+        step = damping / (EXPECTED * self._radian) ** 2
+        inverse = np.linalg.inv(np.linalg.cholesky(inner + np.diag(step)))  # products are cheaper
         reduced, last = inverse @ mixed, (inverse @ pulled[:, :, None])[:, :, 0]
         tall = reduced.reshape(-1, len(right))
         schur = outer + np.diag(SMALL + damping * usual) - tall.T @ tall

@@ -169,7 +169,7 @@ def _parse(arguments: list[str]) -> Namespace:
     add = parser.add_argument
     add('--seconds', type=positive, default=30.0, metavar='S', help='how long to listen [s]')
     add('--rate', type=number(1.0, 1000.0), default=100.0, metavar='HZ', help='of muscle_states')
-    text = 'where the arm is held, without joint sensors [rad]'
+    text = 'where the arm is held, without joint sensors [rad or m]'
     add('--posture', type=numbers, metavar='θ,…', help=text)
     text = 'winches without absolute encoders: the zeros of l are not judged'
     add('--unzeroed', action='store_true', help=text)

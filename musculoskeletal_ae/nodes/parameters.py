@@ -54,7 +54,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             (0.0,),
             'where the arm stands when estimator/zero is called, one angle for each joint (0 or '
             '[]: unknown, zeros are found while it moves gently)',
-            'rad',
+            'rad or m',
             (-100.0, 100.0),
             settable=True,
         ),

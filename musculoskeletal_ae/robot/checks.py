@@ -8,6 +8,9 @@ and the moment arms
     r(θ) = −G(θ)    [m],
 
 the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
+So that all joints have one unit, one that slides is taken as if a pinion of radius RACK turned it:
+where a wire lies along it, r is RACK.
+
 An arm is sound when at least 95 % of the postures are held, at least 95 % have a smallest stiffness
 eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff; where it is
 negative, the arm is unstable), every joint moves some mass, and no moment arm is at fault. Beside
@@ -34,6 +37,7 @@ from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription, shown
 from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.jumps import JUMP, jumps
+from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -41,7 +45,7 @@ from musculoskeletal_ae.robot.tension import TensionProgramme
 DESIRED_TENSION = 60.0  # [N]
 REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
-LEAST_INERTIA = 1e-6  # [kg·m² or kg]; with less a joint cannot be simulated
+LEAST_INERTIA = 1e-6  # [kg·m²]; with less a joint cannot be simulated
 SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
 MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
@@ -59,10 +63,13 @@ class Finding(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """A robot in N postures, and what its holding and stiffness follow from."""
+    """A robot in N postures, and what its holding and stiffness follow from.
+
+    All but θ is as if a pinion turned what slides.
+    """
 
     robot: Robot
-    theta: Array  # [rad], (N, D)
+    theta: Array  # [rad] or [m], (N, D)
     jacobian: Array  # G [m/rad], (N, M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
     torque: Array  # g [N·m], (N, D)
@@ -70,9 +77,10 @@ class Setting(NamedTuple):
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
         """Return a robot in postures (N, D)."""
-        jacobian = robot.routes.muscle_jacobian
-        torque = robot.kinematics.holding_torque(theta)
-        return cls(robot, theta, jacobian(theta), muscle_hessian(jacobian, theta), torque)
+        jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
+        hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
+        torque = radian * robot.kinematics.holding_torque(theta)
+        return cls(robot, theta, radian * jacobian(theta), hessian, torque)
 
 
 @dataclass(frozen=True)
@@ -142,6 +150,30 @@ def judge(setting: Setting) -> RobotCheck:
     return RobotCheck(setting, arms, tension, missing, stiffness, one_sided, faults, warnings)
 
 
+class Words(NamedTuple):
+    """How a moment arm at a joint is told: where it slides, as a share of the tension."""
+
+    scale: float
+    unit: str
+    name: str
+    long: str  # what it is where it is large
+    other: str  # where a wire pulls the other way
+    better: str  # where it pulls more surely
+
+
+def words(robot: Robot, joint: int) -> Words:
+    """Return how moment arms at a joint are told."""
+    if robot.kinematics.slides[joint]:
+        return Words(100.0 / RACK, '%', 'pull', 'strong', 'towards the other end of', 'more along')
+    return Words(1e3, 'mm', 'moment arm', 'long', 'along the other side of', 'further from')
+
+
+def required_stiffness(robot: Robot) -> str:
+    """Say the least eigenvalue, and what that is where a joint slides."""
+    sliding = f' (where it slides, {REQUIRED_STIFFNESS / RACK**2:.0f} N/m)'
+    return f'{REQUIRED_STIFFNESS:g} N·m/rad' + sliding * bool(robot.kinematics.slides.any())
+
+
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
     """Return (muscle, joint) → ±1 of `moment_arms.csv`; nothing if there is no such file.
 
@@ -179,13 +211,13 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         if not arm.any():
             actual = '0, it does not cross the joint,'
         if against > TOLERATED_SHARE:
+            scale, unit, name, _, other, _ = words(robot, joint)
             yield Finding(
                 'wrong_sign',
-                f'muscle {robot.muscles[muscle]!r} has a moment arm of wrong sign at joint '
+                f'muscle {robot.muscles[muscle]!r} has a {name} of wrong sign at joint '
                 f'{robot.joints[joint]!r}: expected {expected}, found {actual} in '
-                f'{100 * against:.0f} % of postures (median {1e3 * np.median(arm):+.1f} mm)',
-                'lead its route along the other side of the joint axis, or correct '
-                f'{DECLARATION_FILE}',
+                f'{100 * against:.0f} % of postures (median {scale * np.median(arm):+.1f} {unit})',
+                f'lead its route {other} the joint axis, or correct {DECLARATION_FILE}',
             )
 
 
@@ -196,31 +228,37 @@ def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         '-': np.min(moment_arms, axis=1) >= -MATTERS,
     }
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
-    for joint in np.flatnonzero(np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE):
+    one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
+    for joint in np.flatnonzero(one_way).tolist():
         missing = ' and '.join(
             f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'
             for sign, lacking in lacks.items()
             if lacking[:, joint].any()
         )
+        scale, unit, _, _, other, _ = words(robot, joint)
         acting = ', '.join(
-            f'{robot.muscles[m]} ({1e3 * median[m, joint]:+.0f} mm)'
+            f'{robot.muscles[m]} ({scale * median[m, joint]:+.0f} {unit})'
             for m in np.flatnonzero(longest[:, joint] > MATTERS)
         )
         yield Finding(
             'one_way_joint',
             f'joint {robot.joints[joint]!r} has no muscle that pulls in direction '
             f'{missing}; muscles that act on it: {acting or "none"}',
-            'a wire only pulls: lead a muscle along the other side of its axis',
+            f'a wire only pulls: lead a muscle {other} its axis',
         )
 
 
 def _useless_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    for name, arm in zip(robot.muscles, np.abs(moment_arms).max(axis=(0, 2)), strict=True):
-        if arm < MATTERS:
+    along = ', along one that slides' * bool(robot.kinematics.slides.any())
+    for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
+        if (arm := arms.max()) < MATTERS:
+            scale, unit, name, long, *_ = words(robot, int(arms.argmax()))
             yield Finding(
                 'useless_muscle',
-                f'muscle {name!r} never matters: its longest moment arm is {1e3 * arm:.1f} mm',
-                f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint, or remove it',
+                f'muscle {muscle!r} never matters: '
+                f'its {long}est {name} is {scale * arm:.1f} {unit}',
+                f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint{along}, '
+                'or remove it',
             )
 
 
@@ -243,7 +281,7 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
                 'flipping_muscle',
                 f'muscle {robot.muscles[m]!r} changes the sign of its main action, '
                 f'at joint {robot.joints[joint]!r}, in {100 * against:.0f} % of postures',
-                'lead it further from the axis of that joint',
+                f'lead it {words(robot, joint).better} the axis of that joint',
             )
 
 
@@ -264,14 +302,15 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
-    least = np.min([robot.kinematics.joint_inertia(posture) for posture in theta], axis=0)
-    for name, value in zip(robot.joints, least, strict=True):
-        if value < LEAST_INERTIA:
-            yield Finding(
-                'no_inertia',
-                f'joint {name!r} moves no mass (inertia {value:.2g} kg·m²)',
-                'give the links it carries an <inertial> in robot.urdf',
-            )
+    kin = robot.kinematics
+    least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
+    for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):
+        told = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
+        yield Finding(
+            'no_inertia',
+            f'joint {robot.joints[j]!r} moves no mass ({told})',
+            'give the links it carries an <inertial> in robot.urdf',
+        )
 
 
 def _holding_faults(
@@ -284,8 +323,10 @@ def _holding_faults(
         lack = np.abs(missing[~held])
         most = lack.argmax(axis=1)
         counts = Counter(sorted(most.tolist())).most_common()
+        own, units = lack / robot.kinematics.radian, robot.units
+        force = 'torque' + ' or force' * bool(robot.kinematics.slides.any())
         where = ', '.join(
-            f'{robot.joints[k]} in {count} (up to {lack[most == k, k].max():.2f} N·m)'
+            f'{robot.joints[k]} in {count} (up to {own[most == k, k].max():.2f} {units[k].torque})'
             for k, count in counts
         )
         worst = counts[0][0]
@@ -293,7 +334,7 @@ def _holding_faults(
             'not_held',
             f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
             f'weight with T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N, '
-            f'{required}; of the {len(lack)} others torque lacks most at {where}',
+            f'{required}; of the {len(lack)} others {force} lacks most at {where}',
             joint=worst,
         )
     if stiff.mean() < REQUIRED_SHARE:
@@ -306,7 +347,7 @@ def _holding_faults(
         yield Finding(
             'not_stiff',
             f'the arm is {told}: {100 * stiff.mean():.1f} % of postures have a smallest '
-            f'stiffness eigenvalue >= {REQUIRED_STIFFNESS:g} N·m/rad, {required} '
+            f'stiffness eigenvalue >= {required_stiffness(robot)}, {required} '
             '(a posture that is not held counts as not stiff); softest joint of the held ones, '
             f'in postures: {where or "none"}',
             joint=counts[0][0] if counts else worst,

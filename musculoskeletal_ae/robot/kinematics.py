@@ -25,6 +25,20 @@ from musculoskeletal_ae.arrays import Array
 
 REVOLUTE = ('JointModelRX', 'JointModelRY', 'JointModelRZ', 'JointModelRevoluteUnaligned')
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
+#: [m] that a joint slides count as one radian of one that turns, wherever both are judged alike:
+#: the radius of the pinion by which a joint module moves what slides; chosen
+RACK = 0.06
+
+
+class Units(NamedTuple):
+    """In what one joint's θ, torque and stiffness are."""
+
+    theta: str
+    torque: str
+    stiffness: str
+
+
+TURNS, SLIDES = Units('rad', 'N·m', 'N·m/rad'), Units('m', 'N', 'N/m')
 
 
 class JointPoses(NamedTuple):
@@ -134,6 +148,10 @@ class Kinematics:
         self.placement_rotation = np.stack([m.rotation for m in self.model.jointPlacements])
         self.placement_translation = np.stack([m.translation for m in self.model.jointPlacements])
         self.prismatic = np.array([joint.shortname() in PRISMATIC for joint in self.model.joints])
+        #: of each joint of θ, (D,): whether it slides, what counts as a radian of it, its units
+        self.slides = self.prismatic[ids]
+        self.radian: Array = np.where(self.slides, RACK, 1.0)
+        self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
         self.local_axis = np.zeros((count, 3))
         # Pose in the parent = placement + a(θ) · first + b(θ) · second.
         self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])

@@ -16,7 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
+from musculoskeletal_ae.robot.checks import (
+    REQUIRED_SHARE,
+    Finding,
+    RobotCheck,
+    Setting,
+    judge,
+    words,
+)
 from musculoskeletal_ae.robot.description import shown
 
 HELPS = 0.01  # of the postures; a change that wins less is not named
@@ -80,13 +87,16 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
     if what == 'moment arms':
         scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
         hessian = scale[:, None] * setting.hessian * scale
-        text = f'moment arms at {robot.joints[joint]} {factor:g} times as long'
+        _, _, name, long, *_ = words(robot, joint)
+        text = f'{name}s at {robot.joints[joint]} {factor:g} times as {long}'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
     if what == 'limits':  # and the postures with them
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
         theta[:, joint] += (1.0 - factor) * (middle - theta[:, joint])
         low, high = (middle + factor * (end[joint] - middle) for end in (robot.lower, robot.upper))
-        return Setting.of(robot, theta), f'limits of {robot.joints[joint]} [{low:.2f}, {high:.2f}]'
+        text = f'[{low:.4f}, {high:.4f}] m'
+        text = text if robot.kinematics.slides[joint] else f'[{low:.2f}, {high:.2f}]'
+        return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot
     values = factor * getattr(of, part)

@@ -37,8 +37,9 @@ class Robot:
         )
         self.routes = Routes(self.kinematics, description.routes)
         self.groups = groups(self.routes.crossed)
-        #: joint limits [rad], (D,)
+        #: joint limits [rad] (or [m] where they slide), (D,), and the units of each joint
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
+        self.units = self.kinematics.units
 
     @classmethod
     def load(cls, robot: str | Path) -> Robot:
@@ -104,6 +105,11 @@ class Robot:
         """Return k(θ, T) [N/m] of MSC and the elastic unit in series, θ (..., D), T (..., M)."""
         absolute = self.routes.absolute_lengths(theta)
         return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
+
+    def told(self, theta: Array, digits: int = 2) -> str:
+        """Return θ (D,) with names and units, for people to read."""
+        each = zip(self.joints, theta, self.units, strict=True)
+        return ', '.join(f'{name} {value:.{digits}f} {unit.theta}' for name, value, unit in each)
 
     def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
         """Return θ [rad] (count, D), uniform up to `margin` of each joint's range beyond it."""

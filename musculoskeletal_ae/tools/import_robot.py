@@ -15,8 +15,8 @@ def main(argv: list[str] | None = None) -> int:
         'import_robot',
         'Makes a robot directory out of a MuJoCo model (MJCF), a cardsflow.xml beside its '
         'model.urdf or model.sdf, an OpenSim model (.osim, version 4) or a URDF (a skeleton to '
-        'fill in). Says what it chose, dropped or approximated, and how far lengths are from '
-        "the source's own. Exit status 0: the directory loads.",
+        'fill in). Says what it chose, dropped, renamed or approximated, and how far lengths are '
+        "from the source's own. Exit status 0: the directory loads.",
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')

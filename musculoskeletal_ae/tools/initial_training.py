@@ -168,8 +168,8 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
     """Return the mean absolute error of every joint estimated from (T, l)."""
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
-    rows = zip(robot.joints, estimates['theta'])
-    lines = [f'{name:<{width}}{error:.4f} rad' for name, error in rows]
+    rows = zip(robot.joints, estimates['theta'], robot.units)
+    lines = [f'{name:<{width}}{error:.4f} {unit.theta}' for name, error, unit in rows]
     return '\n'.join(['', '② → θ, mean |error| of each joint', *lines, ''])
 
 
@@ -206,6 +206,8 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) ->
     grid.scale(0.8, 2.2)
     for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
         one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
+        if output == 'theta':  # 'rad', 'm' or both
+            unit = ' or '.join(sorted({each.theta for each in robot.units}, reverse=True))
         place = np.arange(len(names))
         for i, error in enumerate(e for e in errors if e.output == output):
             label = f'from {ENTERED[error.mask]}'

@@ -16,8 +16,11 @@ from musculoskeletal_ae.robot.checks import (
     REQUIRED_STIFFNESS,
     RobotCheck,
     check_robot,
+    required_stiffness,
+    words,
 )
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.suggestion import suggest, write
@@ -75,7 +78,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
-        f'stiffness >= {REQUIRED_STIFFNESS:g} N·m/rad:  {100 * result.stiff.mean():.1f} %',
+        f'stiffness >= {required_stiffness(robot)}:  {100 * result.stiff.mean():.1f} %',
     ]
     if held.any():
         one_sided = (np.nan_to_num(result.one_sided) >= REQUIRED_STIFFNESS) & held
@@ -100,18 +103,23 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     """Return min, median and max of every moment arm [mm], one row a muscle."""
     width = max(18, *(len(name) + 2 for name in robot.joints))
     first = max(len(name) for name in robot.muscles) + 2
-    arms = 1e3 * result.moment_arms
+    scale = np.array([words(robot, j).scale for j in range(robot.joint_count)])
+    arms = scale * result.moment_arms
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
+    sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
+    moves = 'moves' if sliders else 'turns'
+    sliding = f'of what slides ({sliders}): the share of the tension along it [%], "." = below '
     lines = [
         '',
-        'moment arms [mm]: min, median, max; + turns the joint in its positive direction',
+        f'moment arms [mm]: min, median, max; + {moves} the joint in its positive direction',
         f'"." = below {1e3 * MATTERS:g} mm in every posture',
+        *[f'{sliding}{100 * MATTERS / RACK:g} %'] * bool(sliders),
         ' ' * first + ''.join(name.rjust(width) for name in robot.joints),
     ]
     for name, row in zip(robot.muscles, spread):
         cells = [
-            '.' if np.abs(cell).max() < 1e3 * MATTERS else ''.join(f'{v:+5.0f}' for v in cell)
-            for cell in row
+            '.' if np.abs(cell).max() < least else ''.join(f'{v:+5.0f}' for v in cell)
+            for cell, least in zip(row, scale * MATTERS)
         ]
         lines.append(name.ljust(first) + ''.join(cell.rjust(width) for cell in cells))
     return '\n'.join([*lines, ''])
@@ -126,18 +134,16 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     figure = Figure(figsize=(5.2 * columns, 3.8 * rows), layout='constrained')
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
-    arms = 1e3 * result.moment_arms.transpose(2, 1, 0)
-    slides = robot.kinematics.prismatic[robot.kinematics.tree]
-    for panel, name, angle, of_joint, slide in zip(
-        axes, robot.joints, result.setting.theta.T, arms, slides
-    ):
-        label, shown_as = ('position [mm]', 1e3) if slide else ('joint angle [deg]', 180.0 / np.pi)
+    for j, (panel, name) in enumerate(zip(axes, robot.joints)):
+        slides, (scale, unit, called, *_) = robot.kinematics.slides[j], words(robot, j)
+        label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
-            if np.abs(of_joint[m]).max() >= 1e3 * MATTERS:
+            arm = result.moment_arms[:, m, j]
+            if np.abs(arm).max() >= MATTERS:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}
-                panel.scatter(shown_as * angle, of_joint[m], **look)
+                panel.scatter(shown_as * result.setting.theta[:, j], scale * arm, **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
-        panel.set(title=name, xlabel=label, ylabel='moment arm −G [mm]')
+        panel.set(title=name, xlabel=label, ylabel=f'{called} −G [{unit}]')
         if panel.collections:
             panel.legend(fontsize=6, ncols=2, markerscale=2, loc='best')
     last, held = axes[robot.joint_count], result.held

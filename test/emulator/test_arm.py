@@ -231,6 +231,15 @@ def test_no_wrench_that_is_taken_breaks_it_and_reset_mends_one_that_does(name, r
 
 
 @pytest.mark.parametrize('reality', ['kin', 'foreign'])
+def test_the_sensor_of_a_joint_that_slides_is_off_by_millimetres(tmp_path, reality):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    arms = [make_arm(robot, seed, reality) for seed in range(3)]
+    off = np.array([[arm.sense().theta[-1] - arm.theta[-1] for _ in range(30)] for arm in arms])
+    assert np.abs(off).max() < 0.01
+    assert 1e-5 < off.std(axis=1).max() < 2e-4
+
+
+@pytest.mark.parametrize('reality', ['kin', 'foreign'])
 def test_a_joint_that_slides_stops_at_its_limits(tmp_path, reality):
     """As firmly as a joint that turns, driven by a pinion: 200 N go some millimetres beyond."""
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'

@@ -13,7 +13,6 @@ from musculoskeletal_ae.experiments.roles import (
     flexed,
     plotted,
     shoulder,
-    slides,
     within,
 )
 from musculoskeletal_ae.robot.robot import Robot
@@ -33,7 +32,7 @@ def test_joints_are_found_by_name(name, flexes, forced):
 
 def test_foreign_names_leave_the_first_and_the_last_joint_that_turn(tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
-    assert slides(robot, robot.joint_count - 1)
+    assert robot.kinematics.slides.tolist() == [False, False, False, True]
     assert shoulder(robot) == 0
     assert elbow(robot) == robot.joint_count - 2
     assert plotted(robot, robot.joint_count - 1) == (1000.0, 'mm')

@@ -78,6 +78,7 @@ def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.muscles == ('a_b', 'a_b_', 'out', 'in', 'bend', 'stretch', 'curler')
     assert result.robot.joints == ('to_base', 'universe_', 'elbow')
+    assert 'renamed: tendon a b is a_b_ here' in result.notes
     assert max(result.errors.values()) < 1e-6
 
 
@@ -145,6 +146,13 @@ def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
 
 
+def test_cardsflow_muscles_of_one_name_are_told_apart(cardsflow, tmp_path):
+    cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
+    result = import_robot(cardsflow, tmp_path / 'out')
+    assert result.robot.muscles == ('front', 'front_')
+    assert 'renamed: muscle front is front_ here' in result.notes
+
+
 def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
     wrap = '<viaPoint type="SPHERICAL" radius="0.02">0 -0.01 0.1</viaPoint>'
     text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
@@ -158,12 +166,17 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         read_source(cardsflow)
 
 
+TWICE = '<joint name="other" type="fixed"><child>arm</child></joint></model>'
+
+
 @pytest.mark.parametrize(
     ('old', 'new', 'told'),
     [
         ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only what SDF 1.6 knows is read'),
         ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
         ('"shoulder"', '"universe"', 'joint universe: expected a name that no other has'),
+        ('<joint', '<link name="arm"/><joint', "link 'arm' comes twice; expected unique names"),
+        ('</model>', TWICE, "child of a joint 'arm' comes twice; expected one joint for each link"),
     ],
 )
 def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, told):
@@ -212,6 +225,7 @@ COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
 <coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
 </coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
 <dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
+CONTACT = '<HuntCrossleyForce name="c"><HuntCrossleyForce::Parts/></HuntCrossleyForce>'
 LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
 
 
@@ -222,9 +236,12 @@ LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
         ('<range>0 2</range>', '<prescribed>true</prescribed>', 'prescribed motion of'),
         ('name="flexor">', 'name="f"><appliesForce>false</appliesForce>', 'f: it applies no force'),
         ('<ForceSet><objects>', f'<ForceSet><objects>{LONE}', 'muscle lone: fewer than 2 points'),
+        ('<ForceSet><objects>', f'<ForceSet><objects>{CONTACT}', 'HuntCrossleyForce c: no muscle'),
         ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
         ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
-        ('name="extensor"', 'name="flexor"', 'locked coordinate bend'),
+        ('name="extensor"', 'name="flexor"', 'renamed: muscle flexor is flexor_ here'),
+        ('name="extensor"', 'name="a b"', 'renamed: muscle a b is a_b here'),
+        ('</Body><Body name="hand">', f'{bodies._WRAP}</Body><Body name="hand">', 'drum of ulna'),
         ('name="bend"', 'name="a&#10;joints: b"', r'a\njoints: b'),
     ],
 )
@@ -245,6 +262,12 @@ def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
     [
         ('<inertia>0.01 ', '<inertia>-0.01 ', 'link humerus: expected principal moments'),
         ('/flexion</socket_x', '/flex</socket_x', "there is no coordinate 'flex'"),
+        ('</Body></obj', '</Body><Body name="ulna"/></obj', "body 'ulna' comes twice; .* rename"),
+        ('</Body></obj', '</Body><Body name="ground"/></obj', "'ground' comes twice"),
+        ('"wrist"', '"elbow"', "joint 'elbow' comes twice; expected unique names: rename one"),
+        ('"bend"', '"flexion"', "coordinate 'flexion' comes twice"),
+        ('="up"', '="down"', "frame 'shoulder/down' comes twice"),
+        ('/bodyset/hand<', '/bodyset/ulna<', "joint 'ulna' comes twice; expected one joint for"),
     ],
 )
 def test_a_wrong_opensim_model_is_refused_by_name(tmp_path, old, new, told):

@@ -131,6 +131,15 @@ def test_angles_that_are_read_stay_where_they_are_read(arm26, seen):
     assert np.abs(found - seen.theta).max() < 0.03
 
 
+def test_positions_of_what_slides_stay_where_they_are_read(tmp_path):
+    robot, off = Robot.load(write_robot(tmp_path, slider=True)), []
+    for seed in range(4):
+        seen = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
+        off.append(fit_body(CorrectedBody(robot), seen).theta[:, -1] - seen.theta[:, -1])
+    # 0.2 mm; 0.7 mm if zeros of sensors were thought to be off by 2° in metres.
+    assert np.abs(off).mean() < 4e-4
+
+
 def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
     part = seen[np.arange(8)]
     body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)

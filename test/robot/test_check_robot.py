@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from robots import copy_robot, read_muscles, write_muscles, write_robot
+from scipy.linalg import eigh
 
 from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.tools.check_robot import main
 from musculoskeletal_ae.tools.robot_report import plot
 
@@ -95,6 +98,44 @@ def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path, monkeypatch):
     plot(robot, check_robot(robot, 5), tmp_path / 'plot.png')
     labels = [panel.get_xlabel() for panel in figures[0].axes[:4]]
     assert labels == ['joint angle [deg]'] * 3 + ['position [mm]']
+    assert [panel.get_ylabel() for panel in figures[0].axes[2:4]] == [
+        'moment arm −G [mm]',
+        'pull −G [%]',
+    ]
+
+
+def test_what_slides_is_as_stiff_as_a_pinion_that_moves_it(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True, stiffness=2000.0))
+    result = check_robot(robot, 20)
+    held = result.held
+    assert held.any()  # the premise
+    theta, tension = result.setting.theta[held], result.tension[held]
+    raw, k = robot.routes.muscle_jacobian, robot.muscle_stiffness(theta, tension)
+    mixed = joint_stiffness(raw(theta), muscle_hessian(raw, theta), k, tension)
+    lowest = [
+        eigh(each, np.diag([1.0, 1.0, 1.0, RACK**-2]), eigvals_only=True)[0] for each in mixed
+    ]
+    np.testing.assert_allclose(result.stiffness[held], lowest, rtol=1e-6)
+
+
+def test_what_slides_is_told_in_newtons_and_shares_of_the_tension(tmp_path, capsys):
+    def back(document):
+        (entry,) = (m for m in document['muscles'] if m['name'] == 'slider_out')
+        entry['route'][0]['xyz'] = [0.0, -0.02, -0.1]
+
+    directory = change(write_robot(tmp_path, slider=True), back)
+    (directory / 'moment_arms.csv').write_text('muscle,joint,sign\nslider_out,wrist,+\n')
+    urdf = directory / 'robot.urdf'
+    urdf.write_text(
+        urdf.read_text().replace('"0.25"', '"9"').replace('lower="0.0"', 'lower="0.02"')
+    )
+    status, printed, _ = verdict(capsys, directory, '--postures', '40')
+    assert status == 1
+    assert re.search(r'wrist in \d+ \(up to [\d.]+ N\)', printed)
+    assert re.search(r"pull of wrong sign at joint 'wrist'.*\(median -\d+\.\d %\)", printed)
+    assert re.search(r'act on it: .*slider_in \(-\d+ %\)', printed)
+    assert 'of what slides (wrist): the share of the tension along it [%]' in printed
+    assert '5 N·m/rad (where it slides, 1389 N/m)' in printed
 
 
 @pytest.mark.parametrize('name', SHIPPED)
