@@ -17,6 +17,8 @@ from musculoskeletal_ae.files import read_table
 if TYPE_CHECKING:  # options are read without numpy
     from musculoskeletal_ae.robot.groups import Group
 
+#: where networks are trained
+DEVICES = 'cpu', 'cuda'
 REFERENCE = 5 + 10  # D + M of the arm that the numbers of preset `default` are for
 
 

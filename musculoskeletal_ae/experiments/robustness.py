@@ -10,7 +10,8 @@ messages. Oracle: least squares on one message with the true routes and elastic 
 informed oracle also knows the errors of the tension and length sensors, and how much each wire
 rubs; neither knows what a message does not tell: which way a wire slid, loops, creep, drift. What
 is learned comes from the joint sensors, whose own error is there, too. The
-ablation leaves out some effects of the foreign body, the rest of the individual staying as it is.
+ablation leaves out some effects of the foreign body, the rest of the individual staying as it is;
+"links" adds one, of link lengths, axes and masses, which the paper takes as exact.
 """
 
 from __future__ import annotations
@@ -89,10 +90,12 @@ def measure(study: Study, seed: int) -> Measured:
     frozen, why = _frozen(study, seed, [part.folder for part in parts.values()])
     for reality, error in zip(REALITIES, frozen, strict=True):
         numbers[reality]['frozen_after_rad'] = error
+    if not study.quick:
+        numbers['links_rad'] = _otherwise(parts[FOREIGN], seed, links=1.0)
     numbers |= {'frozen': why} if why else {}
     if seed == study.seeds[0]:
         numbers['ablation_rad'] = {
-            name: _without(parts[FOREIGN], seed, effects)
+            name: _otherwise(parts[FOREIGN], seed, **dict.fromkeys(effects, 0.0))
             for name, effects in ABLATED.items()
             if name in QUICK or not study.quick
         }
@@ -167,13 +170,13 @@ def _output(command: list[Any], cwd: str | None = None) -> bytes:
     return bytes(subprocess.run(command, check=True, **options).stdout)  # noqa: S603
 
 
-def _without(study: Study, seed: int, effects: tuple[str, ...]) -> float:
-    """Return what learning is left with where an individual lacks some effects [rad]."""
+def _otherwise(study: Study, seed: int, **effects: float) -> float:
+    """Return what learning is left with where an individual has other effects [rad]."""
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm
 
     def arm() -> Arm:
-        return ForeignArm(study.robot, seed, replace(Effects(), **dict.fromkeys(effects, 0.0)))
+        return ForeignArm(study.robot, seed, replace(Effects(), **effects))
 
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     learner, loop = online_learning.beginner(study, arm(), seed, study.preset)

@@ -413,7 +413,7 @@ class Learner:
             values |= {
                 'error at newest samples': f'{update.error:.4f} rad',
                 'loss': f'{update.loss:.4f}',
-                'update': f'{update.seconds:.2f} s',
+                'update': f'{update.seconds:.2f} s on {update.device}',
                 'anomaly calibrated': str(is_calibrated(update.mae)),
             }
             if len(update.noise):

@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae import checkpoint
@@ -59,6 +61,7 @@ class Update(NamedTuple):
     contradicted: tuple[int, ...] = ()  # muscles that they contradict together: θ is wrong there
     error: float = 0.0  # mean ‖θ_est − θ‖₂ over the newest samples before they were learned [rad]
     seconds: float = 0.0  # how long it took
+    device: str = 'cpu'  # where it was trained
 
 
 class Training:
@@ -124,8 +127,10 @@ class TrainingProcess(Training):
     No call waits for the process: a thread does. A job that was lost with one is given to the next.
     """
 
-    def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
+    def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:
+        """Learn on one of `presets.DEVICES`, or on the CPU where there is no such."""
         super().__init__(robot, preset, seed)
+        self._device = device
         self.restarts = 0  # how often a process was lost
         self._mae: Mae | None = None
         self._job: Job | None = None
@@ -145,7 +150,7 @@ class TrainingProcess(Training):
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Update | str] = queue.SimpleQueue()
         context = multiprocessing.get_context('spawn')
-        arguments = self.robot.description.directory, self.preset.name, self.seed
+        arguments = self.robot.description.directory, self.preset.name, self.seed, self._device
         try:
             ours, theirs = context.Pipe()
             process = context.Process(target=serve, args=(theirs, *arguments), daemon=True)
@@ -260,13 +265,19 @@ def _talk(
             answers.put(f'{type(error).__name__}: {error}')
 
 
-def serve(connection: Connection, directory: Path, preset: str, seed: int) -> None:
+def serve(connection: Connection, directory: Path, preset: str, seed: int, device: str) -> None:
     """Be the training process: answer until the other end closes, however the node ended."""
     faulthandler.enable()
     os.nice(NICENESS)
     import torch
 
+    from musculoskeletal_ae.mae.training import train_on
+
     torch.set_num_threads(1)
+    try:
+        train_on(device)
+    except MusculoskeletalError as error:
+        print(f'{error}; learning on the CPU', file=sys.stderr, flush=True)
     robot = Robot.load(directory)
     training = Training(robot, preset, seed)
     try:

@@ -68,7 +68,8 @@ class Updater(ABC):
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
         update = self._learn(job)
-        return update._replace(error=error, seconds=time.perf_counter() - begun)
+        seconds, device = time.perf_counter() - begun, str(torch.get_default_device())
+        return update._replace(error=error, seconds=seconds, device=device)
 
     @abstractmethod
     def _learn(self, job: Job) -> Update: ...

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
@@ -151,7 +152,7 @@ def fit(
     These are `settings.steps` of scaled (θ, T, l), shape (N, D+2M), or (N, 2, D+2M) of samples and
     their twins. The seed draws the masks where a sample is entered by one only.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(torch.get_default_device()).manual_seed(seed)
     optimiser = Optimiser(network, settings.step_size, muon=settings.optimiser == 'muon')
     losses = []
     with one_thread():
@@ -180,6 +181,20 @@ def annealing(progress: float) -> float:
     if progress < RISE:
         return progress / RISE
     return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))
+
+
+def train_on(device: str) -> None:
+    """Let everything that is trained from now on be on one of `presets.DEVICES`.
+
+    Raises:
+        MusculoskeletalError: If torch finds no such device.
+    """
+    if device == 'cuda' and not torch.cuda.is_available():
+        raise MusculoskeletalError(
+            f"device 'cuda': torch {torch.__version__} finds none here; legal: cpu. "
+            'For a GPU, install its driver and a torch that is built for it (pytorch.org)'
+        )
+    torch.set_default_device(device)
 
 
 @contextmanager

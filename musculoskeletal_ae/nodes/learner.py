@@ -9,6 +9,7 @@ mae_checkpoint.
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ class Learner(Shell):
             period=1.0 / self.rate,
             settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
             joint_source=value('joint_source'),
-            training=TrainingProcess,
+            training=partial(TrainingProcess, device=value('device')),
             directory=self._directory(value('state_directory')),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)

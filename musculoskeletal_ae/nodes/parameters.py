@@ -31,6 +31,7 @@ from musculoskeletal_ae.parameters import (
     Parameter,
     parameters_of,
 )
+from musculoskeletal_ae.presets import DEVICES
 
 FRAME_PREFIX = Parameter('', 'put before every frame that is published, such as "left/"')
 SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}
@@ -139,6 +140,11 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **parameters_of(LearningSettings),
         'update_steps': Parameter(
             STEPS, 'mini-batches of one update, preset default', '', (1, 100_000)
+        ),
+        'device': Parameter(
+            'cpu',
+            'where the network is trained (cuda: the CPU where torch finds none)',
+            legal=DEVICES,
         ),
     },
     'bringup_status': {

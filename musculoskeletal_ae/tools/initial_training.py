@@ -27,6 +27,7 @@ from musculoskeletal_ae.mae.training import (
     initial_mae,
     pair_errors,
     random_states,
+    train_on,
 )
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.options import save_plot
@@ -48,6 +49,7 @@ def train(args: Namespace) -> None:
     for file in filter(None, (args.out, args.plot)):
         if not file.parent.is_dir() or file.is_dir():
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
+    train_on(args.device)
     robot = Robot.load(args.robot)
     preset = PRESETS[args.preset]
     steps = preset.steps(robot.groups) // (10 if args.quick else 1)

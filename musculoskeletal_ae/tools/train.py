@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.presets import DEVICES
 from musculoskeletal_ae.start import load
 
 
@@ -29,6 +30,8 @@ def main(argv: list[str] | None = None) -> int:
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
     text = 'with --from-bag: network to start from (default: train one on the geometric model)'
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
+    text = 'where to train (default: cpu)'
+    parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
     parser.add_quick('a tenth of the training, to try things out')
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint):

@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 
 from musculoskeletal_ae.learning import training
 from musculoskeletal_ae.learning.training import Training, TrainingProcess
@@ -61,6 +62,16 @@ def test_it_learns_what_would_be_learned_here(process, arm26, initial, stage):
     assert there.loss == expected.loss
     np.testing.assert_array_equal(there.mae.encoder[0][0], expected.mae.encoder[0][0])
     assert process.ready
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason='it learns there')
+def test_without_a_gpu_it_learns_on_the_cpu_and_says_so(arm26, initial, stage, capfd):
+    process = TrainingProcess(arm26, 'default', device='cuda')
+    process.begin(initial)
+    process.submit(job(stage.store(3), steps=1))
+    assert answer(process).device == 'cpu'
+    process.close()
+    assert 'finds none here' in capfd.readouterr().err
 
 
 def test_a_process_that_hangs_is_replaced_and_the_next_does_its_job(

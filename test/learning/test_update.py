@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -14,10 +15,12 @@ from musculoskeletal_ae.learning.update import (
     UNSURE,
     BodyUpdater,
     PaperUpdater,
+    Trainer,
     learned_steps,
     synthetic_samples,
 )
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.presets import PAPER
 
@@ -124,6 +127,17 @@ def test_a_slipped_joint_sensor_reopens_no_muscle(arm26, initial, stage):
     update = updater.update(job(store, steps=1))
     assert update.changed == ()
     assert len(update.contradicted) > 1
+
+
+def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body, monkeypatch):
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, 'Adam', lambda those, lr, **_: adam(those, lr))  # unfused
+    data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
+    with torch.device('meta'):  # computes nothing, so that a loss has no value in the end
+        trainer = Trainer(from_mae(initial))
+        with pytest.raises(RuntimeError, match='item'):
+            trainer.train(data, 1)
+    assert trainer.steps == 1
 
 
 def test_synthetic_lengths_scatter_both_ways_by_what_of_friction_stays_unknown(other_body):
