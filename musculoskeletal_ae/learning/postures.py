@@ -319,31 +319,14 @@ class _GroupFit:
     def run(self, theta: Array, zero: Array) -> list[Array]:
         """Bring θ (N, D) and zeros (D,) of all joints in line, in place; return the parameters."""
         body, joints = self._body, self._joints
-        rows = self.rows(theta, zero[joints])
-        determined, first = np.zeros(len(self.noise)), 0
+        rows, determined, level = self.rows(theta, zero[joints]), np.zeros(len(self.noise)), 0
         for _ in range(ROUNDS):
             self.weigh(rows, theta, determined)
-            before = self.cost(rows, theta, zero[joints])
             system = self.system(rows, theta, zero[joints])
-            old = body.parameters, theta.copy(), zero.copy()
             determined = self.determined()
-            for level in range(first, len(DAMPING)):
-                change, turn, shift = self.solve(system, DAMPING[level])
-                steps = (change[column] for column in self._columns)
-                body.parameters = [at + step for at, step in zip(old[0], steps)]
-                theta[:, joints] = old[1][:, joints] + turn
-                zero[joints] = old[2][joints] + shift
-                rows = self.rows(theta, zero[joints])
-                now = self.cost(rows, theta, zero[joints])
-                if now <= before:
-                    break
-            else:
-                body.parameters, theta[:], zero[:] = old
-                rows = self.rows(theta, zero[joints])
+            rows, level, gained = self._step(rows, system, theta, zero, max(0, level - 1))
+            if gained < ENOUGH:
                 break
-            if before - now < ENOUGH:
-                break
-            first = max(0, level - 1)
         self.weigh(rows, theta, determined)
         if level or (self._unread > 1.0).any():
             self._by_torque /= self._unread
@@ -356,6 +339,32 @@ class _GroupFit:
             unknown = np.square(solve_triangular(self.root, wide, trans='T')).sum(axis=0)
             self.noise[i] = np.hypot(self.noise[i], np.sqrt(unknown.mean()))
         return body.parameters
+
+    def _step(
+        self, rows: _Rows, system: tuple[Array, ...], theta: Array, zero: Array, first: int
+    ) -> tuple[_Rows, int, float]:
+        """Go a step, in place, with the least damping from `first` on that lowers the cost.
+
+        Returns the rows there, the damping, and by how much: 0 where no step is worth it.
+        """
+        body, joints = self._body, self._joints
+        before = self.cost(rows, theta, zero[joints])
+        old = body.parameters, theta.copy(), zero.copy()
+        for level in range(first, len(DAMPING)):
+            change, turn, shift = self.solve(system, DAMPING[level])
+            expected = np.append(change, shift) @ system[-1] + (turn * system[3]).sum()
+            if expected < ENOUGH:
+                break
+            steps = (change[column] for column in self._columns)
+            body.parameters = [at + step for at, step in zip(old[0], steps)]
+            theta[:, joints] = old[1][:, joints] + turn
+            zero[joints] = old[2][joints] + shift
+            there = self.rows(theta, zero[joints])
+            now = self.cost(there, theta, zero[joints])
+            if now <= before:
+                return there, level, before - now
+        body.parameters, theta[:], zero[:] = old
+        return rows, level, 0.0
 
 
 def student(score: Array) -> Array:

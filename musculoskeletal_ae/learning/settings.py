@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import Parameter
 
-STEPS = 100  # of training in one update of preset default
+STEPS = 50  # of training in one update of preset default; with 100 the error is 3 % less
 
 
 @dataclass(frozen=True)
