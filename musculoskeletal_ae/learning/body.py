@@ -38,8 +38,8 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 FEATURES = 60  # of the smooth rest that are drawn, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges
-#: share of what they vary by that is left out, with the half of them that says no more, and the
-#: postures that this is taken over: less than 0.1 mm at the prior's spread
+#: share of their variance that is left out with the directions that vary least, about half of them
+#: (less than 0.1 mm at the prior's spread), and the postures that it is taken over
 LEFT_OUT, POSTURES = 1e-3, 500
 # More than twice the tension at the elastic unit than at the motor is no friction.
 LARGEST_FRICTION = 0.5
@@ -62,7 +62,7 @@ class Layout:
 class Smooth(NamedTuple):
     """ψ of one muscle: K random Fourier features, in the F directions in which they vary."""
 
-    frequency: Array  # [1/rad], (K, D); 0 for joints that the muscle does not cross
+    frequency: Array  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
     phase: Array  # (K,)
     basis: Array  # (K, F)
 
@@ -83,7 +83,7 @@ class Smooth(NamedTuple):
         return values @ self._scaled
 
     def slope(self, theta: Array, joints: Ints) -> Array:
-        """Return ∂ψ/∂θ of some joints [1/rad], shape (joints, N, F)."""
+        """Return ∂ψ/∂θ of some joints [1/rad or 1/m], shape (joints, N, F)."""
         values = -np.sin(theta @ self.frequency.T + self.phase)
         return (values * self.frequency.T[joints, None]) @ self._scaled
 
@@ -110,10 +110,7 @@ class CorrectedBody:
         seed: int = 0,
         smooth: list[Smooth] | None = None,
     ) -> None:
-        """Correct `robot` by one vector per muscle, zero by default; `seed` draws the smooth rest.
-
-        Unless it is given, too.
-        """
+        """Correct `robot` by one vector per muscle (zero); `seed` draws `smooth` if not given."""
         self.robot, routes = robot, robot.routes
         if smooth is None:
             rng = np.random.default_rng([seed, 0xF0])
@@ -125,7 +122,9 @@ class CorrectedBody:
             points = np.append(routes.first[segments], routes.second[segments[-1]])
             self.layouts.append(Layout(points, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
-        self.zero = np.zeros(robot.joint_count)  # of the joint sensors, where a fit starts [rad]
+        #: where a fit starts: zeros of the joint sensors [rad], θ (D,) of samples by their lengths
+        self.zero = np.zeros(robot.joint_count)
+        self.found: dict[bytes, Array] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
         """Return the body of one group, with the parameters of its muscles."""

@@ -49,10 +49,10 @@ LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
 #: spreads that takes, and how far such a joint is from the limit [rad]
 NEAR_STOP, PUSHED, STOP = 0.05, 3.0, 0.01
 ROUNDS = 12
-#: decrease, in variances, that ends the rounds: the step was then far shorter than what the samples
-#: leave open, and the noise has settled (at 1, a slipped joint sensor is taken for a changed muscle
-#: twice as often)
-ENOUGH = 0.1
+#: decrease, in variances for each length, that ends the rounds: the step was then far shorter than
+#: what the samples leave open, and the noise has settled (with ten times as much, a joint sensor
+#: that slipped is taken for a changed muscle more often)
+ENOUGH = 3e-4
 #: of a step, tried until one lowers the cost; from one below the last that did
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)
 EXPECTED = 0.3  # step of a posture [rad]
@@ -98,6 +98,7 @@ class _GroupFit:
         self._least, seen, robot = least_noise, self._seen, self._body.robot
         self._radian = robot.kinematics.radian
         self._known = seen.known.astype(float)
+        self._enough = ENOUGH * self._known.sum()
         self._crossed = robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
         self._acting = [np.flatnonzero(own) for own in of_muscle]  # parameters, by joint
@@ -325,7 +326,7 @@ class _GroupFit:
             system = self.system(rows, theta, zero[joints])
             determined = self.determined()
             rows, level, gained = self._step(rows, system, theta, zero, max(0, level - 1))
-            if gained < ENOUGH:
+            if gained < self._enough:
                 break
         self.weigh(rows, theta, determined)
         if level or (self._unread > 1.0).any():
@@ -350,10 +351,11 @@ class _GroupFit:
         body, joints = self._body, self._joints
         before = self.cost(rows, theta, zero[joints])
         old = body.parameters, theta.copy(), zero.copy()
+        *_, pulled, right = system
         for level in range(first, len(DAMPING)):
             change, turn, shift = self.solve(system, DAMPING[level])
-            expected = np.append(change, shift) @ system[-1] + (turn * system[3]).sum()
-            if expected < ENOUGH:
+            expected = np.append(change, shift) @ right + (turn * pulled).sum()
+            if expected < self._enough:
                 break
             steps = (change[column] for column in self._columns)
             body.parameters = [at + step for at, step in zip(old[0], steps)]
@@ -385,7 +387,9 @@ def fit_jointly(
     Returns what `Fit` holds.
     """
     own, zero = np.isfinite(seen.theta) & (seen.spread == 0.0), body.zero
-    theta = start - own * zero
+    theta, samples = start - own * zero, [length.tobytes() for length in seen.length]
+    for n in np.flatnonzero([sample in body.found for sample in samples]):
+        theta[n] = body.found[samples[n]]
     weight = np.zeros_like(seen.length)
     noise, root = np.empty(seen.length.shape[1]), []
     for group in body.robot.groups:
@@ -396,6 +400,7 @@ def fit_jointly(
             body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, fit.root))
+    body.found = dict(zip(samples, theta, strict=True))
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
     read = np.where(np.isnan(seen.theta), theta, seen.theta - own * zero)
     (length,) = body.lengths(read, seen.tension, seen.direction)

@@ -241,13 +241,13 @@ class BodyUpdater(Updater):
         if self._prior_mean is None or self._prior_mean_confirmed or len(seen) < IN_A_ROW:
             return self.body
         self._prior_mean_confirmed = True
-        body = CorrectedBody(self._robot, self._prior_mean, self._seed)
+        body = CorrectedBody(self._robot, self._prior_mean, smooth=self.body.smooth)
         (length,) = body.lengths(seen.theta, seen.tension, seen.direction)
         if np.median(np.abs(seen.length - length)[seen.known]) <= LEAST_CHANGE:
             return self.body
         self._prior_mean = None
         self._trainer.restart()
-        return CorrectedBody(self._robot, seed=self._seed)
+        return CorrectedBody(self._robot, smooth=self.body.smooth)
 
     def _mean_length(self) -> Array:
         """Return l [m] (M,) of the body, averaged over always the same postures and tensions."""

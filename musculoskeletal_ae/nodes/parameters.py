@@ -143,7 +143,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'device': Parameter(
             'cpu',
-            'where the network is trained (cuda: the CPU where torch finds none)',
+            'where the network is trained (the CPU where torch computes nothing there)',
             legal=DEVICES,
         ),
     },

@@ -71,7 +71,7 @@ def test_without_a_gpu_it_learns_on_the_cpu_and_says_so(arm26, initial, stage, c
     process.submit(job(stage.store(3), steps=1))
     assert answer(process).device == 'cpu'
     process.close()
-    assert 'finds none here' in capfd.readouterr().err
+    assert 'computes nothing there' in capfd.readouterr().err
 
 
 def test_a_process_that_hangs_is_replaced_and_the_next_does_its_job(
