@@ -32,7 +32,7 @@ TRIES = 1000
 # of gentle motion
 SPEED = 0.05  # [m/s] of a command, at most
 DURATION, REST = 1.5, 0.25  # [s] of a step and after it
-REACH = 0.7  # [rad] of a step, each joint
+REACH = 0.7  # [rad] of a step, each joint; times RACK [m] of what slides
 INSIDE = 0.1  # of the joint range that goals keep from its ends
 GOALS = 20  # goals, of which the first is taken that can be held
 SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
@@ -119,8 +119,9 @@ class GentleMotion:
     def _goal(self, mae: Mae, tension: Array, length: Array, theta: Array) -> Array:
         robot, limits = self._robot, (self._robot.tension.bias, gentle_limit(self._robot))
         best, pull, least = theta, tension, np.inf
+        radian = robot.kinematics.radian
         for goal in robot.random_postures(GOALS, self._rng, -INSIDE):
-            near = theta + np.clip(goal - theta, -REACH, REACH)
+            near = theta + np.clip(goal - theta, -REACH * radian, REACH * radian)
             programme = TensionProgramme(
                 mae.muscle_jacobian(near, tension), robot.kinematics.holding_torque(near), *limits
             )
@@ -130,7 +131,7 @@ class GentleMotion:
                 break
             except InfeasibleError:
                 exertion = programme.compromise()
-                if (missing := float(np.abs(exertion.missing_torque).max())) < least:
+                if (missing := float(np.abs(radian * exertion.missing_torque).max())) < least:
                     best, pull, least = near, exertion.tension, missing
         now = length - mae.lengths(theta, tension)
         return now + mae.lengths(best, pull) + msc_compensation(robot, pull)

@@ -58,7 +58,7 @@ STEP = 0.05
 # `tension`
 SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
 
-# `float`
+# `float`; as of a pinion of radius RACK where a joint slides
 BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
 DAMPING = 1.0  # [N·m·s/rad]
 WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
@@ -288,8 +288,9 @@ class TorqueControl:
         T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
 
     with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the
-    estimate, smoothed. With both gains zero the arm's weight is carried and `effort` is exerted,
-    nothing more: such an arm floats and keeps no posture.
+    estimate, smoothed. Where a joint slides, K_p and K_d are those of a pinion of radius RACK. With
+    both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
+    floats and keeps no posture.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -327,8 +328,9 @@ class TorqueControl:
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the torque by posture and velocity [N·m], (D,)."""
-        chosen = self.settings
-        return chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
+        chosen, radian = self.settings, self._robot.kinematics.radian
+        torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
+        return torque / radian**2
 
 
 class FloatControl(TorqueControl):
@@ -347,8 +349,9 @@ class FloatControl(TorqueControl):
         self.held: Array | None = None  # θ_held [rad], (D,)
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        low, high = self._robot.lower, self._robot.upper
-        held = target if self.held is None else np.clip(self.held, theta - BAND, theta + BAND)
+        low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian
+        band, edge = BAND * radian, WALL_AT * radian
+        held = target if self.held is None else np.clip(self.held, theta - band, theta + band)
         self.held = np.clip(held, low, high)
-        wall = np.clip(theta, low + WALL_AT, high - WALL_AT) - theta
-        return HOLD * (held - theta) - DAMPING * velocity + WALL * wall
+        wall = np.clip(theta, low + edge, high - edge) - theta
+        return (HOLD * (held - theta) - DAMPING * velocity + WALL * wall) / radian**2

@@ -46,7 +46,7 @@ SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the f
 PLANS = 4  # times a plan is slowed and tried again
 SLOWNESS = 20.0  # at most
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
-FALLEN, FALLING = 0.2, 2.0  # [rad] off, so long [s] after the end
+FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
 TURNING = 0.005  # [m/s] of a wire beyond which its direction is sure
 WINDING = 0.03  # [m/s] from which a winch tells its lag
@@ -176,7 +176,7 @@ class MotionControl:
         """Whether the arm lacks a muscle and rests elsewhere than where a trajectory has led."""
         rested = self.trajectory is not None and self.time > self.trajectory.duration + FALLING
         rested = rested and self.next is None and not self._robot.used.all()
-        return bool(rested and np.abs(self.error).max() > FALLEN)
+        return bool(rested and np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
 
     @property
     def latest(self) -> Trajectory | None:
@@ -308,7 +308,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
         pulls, missing = (np.array(part) for part in zip(*plans))
         command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
         change = np.abs(np.diff(command, axis=0)).max(axis=1)
-        lacking = np.abs(missing).max(axis=1) > NOTABLE
+        lacking = np.abs(robot.kinematics.radian * missing).max(axis=1) > NOTABLE
         change[lacking[1:] | lacking[:-1]] = 0.0
         needed = change.max() * count / tried.duration / (SHARE * settings.rate_limit)
         if needed <= 1.0:

@@ -7,11 +7,11 @@ go straight to where they can. `way` is the cheapest path through a roadmap of r
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
-with tensions up to T_bias + USED (T_limit − T_bias), so that it leads through what is held with
-something to spare, if there is such a way, and else where the least is missing. Some of the roadmap
-lies where joints that the arm leans on stay at their stops. Edges are looked at only if the
-cheapest path leads along them (lazy roadmap, Bohlin and Kavraki 2000); until then the postures at
-their ends say what they cost.
+with what slides as if a pinion of radius RACK turned it, and tensions up to
+T_bias + USED (T_limit − T_bias), so that it leads through what is held with something to spare, if
+there is such a way, and else where the least is missing. Some of the roadmap lies where joints that
+the arm leans on stay at their stops. Edges are looked at only if the cheapest path leads along them
+(lazy roadmap, Bohlin and Kavraki 2000); until then the postures at their ends say what they cost.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
+# Where a joint slides, [rad] below are times RACK [m], [N·m] over RACK [N].
 NOTABLE = 0.05  # [N·m] of missing torque at which a posture is not held
 HALVINGS = 6  # of the way to a posture that cannot be held
 
@@ -36,11 +37,14 @@ AT_STOP, STOP = 0.05, 100.0  # [rad] from a joint's limit; [N·m] that its stop 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     """Return which joint lacks how much torque to hold θ [rad] (D,), or ''."""
-    torque, limits = robot.kinematics.holding_torque(theta), robot.tension
-    jacobian = mae.muscle_jacobian(theta, limits.bias)
+    limits, radian = robot.tension, robot.kinematics.radian
+    torque = radian * robot.kinematics.holding_torque(theta)
+    jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
     lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
     joint = int(lacks.argmax())
-    told = f'{lacks[joint]:.2f} {robot.units[joint].torque} at {robot.joints[joint]}'
+    told = (
+        f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque} at {robot.joints[joint]}'
+    )
     return told if lacks[joint] > NOTABLE else ''
 
 
@@ -68,40 +72,42 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     from scipy.sparse.csgraph import dijkstra
 
     limits, joints = robot.tension, np.eye(robot.joint_count)
+    radian = robot.kinematics.radian
+    at_stop = AT_STOP * radian
     most = limits.bias + USED * (limits.limit - limits.bias)
 
     def missing(postures: Array) -> Array:
         pulls = np.broadcast_to(limits.bias, (len(postures), robot.muscle_count))
         found = []
-        for at, jacobian in zip(postures, mae.muscle_jacobian(postures, pulls)):
+        for at, jacobian in zip(postures, radian * mae.muscle_jacobian(postures, pulls)):
             # A stop is a muscle that pulls away from it.
-            low, high = at < robot.lower + AT_STOP, at > robot.upper - AT_STOP
+            low, high = at < robot.lower + at_stop, at > robot.upper - at_stop
             stops = np.vstack([-joints[low], joints[high]])
             none = np.zeros(len(stops))
             ends = np.concatenate([limits.bias, none]), np.concatenate([most, none + STOP])
-            torque = robot.kinematics.holding_torque(at)
+            torque = radian * robot.kinematics.holding_torque(at)
             found.append(least_tension(np.vstack([jacobian, stops]), torque, *ends).missing_torque)
         m = np.abs(found).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
 
     def cost(one: Array, other: Array) -> float:
-        length = float(np.linalg.norm(other - one))
+        length = float(np.linalg.norm((other - one) / radian))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
         m = missing(one + shares * (other - one))
         return length * (1.0 + PRICE * float(m.mean()))
 
     direct = cost(start, theta)
-    if direct <= np.linalg.norm(theta - start):
+    if direct <= np.linalg.norm((theta - start) / radian):
         return theta[None]
     rng = np.random.default_rng(0)
     postures = robot.random_postures(POSTURES, rng)
     # Where the arm leans on a stop, a part of the roadmap does as well.
     for joint in range(robot.joint_count):
         for stop in (robot.lower[joint], robot.upper[joint]):
-            if abs(start[joint] - stop) < AT_STOP:
+            if abs(start[joint] - stop) < at_stop[joint]:
                 postures[rng.random(POSTURES) < 0.3, joint] = stop
     postures = np.vstack([start, theta, postures])
-    apart = np.linalg.norm(postures[:, None] - postures, axis=2)
+    apart = np.linalg.norm((postures[:, None] - postures) / radian, axis=2)
     m = missing(postures)
     price = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
     near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]

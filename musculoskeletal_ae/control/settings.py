@@ -45,10 +45,18 @@ class Settings:
         0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
     )
     position_gain: float = settable(
-        10.0, 'torque towards the target, method `tension` (0: torque only)', 'N·m/rad', 0.0, 200.0
+        10.0,
+        'torque towards the target, method `tension` (0: torque only; over 0.06² where it slides)',
+        'N·m/rad',
+        0.0,
+        200.0,
     )
     velocity_gain: float = settable(
-        0.5, 'damping torque, method `tension` (0: none)', 'N·m·s/rad', 0.0, 20.0
+        0.5,
+        'damping torque, method `tension` (0: none; over 0.06² where it slides)',
+        'N·m·s/rad',
+        0.0,
+        20.0,
     )
     feedback_gain: float = settable(
         0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0

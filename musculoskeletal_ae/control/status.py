@@ -19,7 +19,7 @@ def report(core: Controller, now: float) -> Report:
     solution = motion.solution if core.follows else posture.solution
     at_work: MotionControl | TorqueControl | Solution | None
     at_work = motion if core.follows else core.by_tension or solution
-    missing = np.zeros(0) if at_work is None else at_work.missing_torque
+    missing = np.zeros(robot.joint_count) if at_work is None else at_work.missing_torque
     values, warnings = {'method': chosen.method, 'preset': chosen.preset}, []
     if core.clamped:
         values['target clamped at'] = ', '.join(core.clamped)
@@ -39,7 +39,7 @@ def report(core: Controller, now: float) -> Report:
         values['lag of the winches'] = f'{1000.0 * motion.winches.lag:.0f} ms'
         if motion.moving and (slow := slowed(motion)):
             warnings.append(f'trajectory {slow}')
-    if np.abs(missing).max(initial=0.0) > reach.NOTABLE:
+    if np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         lacks = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {lack:.2f} {u.torque}' for n, lack, u in lacks)
         warnings.append('the target needs more torque than the muscles have')
@@ -89,7 +89,7 @@ def _lying(core: Controller) -> str:
     """Return how far from its target an arm rests that fell, and what keeps it there."""
     mae, estimate, off, robot = core.mae, core.estimate, core.motion.error, core.robot
     assert mae is not None and estimate is not None  # it has moved
-    joint = int(np.abs(off).argmax())
+    joint = int(np.abs(off / robot.kinematics.radian).argmax())
     far = f'{abs(off[joint]):.2f} {robot.units[joint].theta}'
     told = f'fallen: {robot.joints[joint]} rests {far} off its target'
     lacks = reach.lacking(robot, mae, estimate)

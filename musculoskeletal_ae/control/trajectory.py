@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 
-BEYOND = 0.02  # [rad] by which the curve between points may leave the joint limits
+BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
 STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
 SAMPLES = 200  # of a trajectory that are looked at
 #: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
@@ -138,8 +138,9 @@ class Trajectory:
         """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
         theta = self.sample(np.linspace(0.0, self.duration, SAMPLES)).theta
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
-        if (out > BEYOND).any():
-            j = int(out.argmax())
+        beyond = out / robot.kinematics.radian
+        if (beyond > BEYOND).any():
+            j = int(beyond.argmax())
             told = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
             raise MessageError('leaves the joint limits', told)
 

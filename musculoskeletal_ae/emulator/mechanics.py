@@ -30,7 +30,7 @@ from musculoskeletal_ae.emulator.wrapping import (
 
 SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
 # Joints.
-STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up
+STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up; of a pinion
 VISCOUS = 0.5  # [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
 STOP_LOAD = 40.0  # [N·m] of weight and muscles at T_bias; stops of a joint with more are firmer
@@ -140,7 +140,7 @@ def _friction_and_stops(body: Body, joint: JointState) -> None:
     for i in range(joint.q.shape[0]):
         turned = STEP * joint.velocity[i]
         direction = 1.0 if turned > 0.0 else -1.0
-        keep = math.exp(-abs(turned) / STICKING_ANGLE)
+        keep = math.exp(-abs(turned) * math.sqrt(body.gear[i]) / STICKING_ANGLE)
         joint.sticking[i] = direction + (joint.sticking[i] - direction) * keep
         joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
         joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])

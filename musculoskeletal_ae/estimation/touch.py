@@ -31,9 +31,9 @@ from musculoskeletal_ae.robot.robot import Robot
 BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀ [N]
 SMALL = np.eye(3) / LARGEST_USUAL**2
-#: [rad] or [m] from a joint limit: what the estimate may be off by
+#: [rad], or times RACK [m], from a joint limit: what the estimate may be off by
 AT_STOP = 0.06
-TURNED = 0.02  # [rad] by which joints turn until G is taken anew
+TURNED = 0.02  # [rad], or times RACK [m], by which joints turn until G is taken anew
 #: d of five healthy arms that explored for ten minutes each reached 8.6
 CONTACT, IN_A_ROW = 10.0, 2
 
@@ -53,7 +53,7 @@ class ExternalTorque:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._middle = 0.5 * (robot.lower + robot.upper)
-        self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP
+        self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP * robot.kinematics.radian
         self.reset()
 
     def use(self, mae: Mae) -> None:
@@ -74,7 +74,8 @@ class ExternalTorque:
     def step(self, theta: Array, end_tension: Array, dt: float) -> Touch:
         """Take estimated θ [rad] (D,) and T_end [N] (M,), dt [s] after those before."""
         kinematics, joints = self._robot.kinematics, len(theta)
-        if not np.abs(theta - self._turned).max() <= TURNED:  # not a number, too
+        turned = np.abs(theta - self._turned) / kinematics.radian
+        if not turned.max() <= TURNED:  # not a number, too
             self._jacobian, self._turned = self._mae.muscle_jacobian(theta, end_tension), theta
         now: Array = np.concatenate((theta, end_tension @ self._jacobian))
         if self._value is None:
@@ -106,7 +107,7 @@ class ExternalTorque:
 # -- what a healthy arm leaves --------------------------------------------------------------------
 
 MEMORY = 180.0  # [s] of motion whose torques count
-MOVING = 0.05  # [rad/s] or [m/s] of all joints together, below which an arm rests
+MOVING = 0.05  # [rad/s], or times RACK [m/s], of all joints together, below which an arm rests
 #: spreads beyond which a torque counts as if it were there: somebody touched the arm
 OUTLIER = 5.0
 LEAST_SPREAD = 1e-3  # [N·m]
@@ -118,6 +119,7 @@ class HealthyTorque:
     def __init__(self, robot: Robot) -> None:
         """Start with nothing; a network is needed first."""
         self._observer, self._direction = ExternalTorque(robot), FrictionDirection()
+        self._radian = robot.kinematics.radian
         self._square, self._time = np.zeros(robot.joint_count), 0.0
 
     def use(self, mae: Mae) -> Mae:
@@ -142,7 +144,7 @@ class HealthyTorque:
         end = self._direction.end_tension(self._mae.friction, tension, length, dt)
         theta = self._mae.estimate(end, length).theta
         torque = self._observer.step(theta, end, dt).torque
-        if np.linalg.norm(self._observer.velocity) < MOVING:
+        if np.linalg.norm(self._observer.velocity / self._radian) < MOVING:
             return
         square = torque**2
         if self._time > LEAST_MOTION:

@@ -33,6 +33,7 @@ ENOUGH_SEEN, ENOUGH, STANDING = 20.0, 38.0, 1.0
 FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, between later ones
 MOST = 240  # moments
 
+# Where a joint slides, [rad] below are times RACK [m], [N·m] over RACK [N].
 LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
 WORST = 0.3, 5.0  # times LENGTH_NOISE, the muscles that a network knows best and least
 FRICTION = 0.05  # μ of a wire, give or take as much
@@ -114,12 +115,16 @@ class Zeroing:
         self._angles: list[Array] = []  # θ in the same time, where measured
         self._moments: list[tuple[Array, ...]] = []
         muscles, joints = robot.muscle_count, robot.joint_count
-        weight = np.abs(robot.kinematics.holding_torque(robot.random_postures(64, self._rng))).max()
+        self._radian = radian = robot.kinematics.radian
+        postures = robot.random_postures(64, self._rng)
+        weight = np.abs(radian * robot.kinematics.holding_torque(postures)).max()
         counts = muscles, muscles, muscles, joints
         self._mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)  # of the constants, beforehand
         spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight
         self._spread = np.repeat(spread, counts)
-        noise = LENGTH_NOISE * _worse(mae), np.repeat([TORQUE_NOISE, OUTSIDE], joints)
+        self._spread[-joints:] /= radian
+        self._torque_noise = TORQUE_NOISE / radian
+        noise = LENGTH_NOISE * _worse(mae), self._torque_noise, OUTSIDE * radian
         self._noise = np.concatenate(noise)  # of the residuals, (M + 2D,)
         self._before: Array = np.zeros(muscles)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
@@ -245,7 +250,7 @@ class Zeroing:
         drawn, size = [], []
         for _ in range(DRAWN // POSTURES):
             drawn.append(self._robot.random_postures(POSTURES, self._rng))
-            size.append(np.linalg.norm(self._torque(drawn[-1], pull)[0], axis=1))
+            size.append(np.linalg.norm(self._radian * self._torque(drawn[-1], pull)[0], axis=1))
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(size))[:POSTURES]]
         offset = seen.length[0] - mae.lengths(first, pull)
@@ -255,14 +260,14 @@ class Zeroing:
         for n, zero in enumerate(offset):
             theta = mae.estimate(few.tension, few.length - zero).theta
             left = few.length - zero - mae.lengths(theta, few.tension)
-            parts = left / COARSE[0], self._outside(theta) / COARSE[2]
+            parts = left / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
             cost[n] = sum(np.log1p(each**2).sum() for each in parts)
             postures.append(theta)
             if n % 20 == 19:
                 yield
         order = np.argsort(cost)[:SHORTLIST]
         for n in order:
-            torque = self._torque(postures[n], few.tension)[0] / COARSE[1]
+            torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE[1]
             cost[n] += np.log1p(torque**2).sum()
             yield
         best = order[np.argsort(cost[order])][:PURSUED]
@@ -293,9 +298,10 @@ class Zeroing:
         unheld, jacobian = self._torque(theta, pull)
         torque = unheld + sticking * turning
         # A stop takes any torque: there the balance says nothing, at the price of a usual residual.
-        low, high = self._robot.lower + AT_STOP, self._robot.upper - AT_STOP
+        at_stop = AT_STOP * self._radian
+        low, high = self._robot.lower + at_stop, self._robot.upper - at_stop
         free = (low < theta) & (theta < high)
-        left = [seen.length - offset - length, np.where(free, torque, TORQUE_NOISE), outside]
+        left = [seen.length - offset - length, np.where(free, torque, self._torque_noise), outside]
         value = np.concatenate(left, axis=1) / self._noise
         if not slopes:
             return (value,)
@@ -323,7 +329,8 @@ class Zeroing:
     def _refine(self, fit: Fit, seen: Moments, rounds: int) -> Fitting:
         """Return the best fit near one, after so many Gauss–Newton steps at most."""
         eye, own_eye, damping = np.eye(self._robot.joint_count), np.eye(len(self._mean)), 1e-3
-        turning = _turning(fit.theta)
+        turning = _turning(fit.theta, STICKING * self._radian)
+        farthest = FARTHEST * self._radian
         fit = fit._replace(cost=self._cost(self._residuals(fit, seen, turning)[0], fit.constants))
         for _ in range(rounds):
             yield
@@ -346,7 +353,7 @@ class Zeroing:
                 reduced = reduced - np.einsum('kpd,kqd->pq', through, cross)
                 shift = -np.linalg.solve(reduced, down - np.einsum('kpd,kd->p', through, gradient))
                 turn = gradient + np.einsum('kpd,p->kd', cross, shift)
-                turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -FARTHEST, FARTHEST)
+                turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -farthest, farthest)
                 tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
                 cost = self._cost(self._residuals(tried, seen, turning)[0], tried.constants)
                 if cost < before:
@@ -361,12 +368,15 @@ class Zeroing:
         return fit
 
 
-def _turning(theta: Array) -> Array:
-    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D)."""
+def _turning(theta: Array, sticking: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for the K postures of a way (K, D).
+
+    Its friction turns round over `sticking` [rad] (D,).
+    """
     result, reference = np.zeros_like(theta), theta[0].copy()
     for k, posture in enumerate(theta):
-        reference = np.clip(reference, posture - STICKING, posture + STICKING)
-        result[k] = (posture - reference) / STICKING
+        reference = np.clip(reference, posture - sticking, posture + sticking)
+        result[k] = (posture - reference) / sticking
     return result
 
 

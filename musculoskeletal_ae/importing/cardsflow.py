@@ -32,6 +32,7 @@ from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_mimics, read_urdf
 
+ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
 FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # what later versions of SDF add
 
 
@@ -46,6 +47,11 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
         fallback = f'muscle_{len(source.routes)}'
+        kinds = [via.get('type') for via in muscle.findall('link/viaPoint')]
+        if sum(kind not in ROUND for kind in kinds) < 2:
+            told = f'muscle {muscle.get("name") or fallback}: fewer than 2 points'
+            source.note('dropped', told)
+            continue
         name = source.rename('muscle', muscle.get('name'), fallback, source.routes)
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
@@ -55,7 +61,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
             for via in part.findall('viaPoint'):
                 where, kind = f'muscle {name}: viaPoint', via.get('type', 'FIXPOINT')
                 at = centres[link] + numbers(via.text, 3, where)
-                if kind in ('SPHERICAL', 'CYLINDRICAL'):
+                if kind in ROUND:
                     if not route or isinstance(route[-1], Wrap):
                         source.note('dropped', f'muscle {name}: a {kind} via point after no point')
                         continue
@@ -70,10 +76,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
         if route and isinstance(route[-1], Wrap):
             route.pop()
             source.note('dropped', f'muscle {name}: a wrap before no point')
-        if sum(isinstance(item, RoutePoint) for item in route) < 2:
-            source.note('dropped', f'muscle {name}: fewer than 2 points')
-        else:
-            source.routes[name] = tuple(route)
+        source.routes[name] = tuple(route)
     if model == 'model.urdf':
         _measure(source)
     return source

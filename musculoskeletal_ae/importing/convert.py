@@ -44,7 +44,8 @@ def read_source(file: Path) -> Source:
     """
     text = read_text(file, refuse, LARGEST)
     # OpenSim writes names of C++ as tags, as HuntCrossleyForce::ContactParameters.
-    root = parse_xml(file, re.sub(r'(</?\w+)::(?=\w)', r'\1.', text))
+    text = re.sub(r'</?\w+(?:::\w+)+', lambda tag: tag[0].replace('::', '.'), text)
+    root = parse_xml(file, text)
     if root.tag not in READERS:
         told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')

@@ -150,10 +150,10 @@ class _Reader:
     # -- bodies and joints -----------------------------------------------------------------------
 
     def _coordinates(self) -> None:
-        named = ((c.get('name', ''), c) for c in self.model.iter('Coordinate'))
-        given = unique('coordinate', [('', None), *named])  # '' is none
-        del given['']
-        for name, item in given.items():
+        named = [(c.get('name', ''), c) for c in self.model.iter('Coordinate')]
+        if '' in dict(named):
+            raise ValueError('a Coordinate has no name; expected one')
+        for name, item in unique('coordinate', named).items():
             default = _number(item, 'default_value')
             low, high = _vector(item, 'range', 2)
             if _word(item, 'locked').lower() == 'true':
@@ -222,8 +222,10 @@ class _Reader:
             for frame in owner.iter('PhysicalOffsetFrame'):
                 parent, pose = self._frame(frame, 'socket_parent', path)
                 at = pose * _offset(frame, 'orientation')
-                own = [(f'{path}/{frame.get("name")}', (parent, at))]
-                self.frames = unique('frame', [*self.frames.items(), *own])
+                if (label := f'{path}/{frame.get("name")}') in self.frames:
+                    told = 'expected unique names: rename one'
+                    raise ValueError(f'frame {label!r} comes twice; {told}')
+                self.frames[label] = parent, at
         hung = []
         for name, joint in joints.items():
             parent, before = self._frame(joint, 'socket_parent_frame', name)
@@ -357,29 +359,28 @@ class _Reader:
         return body, at, (_word(item, 'socket_coordinate'), low, high)
 
     def _muscle(self, item: ET.Element) -> None:
-        source = self.source
-        name = source.rename('muscle', item.get('name'), 'force', source.routes)
-        path = item.find('GeometryPath')
+        source, path, given = self.source, item.find('GeometryPath'), item.get('name') or 'force'
         if path is None or not ('Muscle' in item.tag or item.tag == 'PathActuator'):
-            source.note('dropped', f'{item.tag} {name}: no muscle with a path of points')
+            source.note('dropped', f'{item.tag} {given}: no muscle with a path of points')
             return
         if _word(item, 'appliesForce').lower() == 'false':
-            source.note('dropped', f'muscle {name}: it applies no force')
+            source.note('dropped', f'muscle {given}: it applies no force')
             return
         points = [self._point(p) for p in path.findall('PathPointSet/objects/*')]
         if len(points) < 2:
-            source.note('dropped', f'muscle {name}: fewer than 2 points')
+            source.note('dropped', f'muscle {given}: fewer than 2 points')
             return
         for _, axes, (condition, *_) in points:
             for coordinate in (condition, *(name for name, _ in axes)):
                 self._driver(coordinate)  # which says if there is none
         places, active = self._path(points, self.random)
         always = _always_active(places, active)
-        stands = [self._standing(f'muscle {name}', *each) for each in zip(points, always)]
         kept = np.flatnonzero(always).tolist()
         if len(kept) < 2:
-            source.note('dropped', f'muscle {name}: fewer than 2 points')
+            source.note('dropped', f'muscle {given}: fewer than 2 points are kept')
             return
+        name = source.rename('muscle', item.get('name'), 'force', source.routes)
+        stands = [self._standing(f'muscle {name}', *each) for each in zip(points, always)]
         self.points[name] = points
         wraps = self.wraps[name] = self._place_wraps(name, path, places, kept)
         route: list[RoutePoint | Wrap] = []

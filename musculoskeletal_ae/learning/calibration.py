@@ -68,14 +68,15 @@ class Reservoir:
         seed: int = 0,
         settings: Settings = DEFAULT,
         capacity: int = CAPACITY,
+        radian: Array | float = 1.0,
     ) -> None:
-        """Start empty; rests differ as samples do."""
+        """Start empty; rests differ as samples do, `radian` as there."""
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
         self._kept: list[NDArray[np.float32]] = []
         self._seen, self._since = 0, 0.0
         self.time = 0.0  # healthy time seen [s]
-        self._rests = SampleStore(settings)
+        self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
         """Take a message, with θ where joint sensors read it."""

@@ -73,15 +73,16 @@ class Learner:
         """
         self.robot = robot
         self.training = training(robot, preset, seed)
-        self.samples = SampleStore(settings)  # what is learned from
+        radian = robot.kinematics.radian
+        self.samples = SampleStore(settings, radian=radian)  # what is learned from
         self._mae: Mae | None = None
         self.checkpoint: bytes | None = None  # the network as learned so far
         self.enabled = self._zeroed = True
         self.last_update: Update | None = None
         self.updates = self.published = 0  # updates made, checkpoints given out
         self._pairing = Pairing(period)
-        self._healthy = Reservoir(robot.muscle_count, seed, settings)
-        spread = SPREAD * robot.kinematics.radian if joint_source == MARKER else NOTHING
+        self._healthy = Reservoir(robot.muscle_count, seed, settings, radian=radian)
+        spread = SPREAD * radian if joint_source == MARKER else NOTHING
         blind = joint_source != SENSOR
         self._rests = RestCollector(robot, settings, self._healthy, blind, spread)
         self._tilted = -math.inf  # when an IMU was heard last [s]

@@ -34,9 +34,11 @@ SURE = 3.0  # standard errors that a difference of means may have by chance
 class RestDetector:
     """Turns the stream of readings into one mean per rest."""
 
-    def __init__(self, settings: Settings, blind: bool = False) -> None:
-        """Start with an empty window."""
-        self.settings, self.blind = settings, blind
+    def __init__(
+        self, settings: Settings, blind: bool = False, radian: Array | float = 1.0
+    ) -> None:
+        """Start with an empty window; `radian` is that of `SampleStore`."""
+        self.settings, self.blind, self._radian = settings, blind, radian
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
         self.reset()
 
@@ -81,7 +83,8 @@ class RestDetector:
         if min(map(len, angles)) < LEAST_READINGS:
             return self.blind
         read = np.isfinite(angles[0][0])  # a robot has a sensor at a joint or has none
-        return _unmoved([part[:, read] for part in angles], self.settings.rest_joint_rate * half)
+        allowed = np.broadcast_to(self.settings.rest_joint_rate * half * self._radian, read.shape)
+        return _unmoved([part[:, read] for part in angles], allowed[read])
 
 
 def _measured(reading: Sample) -> bool:
@@ -95,7 +98,7 @@ def _mean(values: Array) -> Array:
     return np.where(known.any(axis=0), mean, np.nan)
 
 
-def _unmoved(halves: list[Array], allowed: float) -> bool:
+def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
     first, second = halves
     difference = np.abs(second.mean(axis=0) - first.mean(axis=0))
     if (difference <= allowed).all():
@@ -148,7 +151,7 @@ class RestCollector:
         self.anomaly = False  # closes the gate
         # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
-        self._detector = RestDetector(settings, blind)
+        self._detector = RestDetector(settings, blind, robot.kinematics.radian)
         self._hole = max(HOLE, settings.rest_time)
         self._plausibility = Plausibility(robot)
         self._direction = FrictionDirection()

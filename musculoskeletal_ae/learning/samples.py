@@ -100,9 +100,14 @@ class Observations:
 class SampleStore:
     """Samples in the order in which they came, at most `capacity`."""
 
-    def __init__(self, settings: Settings = DEFAULT, capacity: int = CAPACITY) -> None:
-        """Start empty."""
-        self._settings = settings
+    def __init__(
+        self,
+        settings: Settings = DEFAULT,
+        capacity: int = CAPACITY,
+        radian: Array | float = 1.0,
+    ) -> None:
+        """Start empty; `radian` [rad or m] (D,) is what counts as a radian of each joint."""
+        self._settings, self._radian = settings, radian
         self.capacity = capacity
         self.accepted = 0  # ever
         self.clear()
@@ -156,7 +161,8 @@ class SampleStore:
         unread = np.isnan(sample.theta).any()
         # Of a posture that was not read the lengths tell whether it is another one.
         length = sample.length / (MOMENT_ARM * joint) if unread else np.nan * sample.length
-        return np.concatenate([sample.theta / joint, sample.tension / tension, length])
+        theta = sample.theta / (joint * self._radian)
+        return np.concatenate([theta, sample.tension / tension, length])
 
     def _dispensable(self) -> int:
         points = np.nan_to_num(np.array([self._scaled(s) for s in self.samples]))

@@ -16,13 +16,19 @@ class Settings:
 
     rest_time: float = Parameter(0.3, 'how long the arm has to be still', 's', (0.0, 10.0)).field()
     rest_joint_rate: float = Parameter(
-        0.02, 'fastest joint of a resting arm', 'rad/s', (0.0, 1.0)
+        0.02,
+        'fastest joint of a resting arm (times 0.06 m where it slides)',
+        'rad/s',
+        (0.0, 1.0),
     ).field()
     rest_length_rate: float = Parameter(
         0.002, 'fastest muscle of a resting arm', 'm/s', (0.0, 1.0)
     ).field()
     new_joint_distance: float = Parameter(
-        0.05, 'least distance of a new sample in one joint', 'rad', (0.0, 3.0)
+        0.05,
+        'least distance of a new sample in one joint (times 0.06 m where it slides)',
+        'rad',
+        (0.0, 3.0),
     ).field()
     new_tension_distance: float = Parameter(
         10.0, 'least distance of a new sample in one tension', 'N', (0.0, 500.0)

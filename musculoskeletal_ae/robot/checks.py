@@ -211,13 +211,14 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         if not arm.any():
             actual = '0, it does not cross the joint,'
         if against > TOLERATED_SHARE:
-            scale, unit, name, _, other, _ = words(robot, joint)
+            told = words(robot, joint)
+            median = f'{told.scale * np.median(arm):+.1f} {told.unit}'
             yield Finding(
                 'wrong_sign',
-                f'muscle {robot.muscles[muscle]!r} has a {name} of wrong sign at joint '
+                f'muscle {robot.muscles[muscle]!r} has a {told.name} of wrong sign at joint '
                 f'{robot.joints[joint]!r}: expected {expected}, found {actual} in '
-                f'{100 * against:.0f} % of postures (median {scale * np.median(arm):+.1f} {unit})',
-                f'lead its route {other} the joint axis, or correct {DECLARATION_FILE}',
+                f'{100 * against:.0f} % of postures (median {median})',
+                f'lead its route {told.other} the joint axis, or correct {DECLARATION_FILE}',
             )
 
 
@@ -235,16 +236,16 @@ def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             for sign, lacking in lacks.items()
             if lacking[:, joint].any()
         )
-        scale, unit, _, _, other, _ = words(robot, joint)
+        told = words(robot, joint)
         acting = ', '.join(
-            f'{robot.muscles[m]} ({scale * median[m, joint]:+.0f} {unit})'
+            f'{robot.muscles[m]} ({told.scale * median[m, joint]:+.0f} {told.unit})'
             for m in np.flatnonzero(longest[:, joint] > MATTERS)
         )
         yield Finding(
             'one_way_joint',
             f'joint {robot.joints[joint]!r} has no muscle that pulls in direction '
             f'{missing}; muscles that act on it: {acting or "none"}',
-            f'a wire only pulls: lead a muscle {other} its axis',
+            f'a wire only pulls: lead a muscle {told.other} its axis',
         )
 
 
@@ -252,11 +253,11 @@ def _useless_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     along = ', along one that slides' * bool(robot.kinematics.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arm := arms.max()) < MATTERS:
-            scale, unit, name, long, *_ = words(robot, int(arms.argmax()))
+            told = words(robot, int(arms.argmax()))
             yield Finding(
                 'useless_muscle',
                 f'muscle {muscle!r} never matters: '
-                f'its {long}est {name} is {scale * arm:.1f} {unit}',
+                f'its {told.long}est {told.name} is {told.scale * arm:.1f} {told.unit}',
                 f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint{along}, '
                 'or remove it',
             )

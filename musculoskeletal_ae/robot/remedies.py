@@ -87,8 +87,8 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
     if what == 'moment arms':
         scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
         hessian = scale[:, None] * setting.hessian * scale
-        _, _, name, long, *_ = words(robot, joint)
-        text = f'{name}s at {robot.joints[joint]} {factor:g} times as {long}'
+        told = words(robot, joint)
+        text = f'{told.name}s at {robot.joints[joint]} {factor:g} times as {told.long}'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
     if what == 'limits':  # and the postures with them
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]

@@ -135,15 +135,15 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     for j, (panel, name) in enumerate(zip(axes, robot.joints)):
-        slides, (scale, unit, called, *_) = robot.kinematics.slides[j], words(robot, j)
+        slides, told = robot.kinematics.slides[j], words(robot, j)
         label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
             arm = result.moment_arms[:, m, j]
             if np.abs(arm).max() >= MATTERS:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}
-                panel.scatter(shown_as * result.setting.theta[:, j], scale * arm, **look)
+                panel.scatter(shown_as * result.setting.theta[:, j], told.scale * arm, **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
-        panel.set(title=name, xlabel=label, ylabel=f'{called} −G [{unit}]')
+        panel.set(title=name, xlabel=label, ylabel=f'{told.name} −G [{told.unit}]')
         if panel.collections:
             panel.legend(fontsize=6, ncols=2, markerscale=2, loc='best')
     last, held = axes[robot.joint_count], result.held

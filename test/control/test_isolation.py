@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from control_bench import OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
+from robots import write_robot
 
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.controller import APPROACHES, Controller
+from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.safety import DEPTH, LENGTH, PAYING_OUT, TENSION, WIND, Muscles
-from musculoskeletal_ae.control.settings import METHODS
+from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -158,6 +162,42 @@ def test_a_way_leads_round_what_is_not_held():
     assert lack(start, path) == 0.0
     robot.isolate([])
     np.testing.assert_array_equal(reach.way(robot, mae, start, goal), [goal])
+
+
+@pytest.fixture(scope='module')
+def sliding(tmp_path_factory):
+    """Return an arm whose last joint slides and has no muscle left, and what its weight asks."""
+    robot = Robot.load(write_robot(tmp_path_factory.mktemp('slider'), slider=True))
+    robot.isolate(robot.muscle_indices(['slider_in', 'slider_out']))
+    postures = robot.random_postures(100, np.random.default_rng(0))
+    return robot, postures, robot.kinematics.holding_torque(postures)[:, -1]
+
+
+def test_what_slides_lacks_newtons(sliding):
+    robot, postures, force = sliding
+    told = [lacking(robot, ExactMae(robot), theta) for theta in postures]
+    notable = reach.NOTABLE / RACK
+    assert told == [f'{f:.2f} N at wrist' if f > notable else '' for f in np.abs(force)]
+    assert 0 < np.sum(np.abs(force) > notable) < len(force)
+
+
+def test_what_slides_is_led_along_its_stop_and_leans_on_none_in_between(sliding):
+    robot, postures, force = sliding
+    steep = postures[force < -1.6]  # pressed to the upper stop
+    apart = np.linalg.norm((steep[:, None] - steep)[..., :3], axis=2)
+    start, goal = steep[list(np.unravel_index(apart.argmax(), apart.shape))]
+    start[-1], goal[-1] = robot.upper[-1], 0.5 * robot.upper[-1]
+    path = reach.way(robot, ExactMae(robot), start, goal)
+    np.testing.assert_array_equal(path[:, -1], [robot.upper[-1], goal[-1]])
+
+
+def test_what_slides_has_fallen_15_mm_from_its_target(sliding):
+    robot, (theta, *_), _ = sliding
+    motion = MotionControl(robot, Settings())
+    motion.trajectory, motion.time = Trajectory.to(Setpoint.resting(theta), theta, 1.0), 60.0
+    for off, fallen in ((0.01, False), (0.015, True)):
+        motion.error = np.array([0.0, 0.0, 0.1, off])
+        assert motion.fallen is fallen
 
 
 class Verified(Bench):

@@ -8,6 +8,7 @@ import pytest
 from exact_mae import ExactMae
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import write_robot
 
 from musculoskeletal_ae.control.methods import BAND, HOLD, WALL_AT, FloatControl, TorqueControl
 from musculoskeletal_ae.control.settings import Settings
@@ -50,6 +51,17 @@ def test_the_gain_pulls_towards_the_target():
     offset = np.array([0.1, -0.1, 0.1, 0.1, -0.1])
     extra = torque_of(settled(control, THETA + offset)) - ROBOT.kinematics.holding_torque(THETA)
     np.testing.assert_allclose(extra, 4.0 * offset, atol=0.1)
+
+
+@pytest.mark.parametrize('control', [TorqueControl, FloatControl])
+def test_what_slides_is_held_as_by_a_pinion(control, tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    middle = 0.5 * (robot.lower + robot.upper)
+    off, at = 0.02 * robot.kinematics.radian, control(robot, Settings())
+    at.start_from(robot.tension.bias)
+    torque = at._feedback(middle - off, off, middle)
+    np.testing.assert_allclose(torque * robot.kinematics.radian, torque[0])
+    assert torque[0] > 0.1
 
 
 def test_tensions_change_by_the_same_share_no_faster_than_the_limit():

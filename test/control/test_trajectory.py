@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from robots import write_robot
 
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
@@ -99,6 +102,17 @@ def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
     points = Points(BOTH, np.array([0.5, 1.0]), np.array([MIDDLE, MIDDLE]), fast, None)
     with pytest.raises(MessageError, match='leaves the joint limits'):
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
+
+
+def test_a_curve_that_leaves_the_limits_of_what_slides_is_told_in_metres(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
+    for off, told in ((0.001, None), (0.01, 'wrist by 0.01 m')):
+        end = np.append(start[:3], robot.upper[3] + off)
+        points = Points(np.arange(4), np.ones(1), end[None], still, None)
+        trajectory = Trajectory.through(Setpoint.resting(start), points)
+        with pytest.raises(MessageError, match=told) if told else nullcontext():
+            trajectory.check(robot)
 
 
 def test_stopping_comes_to_rest_from_any_motion_within_the_limits():

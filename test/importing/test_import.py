@@ -153,6 +153,21 @@ def test_cardsflow_muscles_of_one_name_are_told_apart(cardsflow, tmp_path):
     assert 'renamed: muscle front is front_ here' in result.notes
 
 
+def test_what_is_dropped_keeps_its_name(cardsflow, tmp_path):
+    point = '<link name="base"><viaPoint>0 0 0</viaPoint></link>'
+    short = f'<cardsflow><myoMuscle name="a b">{point}</myoMuscle>'
+    cardsflow.write_text(bodies.CARDSFLOW.replace('<cardsflow>', short))
+    contact = CONTACT.replace('"c"', '"a b"')
+    osim = bodies.OSIM.replace('<ForceSet><objects>', f'<ForceSet><objects>{contact}')
+    for file, told in (
+        (cardsflow, 'dropped: muscle a b: fewer than 2 points'),
+        (put(tmp_path, 'own.osim', osim), 'dropped: HuntCrossleyForce a b: no muscle with a path'),
+    ):
+        notes = read_source(file).notes
+        assert any(note.startswith(told) for note in notes)
+        assert not any(note.startswith('renamed') for note in notes)
+
+
 def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
     wrap = '<viaPoint type="SPHERICAL" radius="0.02">0 -0.01 0.1</viaPoint>'
     text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
@@ -225,7 +240,7 @@ COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
 <coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
 </coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
 <dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
-CONTACT = '<HuntCrossleyForce name="c"><HuntCrossleyForce::Parts/></HuntCrossleyForce>'
+CONTACT = '<HuntCrossleyForce name="c"><HuntCrossleyForce::Parts/><A::B::C/></HuntCrossleyForce>'
 LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
 
 
@@ -266,6 +281,7 @@ def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
         ('</Body></obj', '</Body><Body name="ground"/></obj', "'ground' comes twice"),
         ('"wrist"', '"elbow"', "joint 'elbow' comes twice; expected unique names: rename one"),
         ('"bend"', '"flexion"', "coordinate 'flexion' comes twice"),
+        ('<Coordinate name="bend">', '<Coordinate>', 'a Coordinate has no name; expected one'),
         ('="up"', '="down"', "frame 'shoulder/down' comes twice"),
         ('/bodyset/hand<', '/bodyset/ulna<', "joint 'ulna' comes twice; expected one joint for"),
     ],

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import write_robot
 
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.training import Training, Update
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
+from musculoskeletal_ae.robot.robot import Robot
 
 DT = 0.01
 
@@ -96,6 +98,19 @@ def test_a_rest_becomes_one_sample_and_the_next_one_in_its_place_none(learner, s
     assert learner.rejected['like a stored one'] > 0
     arm.rest(1.0 + MARGIN + 0.5)
     assert len(learner.samples) == 2
+
+
+def test_two_centimetres_of_what_slides_are_another_posture(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    learner, pull = Learner(robot), np.full(robot.muscle_count, 60.0)
+    theta = 0.5 * (robot.lower + robot.upper)
+    theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
+    for k in range(1200):  # it rests, slides at 5 mm/s as its wires do not tell, and rests
+        theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
+        learner.step(DT * k, theta, pull, length)
+    found = [sample.theta[-1] for sample in learner.samples.samples]
+    np.testing.assert_allclose(found, [0.01, 0.03], atol=1e-4)
+    assert learner._healthy.healthy().rests == 2
 
 
 def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner, stage):

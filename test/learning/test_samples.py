@@ -15,8 +15,10 @@ from musculoskeletal_ae.learning.rest import (
 )
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT
+from musculoskeletal_ae.robot.kinematics import RACK
 
 DT = 0.01
+SLIDES = np.array([1.0, RACK])  # what counts as a radian where the second of two joints slides
 
 
 def reading(theta, length):
@@ -43,6 +45,11 @@ def test_a_still_arm_gives_its_mean_once_a_second():
 def test_a_moving_joint_or_wire_is_no_rest():
     assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.05 * t) == []
     assert run(RestDetector(DEFAULT), 3.0, length=lambda t: 0.01 * t) == []
+
+
+def test_what_slides_a_centimetre_a_second_is_no_rest():
+    assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.01 * t)
+    assert run(RestDetector(DEFAULT, radian=SLIDES), 3.0, theta=lambda t: 0.01 * t) == []
 
 
 def test_rest_that_ends_early_still_counts():
@@ -78,6 +85,13 @@ def test_the_store_takes_only_what_is_new():
     assert not store.is_new(at(0.04, -0.04))
     assert store.is_new(at(0.06, 0.0))
     assert store.is_new(at(0.0, 0.0)._replace(tension=np.array([61.0])))
+
+
+def test_another_posture_of_what_slides_is_new_after_3_mm():
+    store = SampleStore(radian=SLIDES)
+    store.add(at(0.0, 0.0))
+    assert not store.is_new(at(0.04, 0.0025))
+    assert store.is_new(at(0.0, 0.0035))
 
 
 def test_a_full_store_keeps_the_newest_and_its_coverage():
