@@ -12,7 +12,7 @@ Starts are reached by moving there, for all methods with `proposed` of the learn
 preset paper, `proposed_paper` as printed. QP bound: the least ‖T‖ with which the true body holds
 θ_eval. "Bound reached": the same at the posture where the arm came to rest, as an arm that sags
 needs less. What all starts of a target have in common is the model’s error, their scatter is
-hysteresis.
+hysteresis. Where a controller stopped, the arm's place then counts, and the stop is counted.
 """
 
 from __future__ import annotations
@@ -68,6 +68,7 @@ class Approaches(NamedTuple):
     #: least ‖T‖ that holds the posture reached [N], (P, S); nan where none does, as in one that
     #: leans on a joint's stop or rests by friction
     bound_there: dict[str, Array]
+    stops: dict[str, int]  # approaches on which the controller stopped: they end where it did
 
 
 def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
@@ -80,19 +81,25 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
     held = holdable_postures(robot, postures, count, arm.individual.muscle_jacobian)
     offset = {name: np.empty((count, count, robot.joint_count)) for name in METHODS}
     tension, there = ({name: np.empty((count, count)) for name in METHODS} for _ in range(2))
+    stops = dict.fromkeys(METHODS, 0)
     for p, (theta, _) in enumerate(held):
         for s, start in enumerate(robot.random_postures(count, rng)):
             for name, (method, preset, _) in METHODS.items():
                 loop = ClosedLoop(arm, networks['default'])
-                loop.go(start, STARTING)
+                loop.target(start)
+                loop.wait(STARTING)
+                if loop.core.safety.cause:  # the start is then where it stopped
+                    loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
-                loop.go(theta, DURATION)
+                loop.target(theta)
+                loop.wait(DURATION)
+                stops[name] += bool(loop.core.safety.cause)
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
                 there[name][p, s] = _bound(arm)
     bound = np.array([np.linalg.norm(least) for _, least in held])
-    return Approaches(np.array([theta for theta, _ in held]), bound, offset, tension, there)
+    return Approaches(np.array([theta for theta, _ in held]), bound, offset, tension, there, stops)
 
 
 def _bound(arm: Arm) -> float:
@@ -124,6 +131,7 @@ def measure(study: Study, seed: int) -> Measured:
             'tension_to_bound': float((tension / ended.bound[:, None]).mean()),
             'bound_reached_n': float(there[held].mean()) if held.any() else 0.0,
             'reached_holdable_share': float(held.mean()),
+            'stops': ended.stops[name],
         }
     smooth = study.arm(seed, friction=False)
     numbers['proposed_causes'] = _causes(smooth, networks['default'], ended)
@@ -141,7 +149,9 @@ def _causes(smooth: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
         torque = robot.kinematics.holding_torque(theta)
         none = np.full(robot.muscle_count, robot.tension.bias)
         plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
-        ClosedLoop(smooth, mae).go(theta, DURATION)
+        loop = ClosedLoop(smooth, mae)
+        loop.target(theta)
+        loop.wait(DURATION)
         parts = plan.tension, smooth.tension, smooth.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)

@@ -8,6 +8,7 @@ import pytest
 
 from bench.control_nominal import nominal_arm, nominal_tables
 from musculoskeletal_ae.experiments.control import METHODS, protocol
+from musculoskeletal_ae.experiments.recording import ClosedLoop
 
 
 def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm26, trained):
@@ -23,6 +24,20 @@ def test_a_posture_at_the_target_needs_the_bound(arm26, trained):
     """Where an arm came close to θ_eval, holding it there takes what holding θ_eval takes."""
     ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
+
+
+def test_where_a_controller_stops_all_else_is_measured(arm26, trained, monkeypatch):
+    target = ClosedLoop.target
+
+    def stopping(loop, theta):
+        target(loop, theta)
+        if loop.core.settings.method == 'geometric':
+            loop.core.safety.stop('as a test')
+
+    monkeypatch.setattr(ClosedLoop, 'target', stopping)
+    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
+    assert ended.stops == {name: int(name == 'geometric') for name in METHODS}
+    assert all(np.isfinite(offset).all() for offset in ended.offset.values())
 
 
 def test_the_table_of_the_nominal_body_names_every_method(arm26, trained):
