@@ -121,7 +121,8 @@ def host(graph, arm26, trained_file, monkeypatch):
 
     def make(process=False, **parameters):
         if not process:
-            monkeypatch.setattr('musculoskeletal_ae.nodes.learner.TrainingProcess', Training)
+            here = 'musculoskeletal_ae.nodes.learner.TrainingProcess'
+            monkeypatch.setattr(here, lambda *given, device: Training(*given))  # noqa: ARG005
         given = {'checkpoint': trained_file, 'state_directory': '', **parameters}
         return HostedLearner(graph, arm26, **given)
 
