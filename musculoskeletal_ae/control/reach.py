@@ -42,10 +42,11 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
     lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
     joint = int(lacks.argmax())
-    told = (
+    if lacks[joint] <= NOTABLE:
+        return ''
+    return (
         f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque} at {robot.joints[joint]}'
     )
-    return told if lacks[joint] > NOTABLE else ''
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:

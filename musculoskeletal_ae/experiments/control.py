@@ -86,14 +86,12 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
         for s, start in enumerate(robot.random_postures(count, rng)):
             for name, (method, preset, _) in METHODS.items():
                 loop = ClosedLoop(arm, networks['default'])
-                loop.target(start)
-                loop.wait(STARTING)
+                loop.approach(start, STARTING)
                 if loop.core.safety.cause:  # the start is then where it stopped
                     loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
-                loop.target(theta)
-                loop.wait(DURATION)
+                loop.approach(theta, DURATION)
                 stops[name] += bool(loop.core.safety.cause)
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
@@ -149,9 +147,7 @@ def _causes(smooth: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
         torque = robot.kinematics.holding_torque(theta)
         none = np.full(robot.muscle_count, robot.tension.bias)
         plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
-        loop = ClosedLoop(smooth, mae)
-        loop.target(theta)
-        loop.wait(DURATION)
+        ClosedLoop(smooth, mae).approach(theta, DURATION)
         parts = plan.tension, smooth.tension, smooth.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)

@@ -110,9 +110,13 @@ class ClosedLoop:
         Raises:
             MusculoskeletalError: If the controller stopped on the way.
         """
+        self.approach(theta, duration)
+        self.check()
+
+    def approach(self, theta: Array, duration: float) -> None:
+        """Go towards θ [rad] (D,) for a time [s]; whether the controller stopped is not asked."""
         self.target(theta)
         self.wait(duration)
-        self.check()
 
     def check(self) -> None:
         """Raise a MusculoskeletalError if the controller has stopped."""

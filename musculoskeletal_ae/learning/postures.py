@@ -388,8 +388,8 @@ def fit_jointly(
     """
     own, zero = np.isfinite(seen.theta) & (seen.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in seen.length]
-    for n in np.flatnonzero([sample in body.found for sample in samples]):
-        theta[n] = body.found[samples[n]]
+    for n, sample in enumerate(samples):
+        theta[n] = body.found.get(sample, theta[n])
     weight = np.zeros_like(seen.length)
     noise, root = np.empty(seen.length.shape[1]), []
     for group in body.robot.groups:
