@@ -10,14 +10,15 @@ for T is T_end, so that everybody who asks it about what sensors read turns one 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
 REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
-SMOOTHING = 0.05  # [s], so that the sensor's noise does not slide the wire
+#: [m] by which a length is off, in the mean of about 1/LATEST messages, that is as likely the
+#: sensor's noise as sliding
+NOISE = 0.0001
+LATEST = 0.15
 
 
 def slid(direction: Array, moved: Array) -> Array:
@@ -33,31 +34,39 @@ def end_tension(friction: Array | float, tension: Array, direction: Array) -> Ar
 
 
 class FrictionDirection:
-    """Which way each wire slid last, from muscle lengths alone."""
+    """Which way each wire slid last, from muscle lengths alone.
+
+        L ← L + e ē²/(ē² + NOISE²),   e = l − L
+
+    with ē the mean of the latest e. So a wire that rests is not slid by noise, which would turn s
+    away from ±1, and one that slides is not followed late, as it would be by a low pass.
+    """
 
     def __init__(self) -> None:
         self._length: Array | None = None
 
-    def step(self, length: Array, dt: float) -> Array:
-        """Take l [m] (M,), `dt` [s] after the one before; return s (M,)."""
+    def step(self, length: Array) -> Array:
+        """Take l [m] (M,); return s (M,)."""
         if self._length is None:
-            self._length, self._direction = length.copy(), np.zeros_like(length)
-        moved = (1.0 - math.exp(-dt / SMOOTHING)) * (length - self._length)
+            self._length = length.copy()
+            self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
+        off = length - self._length
+        self._off = self._off + LATEST * (off - self._off)
+        moved = off * self._off**2 / (self._off**2 + NOISE**2)
         self._length = self._length + moved
         self._direction = slid(self._direction, moved)
         return self._direction
 
-    def end_tension(self, friction: Array, tension: Array, length: Array, dt: float) -> Array:
-        """Take T [N] and l [m] (M,), `dt` [s] after those before; return T_end (M,), by μ (M,)."""
-        return end_tension(friction, tension, self.step(length, dt))
+    def end_tension(self, friction: Array | float, tension: Array, length: Array) -> Array:
+        """Take T [N] and l [m] (M,); return T_end (M,), by μ (M,)."""
+        return end_tension(friction, tension, self.step(length))
 
     def reset(self) -> None:
         """Forget, as after a jump of the clock."""
         self._length = None
 
 
-def directions(length: Array, dt: Array | float) -> Array:
-    """Return s (N, M) of l [m] (N, M), each `dt` [s] after the one before: one for all, or (N,)."""
+def directions(length: Array) -> Array:
+    """Return s (N, M) of l [m] (N, M), one message after the other."""
     step = FrictionDirection().step
-    seen = zip(length, np.broadcast_to(dt, len(length)), strict=True)
-    return np.array([step(*each) for each in seen]).reshape(length.shape)
+    return np.array([step(each) for each in length]).reshape(length.shape)

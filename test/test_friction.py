@@ -17,7 +17,7 @@ def test_friction_acts_against_the_last_sliding_and_ignores_noise():
     for speed, expected in ((-0.02, 1.0), (0.0, 1.0), (0.02, -1.0), (0.0, -1.0)):
         for _ in range(100):
             length += speed * DT
-            direction = friction.step(np.array([length]) + 1e-4 * rng.standard_normal(1), DT)
+            direction = friction.step(np.array([length]) + 1e-4 * rng.standard_normal(1))
         assert direction[0] * expected > 0.6
 
 
@@ -25,4 +25,4 @@ def test_friction_acts_against_the_last_sliding_and_ignores_noise():
 def test_the_direction_of_friction_stays_within_one(lengths):
     friction = FrictionDirection()
     for length in lengths:
-        assert np.abs(friction.step(np.array([length]), DT)).max() <= 1.0 + 1e-9
+        assert np.abs(friction.step(np.array([length]))).max() <= 1.0 + 1e-9

@@ -34,12 +34,13 @@ from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, ge
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
 from musculoskeletal_ae.control.motion import MotionControl
-from musculoskeletal_ae.control.posture import PostureControl
+from musculoskeletal_ae.control.posture import PostureControl, Pull
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.control.watch import Watch
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
+from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
@@ -75,6 +76,8 @@ class Controller:
         self._exploration = Exploration(robot, seed)
         self.gentle = GentleMotion(robot, seed)
         self.estimate: Array | None = None
+        self._direction = FrictionDirection()
+        self._pull = Pull(robot.tension.bias, robot.tension.bias)
         self.sent_at = 0.0  # when the last command went out; its user says so
         self._fresh = 0.0  # [s] of data since it was late
         # whether it explored at an anomaly; whether a suspect is verified; whether the arm is to go
@@ -112,7 +115,10 @@ class Controller:
     def muscles(self, muscles: Muscles, now: float) -> None:
         """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
         self.watch.muscles(muscles, self.safety.zeroed, now)
-        self.watch.pulled(self.safety.muscles(muscles).tension, now)
+        length, tension, _ = self.safety.muscles(muscles)
+        self.watch.pulled(tension, now)
+        friction = 0.0 if self.mae is None else self.mae.friction
+        self._pull = Pull(tension, self._direction.end_tension(friction, tension, length))
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
@@ -125,6 +131,7 @@ class Controller:
         """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
         self.safety.shift(less)
         self.watch.forget()
+        self._direction.reset()
         if known != self.safety.zeroed or less.any():
             self._starts, self.follows = True, False
         self.safety.zeroed = known
@@ -406,9 +413,11 @@ class Controller:
             (by_tension or posture).start_from(self.safety.last(kind).value)
         if self.follows:
             sent = self.safety.last(LENGTH).value
-            return Command(LENGTH, self.motion.step(muscles, estimate, sent, planned, dt))
+            return Command(
+                LENGTH, self.motion.step(muscles, self._pull, estimate, sent, planned, dt)
+            )
         if by_tension is None:
-            length = posture.step(muscles.tension, estimate, planned, dt)
+            length = posture.step(self._pull, estimate, planned, dt)
             return None if length is None else Command(LENGTH, length)
         if self.settings.method == 'float':
             nothing = np.zeros_like(estimate)

@@ -29,7 +29,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
-from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Ramp, RestFeedback
+from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Pull, Ramp, RestFeedback
 from musculoskeletal_ae.control.reach import NOTABLE
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
@@ -45,6 +45,7 @@ SPACING = 0.04  # [s] between the moments of a plan
 SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the feedback
 PLANS = 4  # times a plan is slowed and tried again
 SLOWNESS = 20.0  # at most
+FED_BACK = 1.5
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
@@ -190,7 +191,9 @@ class MotionControl:
 
     # -- time -----------------------------------------------------------------------------------
 
-    def step(self, muscles: Muscles, theta: Array, sent: Array, limit: Array, dt: float) -> Array:
+    def step(
+        self, muscles: Muscles, pull: Pull, theta: Array, sent: Array, limit: Array, dt: float
+    ) -> Array:
         """Return the command [m] (M,), dt [s] after the last, of which `sent` left [m] (M,).
 
         θ [rad] is estimated; `limit` [N] (M,) is the highest tension planned for each muscle.
@@ -220,12 +223,14 @@ class MotionControl:
             feedback.correction = np.clip(feedback.correction + step, -CORRECTION, CORRECTION)
             feedback.moving()
             # Bounded too: an estimate that is wrong at once must not take the arm along.
-            shift = PROPORTIONAL * np.clip(error, -CORRECTION, CORRECTION)
-            self._shift = feedback.correction + shift
+            shift = feedback.correction + PROPORTIONAL * error
+            self._shift = np.clip(shift, -CORRECTION, CORRECTION)
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
-            command = self._held(mae, muscles.tension, limit, dt)
-        command = np.where(self._robot.used, command, sent)
+            command = self._held(mae, pull, limit, dt)
+        # What is fed back is no reason to pull harder than any plan may.
+        least = muscles.length + msc_compensation(self._robot, FED_BACK * limit)
+        command = np.where(self._robot.used, np.maximum(command, least), sent)
         if self._blend is None:
             rate = self.settings.rate_limit
             self._blend = Ramp(sent - command, np.zeros_like(command), BLENDING, rate)
@@ -273,7 +278,7 @@ class MotionControl:
         self._near = self._near + np.clip(solution.tension - self._near, -most, most)
         return self._near
 
-    def _held(self, mae: Mae, tension: Array, limit: Array, dt: float) -> Array:
+    def _held(self, mae: Mae, pull: Pull, limit: Array, dt: float) -> Array:
         """Return l_target [m] (M,) at rest, for which nothing is solved that does not change."""
         feedback = self._feedback
         if self._resting is None:
@@ -283,7 +288,7 @@ class MotionControl:
             self._resting = length, mae.muscle_jacobian(theta, self._tension)
         length, jacobian = self._resting
         gain = 0.0 if self._stiff else self.settings.feedback_gain
-        feedback.step(self.error, jacobian, tension, limit, gain, dt)
+        feedback.step(self.error, jacobian, pull, limit, gain, dt)
         self._shift = feedback.correction
         return length + feedback.shift(jacobian)
 
@@ -291,11 +296,13 @@ class MotionControl:
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
     """Return how many times longer a trajectory has to take, so that the winches can follow.
 
-    Looked at are moments `SPACING` [s] apart, fewer of a long one; friction, which turns round in
+    Looked at are moments `SPACING` [s] apart, fewer of a long one. Friction, which turns round in
     a moment, is left out, and so are moments at which the muscles lack torque: there tensions jump
-    from one compromise to another, however slowly.
+    from one compromise to another. Near them, tensions change suddenly however slowly the arm
+    moves: by what takes a module from T_bias to T_limit, winches may be late.
     """
     slower, bias, limit = 1.0, robot.tension.bias, robot.tension.limit
+    late = -msc_compensation(robot, limit)
     for _ in range(PLANS):
         tried = trajectory.scaled(slower)
         count = min(max(math.ceil(tried.duration / SPACING), 4), SAMPLES)
@@ -305,12 +312,16 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
         jacobian = mae.muscle_jacobian(at.theta, pulls)
         motion = map(robot.kinematics.inverse_dynamics, *at)
         plans = [least_tension(g, t, bias, limit) for g, t in zip(jacobian, motion)]
-        pulls, missing = (np.array(part) for part in zip(*plans))
-        command = mae.lengths(at.theta, pulls) + msc_compensation(robot, pulls)
-        change = np.abs(np.diff(command, axis=0)).max(axis=1)
+        planned, missing = (np.array(part) for part in zip(*plans))
         lacking = np.abs(robot.kinematics.radian * missing).max(axis=1) > NOTABLE
-        change[lacking[1:] | lacking[:-1]] = 0.0
-        needed = change.max() * count / tried.duration / (SHARE * settings.rate_limit)
+        lacking = (lacking[1:] | lacking[:-1])[:, None]
+        command = mae.lengths(at.theta, planned) + msc_compensation(robot, planned)
+        way = np.cumsum(np.where(lacking, 0.0, np.diff(command, axis=0)), axis=0)
+        needed = np.abs(np.diff(mae.lengths(at.theta, pulls), axis=0)).max()
+        for k in range(1, count):
+            farthest = (np.abs(way[k:] - way[:-k]) - late).max()
+            needed = max(needed, farthest / k)
+        needed *= count / tried.duration / (SHARE * settings.rate_limit)
         if needed <= 1.0:
             break
         slower = min(slower * (1.02 * needed), SLOWNESS)

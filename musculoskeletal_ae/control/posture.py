@@ -33,8 +33,8 @@ RAMP_SHARE = 0.6
 PEAK = 1.5  # fastest over mean speed of a ramp
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
 CORRECTION = 0.3  # [rad] at most
-#: [m] at most: about what a length can be off by, so that friction is not put to holding the arm
-RELIEF = 0.004
+#: [m] at most: by what lengths can be off, and by what friction keeps of a wire that was wound in
+RELIEF = 0.01
 #: of estimated error that is left alone [rad]: about the estimate's own, after which an arm with
 #: friction would creep for ever
 DEADBAND = 0.03
@@ -63,18 +63,28 @@ class Ramp:
         return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
 
 
+class Pull(NamedTuple):
+    """How the muscles pull [N], (M,) each."""
+
+    motor: Array  # T, as measured
+    end: Array  # T_end, what friction along the wires leaves of it
+
+
 class RestFeedback:
     """Two slow integrals while the arm rests: of the estimated error, and of needless tension.
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
-        dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF
-        T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T,   T_bias ≤ T* ≤ T_limit
+        dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF        where T > T*
+              = gain min(T_end − T*, 0)/K_stiff                      elsewhere
+        T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
     Friction and errors of the body image leave the arm beside its target; the estimate sees most of
     that (arXiv 2405.11808). They also leave muscles that pull against each other: a
-    tension commanded as a length is off by K_stiff times what l is off. T* exerts the torque of T,
-    so that the relief of one moves no joint. `correction` is c [rad] (D,), `relief` r [m] (M,).
+    tension commanded as a length is off by K_stiff times what l is off. T* exerts the torque of T
+    without friction, so that the relief moves no joint. A wire that was wound in is paid out until
+    friction keeps nothing of its tension; one that was paid out stays so, as the arm hangs on it by
+    friction already. `correction` is c [rad] (D,), `relief` r [m] (M,).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -92,12 +102,12 @@ class RestFeedback:
         self._rested = self._unsolved = 0.0
 
     def step(
-        self, error: Array, jacobian: Array, tension: Array, limit: Array, gain: float, dt: float
+        self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
     ) -> bool:
         """Integrate over dt [s] if the arm rests; return whether it does.
 
-        Of θ_target − θ_estimated [rad] (D,), G at the target (M, D), and T measured and the highest
-        planned [N] (M,); a gain [1/s] of 0 is no feedback.
+        Of θ_target − θ_estimated [rad] (D,), G at the target (M, D), how the muscles pull, and the
+        highest tension planned [N] (M,); a gain [1/s] of 0 is no feedback.
         """
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
@@ -107,9 +117,11 @@ class RestFeedback:
         self._unsolved += dt
         if self._unsolved >= BETWEEN:
             bias, share = self._robot.tension.bias, gain * self._unsolved / self._robot.stiffness
-            pulled, self._unsolved = np.clip(tension, bias, limit), 0.0
-            least = least_tension(jacobian, -jacobian.T @ pulled, bias, limit).tension
-            self.relief = np.clip(self.relief + share * (pulled - least), -RELIEF, RELIEF)
+            end, self._unsolved = np.clip(pull.end, bias, limit), 0.0
+            least = least_tension(jacobian, -jacobian.T @ end, bias, limit).tension
+            motor = np.clip(pull.motor, bias, limit)
+            needless = np.where(motor > least, motor - least, np.minimum(end - least, 0.0))
+            self.relief = np.clip(self.relief + share * needless, -RELIEF, RELIEF)
         return True
 
     def shift(self, jacobian: Array) -> Array:
@@ -196,23 +208,23 @@ class PostureControl:
         self._command, self._ramp = command.copy(), None
         self.start()
 
-    def step(self, tension: Array, theta: Array, limit: Array, dt: float) -> Array | None:
+    def step(self, pull: Pull, theta: Array, limit: Array, dt: float) -> Array | None:
         """Return the command [m] (M,), dt [s] after the last, or None while there is no target.
 
-        T is measured, θ estimated, and `limit` the highest tension planned for each muscle [N].
+        θ is estimated, and `limit` the highest tension planned for each muscle [N].
         """
         self._remaining -= dt
         if np.abs(limit - self._limit).max() > REPLAN and self._remaining <= 0.0:
             self._limit = limit
             self._solve_again()
         if self._remaining <= 0.0:
-            self._next_goal(tension, limit)
+            self._next_goal(pull.motor, limit)
         if self._ramp is None:
             return None
         if not self._ramp.done:
             self._command = self._ramp.step(dt)
         elif self._corrects:
-            self._correct(tension, theta, dt)
+            self._correct(pull, theta, dt)
         return self._command.copy()
 
     @property
@@ -263,11 +275,11 @@ class PostureControl:
             return methods.proposed(robot, mae, theta, torque, tension, self._limit)
         return methods.proposed_paper(robot, mae, theta, torque, tension)
 
-    def _correct(self, tension: Array, theta: Array, dt: float) -> None:
+    def _correct(self, pull: Pull, theta: Array, dt: float) -> None:
         """Shift the commanded lengths: the estimate nearer to the target, T nearer to the least."""
         target, solution, jacobian = self.theta, self.solution, self._jacobian
         # They gave the goal that is held.
         assert target is not None and solution is not None and jacobian is not None
         error, gain = target - theta, self.settings.feedback_gain
-        if self.feedback.step(error, jacobian, tension, self._limit, gain, dt):
+        if self.feedback.step(error, jacobian, pull, self._limit, gain, dt):
             self._command = solution.length + self.feedback.shift(jacobian)

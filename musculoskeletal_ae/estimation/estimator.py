@@ -178,7 +178,7 @@ class Estimator:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
         if guess is None:
             return None
-        end = self._direction.end_tension(self.mae.friction, tension, length, dt)
+        end = self._direction.end_tension(self.mae.friction, tension, length)
         state = self.mae.estimate(end, length - guess.offset)
         self._theta, length = state.theta, length - self.zeros.offset  # as commands are told
         if self._verification is not None:

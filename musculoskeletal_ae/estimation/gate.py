@@ -112,7 +112,7 @@ class Gate:
         if not 0.0 <= since < LONGEST_PERIOD:
             self._direction.reset()
             since = 0.0
-        direction = self._direction.step(length, since)
+        direction = self._direction.step(length)
         if self._anomaly or (self._messages and 0.0 <= now - self._messages[-1][0] < SPACING):
             return
         self._messages.append((now, tension, length, direction))

@@ -141,7 +141,7 @@ class HealthyTorque:
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
         """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after those before."""
-        end = self._direction.end_tension(self._mae.friction, tension, length, dt)
+        end = self._direction.end_tension(self._mae.friction, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._observer.step(theta, end, dt).torque
         if np.linalg.norm(self._observer.velocity / self._radian) < MOVING:

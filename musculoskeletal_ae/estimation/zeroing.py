@@ -163,7 +163,7 @@ class Zeroing:
         if self.done or (self.stands and self.trouble):
             return
         known = self._posture if self.stands else theta
-        self._window.append((tension, length, self._direction.step(length, dt)))
+        self._window.append((tension, length, self._direction.step(length)))
         self._angles += [] if known is None else [known]
         self._span += dt
         self._since += dt

@@ -92,7 +92,7 @@ def follow(
             samples.append(len(learner.samples))
             errors.append(error(mae))
         _, sensor, length, tension, _ = row
-        end = direction.end_tension(mae.friction, tension, length, SAMPLE_TIME)
+        end = direction.end_tension(mae.friction, tension, length)
         running.append(float(np.linalg.norm(mae.estimate(end, length).theta - sensor)))
         theta = sensor if see is None else see(n, mae)
         learner.step(n * SAMPLE_TIME, theta, tension, length)

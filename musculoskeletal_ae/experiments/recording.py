@@ -89,7 +89,7 @@ class ClosedLoop:
     def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (of others)
         """Return θ [rad] (D,) from what was read at `now` [s]."""
         friction, length = self.mae.friction, read.length
-        end = self._direction.end_tension(friction, read.tension, length, SAMPLE_TIME)
+        end = self._direction.end_tension(friction, read.tension, length)
         return self.mae.estimate(end, length).theta
 
     def commanded(self, command: Command | None, now: float) -> None:
@@ -189,7 +189,7 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
     """Return T_end [N] (N, M) of what was recorded, by a network's friction, as nodes know it."""
-    direction = directions(recording.length, SAMPLE_TIME)
+    direction = directions(recording.length)
     return end_tension(mae.friction, recording.tension, direction)
 
 
@@ -198,7 +198,7 @@ def judge(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
 
     Which way wires slid is found once for all networks that are asked.
     """
-    direction = directions(recording.length, SAMPLE_TIME)[::stride]
+    direction = directions(recording.length)[::stride]
     part = recording.part(np.s_[::stride])
 
     def error(mae: Mae) -> float:

@@ -48,7 +48,7 @@ class FeelingLoop(ClosedLoop):
         """Let a message's time pass; return what it says of the outside."""
         _ = self.explore() if exploring else self.step()
         length, friction = self._read.length, self.mae.friction
-        end = self._sliding.end_tension(friction, self._read.tension, length, SAMPLE_TIME)
+        end = self._sliding.end_tension(friction, self._read.tension, length)
         return self._external.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
     def rest(self, theta: Array) -> None:

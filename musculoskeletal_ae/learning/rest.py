@@ -180,7 +180,7 @@ class RestCollector:
             return []
         self._skipped = 0.0
         self._time += dt
-        direction = self._direction.step(length, dt)
+        direction = self._direction.step(length)
         nothing = np.full(self._robot.joint_count, np.nan)
         theta = nothing if theta is None else theta
         gravity = self.gravity if self.gravity.size else self._no_gravity

@@ -136,7 +136,7 @@ def learn(
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for dt, at, theta, length, tension in zip(steps, *recording, strict=True):
         # The estimator gates live learning; here its detector does the same.
-        end = direction.end_tension(mae.friction, tension, length, dt)
+        end = direction.end_tension(mae.friction, tension, length)
         verdict = detector.step(mae.estimate(end, length), end, tension, length, dt)
         if verdict.cause:
             learner.anomaly(True)
@@ -150,8 +150,7 @@ def learn(
 
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
-    steps = np.diff(recording.time, prepend=recording.time[:1])
-    tension = end_tension(mae.friction, recording.tension, directions(recording.length, steps))
+    tension = end_tension(mae.friction, recording.tension, directions(recording.length))
     estimate = mae.estimate(tension, recording.length).theta
     return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
 

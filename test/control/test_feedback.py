@@ -12,6 +12,7 @@ from musculoskeletal_ae.control.posture import (
     DEADBAND,
     RELIEF,
     SETTLING,
+    Pull,
     RestFeedback,
 )
 from musculoskeletal_ae.robot.robot import Robot
@@ -41,9 +42,10 @@ def holding(robot, desired=0.0):
     return holding_tension(robot, 0.5 * (robot.lower + robot.upper), desired)
 
 
-def step(feedback, robot, error, tension, gain=GAIN):
+def step(feedback, robot, error, tension, gain=GAIN, motor=None):
     limit = np.full(robot.muscle_count, robot.tension.limit)
-    return feedback.step(error, jacobian(robot), tension, limit, gain, DT)
+    pull = Pull(tension if motor is None else motor, tension)
+    return feedback.step(error, jacobian(robot), pull, limit, gain, DT)
 
 
 def test_it_waits_until_the_arm_has_settled(robot):
@@ -76,6 +78,21 @@ def test_relief_pays_out_what_pulls_against_each_other_and_exerts_no_torque(robo
     assert change == pytest.approx(expected, abs=1e-9)
     assert jacobian(robot).T @ change == pytest.approx(np.zeros(robot.joint_count), abs=1e-9)
     assert change @ needless > 0.0
+
+
+@pytest.mark.parametrize('wound', [0.2, -0.2])
+def test_what_friction_keeps_of_a_wire_that_was_wound_in_is_paid_out(robot, wound):
+    feedback = rested(robot)
+    least = holding(robot)
+    motor = least * np.exp(wound)
+    for _ in range(20):
+        step(feedback, robot, np.zeros(robot.joint_count), least, motor=motor)
+    if wound < 0.0:  # friction holds already, and winding in would need more tension
+        assert feedback.relief == pytest.approx(np.zeros(robot.muscle_count), abs=1e-9)
+    else:
+        assert (feedback.relief > 0.0).all()
+        shares = feedback.relief / (motor - least)
+        assert shares == pytest.approx(np.full(robot.muscle_count, shares[0]))
 
 
 def test_both_are_bounded(robot):

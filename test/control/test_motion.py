@@ -10,13 +10,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
-from exact_mae import ExactMae
+from exact_mae import ExactMae, rest_readings
 
 from bench.control_nominal import nominal_arm
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
-from musculoskeletal_ae.control.motion import SETTLING, Winches, slowness
+from musculoskeletal_ae.control.motion import FED_BACK, SETTLING, SHARE, Winches, slowness
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
@@ -24,6 +24,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 
 STILL = np.zeros((1, 2))
+PEAK_SPEED = 1.875  # of a quintic, times its mean speed
 
 
 def points(goal, duration=1.0):
@@ -255,6 +256,30 @@ def test_a_desired_stiffness_is_kept_on_the_way_and_at_its_end(bench):
         assert abs(planned - end) < 0.3 * (highest - lowest)[0]
     assert 'desired 1.00 clamped' in bench.report().values['joint stiffness shoulder']
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
+
+
+def test_sudden_changes_of_tension_slow_little():
+    # Near postures that are hard to hold tensions change suddenly, however slowly the arm moves.
+    mae, chosen, slowed = Bench().mae, Settings(), []
+    postures = ROBOT.random_postures(60, np.random.default_rng(0))
+    bias = np.tile(ROBOT.tension.bias, (100, 1))
+    for start, goal in zip(postures[::2], postures[1::2]):
+        trajectory = Trajectory.to(Setpoint.resting(start), goal, 0.5)
+        theta = trajectory.sample(np.linspace(0.0, 0.499, 100)).theta
+        way = np.abs(np.diff(mae.lengths(theta, bias), axis=0)).sum(axis=0).max()
+        fastest = PEAK_SPEED * way / (SHARE * chosen.rate_limit)
+        slowed.append(0.5 * slowness(ROBOT, mae, trajectory, chosen) / fastest)
+    assert min(slowed) > 0.9
+    assert np.percentile(slowed, 80) < 1.25  # 2.0 where winches may not be late
+
+
+def test_an_estimate_that_does_not_come_along_makes_no_muscle_pull_beyond_its_limit(bench):
+    bench.core.trajectory(points(OTHER))
+    most = 0.0
+    for command in bench.step(400):
+        length, _ = rest_readings(ROBOT, REST)
+        most = max(most, (ROBOT.demanded(length, command.value) / ROBOT.tension.limit).max())
+    assert 1.0 < most <= FED_BACK + 1e-9
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():

@@ -76,7 +76,7 @@ def test_friction_that_is_known_is_no_force():
     for friction in (0.0, 0.1):
         core, sliding = observer(), FrictionDirection()
         for row in (*wound, *[length] * 100):
-            end = sliding.end_tension(np.full(10, friction), tension * np.exp(0.1), row, DT)
+            end = sliding.end_tension(np.full(10, friction), tension * np.exp(0.1), row)
             touch = core.step(THETA, end, DT)
         errors.append(np.abs(touch.torque).max())
     assert errors[1] < 0.05 < 0.2 < errors[0]
