@@ -32,7 +32,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.methods import FloatControl, TorqueControl
+from musculoskeletal_ae.control.methods import FloatControl, TorqueControl, msc_compensation
 from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.posture import PostureControl, Pull
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
@@ -46,6 +46,8 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
+#: of the way from tension.limit to tension.max that may be demanded; `watch` stops at a half
+BEYOND = 1.0 / 3.0
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
@@ -389,6 +391,18 @@ class Controller:
         nothing = self.safety.longest if command.kind == LENGTH else 0.0
         return Command(command.kind, np.where(self.robot.used, command.value, nothing))
 
+    def _bounded(self, length: Array, muscles: Muscles) -> Command:
+        """Return lengths that demand no tension for which `watch` would stop the arm.
+
+        No plan exceeds tension.limit, but what is fed back is demanded on top of it. Stiffness is
+        as was asked for, whatever pushes the arm.
+        """
+        if self.settings.method != 'stiffness' or self.posture.exploring:
+            limits = self.robot.tension
+            most = limits.limit + BEYOND * (limits.max - limits.limit)
+            length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))
+        return Command(LENGTH, length)
+
     def _command(self, dt: float) -> Command | None:
         mae, muscles, estimate = self.mae, self.safety.now, self.estimate
         # No present cause: all are there.
@@ -413,12 +427,11 @@ class Controller:
             (by_tension or posture).start_from(self.safety.last(kind).value)
         if self.follows:
             sent = self.safety.last(LENGTH).value
-            return Command(
-                LENGTH, self.motion.step(muscles, self._pull, estimate, sent, planned, dt)
-            )
+            length = self.motion.step(muscles, self._pull, estimate, sent, planned, dt)
+            return self._bounded(length, muscles)
         if by_tension is None:
-            length = posture.step(self._pull, estimate, planned, dt)
-            return None if length is None else Command(LENGTH, length)
+            goal = posture.step(self._pull, estimate, planned, dt)
+            return None if goal is None else self._bounded(goal, muscles)
         if self.settings.method == 'float':
             nothing = np.zeros_like(estimate)
             tension = self.floating.step(mae, estimate, estimate, nothing, planned, dt)

@@ -45,7 +45,6 @@ SPACING = 0.04  # [s] between the moments of a plan
 SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the feedback
 PLANS = 4  # times a plan is slowed and tried again
 SLOWNESS = 20.0  # at most
-FED_BACK = 1.5
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
@@ -228,9 +227,7 @@ class MotionControl:
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
             command = self._held(mae, pull, limit, dt)
-        # What is fed back is no reason to pull harder than any plan may.
-        least = muscles.length + msc_compensation(self._robot, FED_BACK * limit)
-        command = np.where(self._robot.used, np.maximum(command, least), sent)
+        command = np.where(self._robot.used, command, sent)
         if self._blend is None:
             rate = self.settings.rate_limit
             self._blend = Ramp(sent - command, np.zeros_like(command), BLENDING, rate)

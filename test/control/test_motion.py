@@ -13,10 +13,10 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 
 from bench.control_nominal import nominal_arm
-from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.controller import BEYOND, Controller
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
-from musculoskeletal_ae.control.motion import FED_BACK, SETTLING, SHARE, Winches, slowness
+from musculoskeletal_ae.control.motion import SETTLING, SHARE, Winches, slowness
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
@@ -273,13 +273,12 @@ def test_sudden_changes_of_tension_slow_little():
     assert np.percentile(slowed, 80) < 1.25  # 2.0 where winches may not be late
 
 
-def test_an_estimate_that_does_not_come_along_makes_no_muscle_pull_beyond_its_limit(bench):
+def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_arm(bench):
     bench.core.trajectory(points(OTHER))
-    most = 0.0
-    for command in bench.step(400):
-        length, _ = rest_readings(ROBOT, REST)
-        most = max(most, (ROBOT.demanded(length, command.value) / ROBOT.tension.limit).max())
-    assert 1.0 < most <= FED_BACK + 1e-9
+    (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
+    demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
+    beyond = (demanded - limits.limit) / (limits.max - limits.limit)
+    assert 0.0 < beyond.max() <= BEYOND + 1e-9 < 0.5
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
