@@ -23,14 +23,11 @@ Method `stiffness`: argmin ‖T − T_K‖² instead, with T_K of `methods.stiff
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
 from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Pull, Ramp, RestFeedback
-from musculoskeletal_ae.control.reach import NOTABLE
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
@@ -41,10 +38,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 PROPORTIONAL, INTEGRAL = 1.0, 4.0  # k_p; k_i [1/s]
 FRICTION = 0.05  # μ where none was learned: the mean of what hands build
-SPACING = 0.04  # [s] between the moments of a plan
-SHARE = 0.85  # of the winches' speed that a plan may use; the rest is for the feedback
-PLANS = 4  # times a plan is slowed and tried again
-SLOWNESS = 20.0  # at most
+SHARE = 0.7  # of the winches' speed that lengths may use; the rest is for tensions and feedback
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
@@ -293,33 +287,10 @@ class MotionControl:
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
     """Return how many times longer a trajectory has to take, so that the winches can follow.
 
-    Looked at are moments `SPACING` [s] apart, fewer of a long one. Friction, which turns round in
-    a moment, is left out, and so are moments at which the muscles lack torque: there tensions jump
-    from one compromise to another. Near them, tensions change suddenly however slowly the arm
-    moves: by what takes a module from T_bias to T_limit, winches may be late.
+    Looked at are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they
+    change suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
-    slower, bias, limit = 1.0, robot.tension.bias, robot.tension.limit
-    late = -msc_compensation(robot, limit)
-    for _ in range(PLANS):
-        tried = trajectory.scaled(slower)
-        count = min(max(math.ceil(tried.duration / SPACING), 4), SAMPLES)
-        time = np.linspace(0.0, tried.duration, count + 1)
-        at = tried.sample(0.999999 * time)
-        pulls = np.broadcast_to(bias, (len(time), len(bias)))
-        jacobian = mae.muscle_jacobian(at.theta, pulls)
-        motion = map(robot.kinematics.inverse_dynamics, *at)
-        plans = [least_tension(g, t, bias, limit) for g, t in zip(jacobian, motion)]
-        planned, missing = (np.array(part) for part in zip(*plans))
-        lacking = np.abs(robot.kinematics.radian * missing).max(axis=1) > NOTABLE
-        lacking = (lacking[1:] | lacking[:-1])[:, None]
-        command = mae.lengths(at.theta, planned) + msc_compensation(robot, planned)
-        way = np.cumsum(np.where(lacking, 0.0, np.diff(command, axis=0)), axis=0)
-        needed = np.abs(np.diff(mae.lengths(at.theta, pulls), axis=0)).max()
-        for k in range(1, count):
-            farthest = (np.abs(way[k:] - way[:-k]) - late).max()
-            needed = max(needed, farthest / k)
-        needed *= count / tried.duration / (SHARE * settings.rate_limit)
-        if needed <= 1.0:
-            break
-        slower = min(slower * (1.02 * needed), SLOWNESS)
-    return slower
+    at = trajectory.sample(np.linspace(0.0, 0.999999 * trajectory.duration, SAMPLES + 1))
+    length = mae.lengths(at.theta, np.tile(robot.tension.bias, (SAMPLES + 1, 1)))
+    fastest = np.abs(np.diff(length, axis=0)).max() * SAMPLES / trajectory.duration
+    return float(max(1.0, fastest / (SHARE * settings.rate_limit)))

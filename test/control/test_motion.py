@@ -268,9 +268,9 @@ def test_sudden_changes_of_tension_slow_little():
         theta = trajectory.sample(np.linspace(0.0, 0.499, 100)).theta
         way = np.abs(np.diff(mae.lengths(theta, bias), axis=0)).sum(axis=0).max()
         fastest = PEAK_SPEED * way / (SHARE * chosen.rate_limit)
-        slowed.append(0.5 * slowness(ROBOT, mae, trajectory, chosen) / fastest)
-    assert min(slowed) > 0.9
-    assert np.percentile(slowed, 80) < 1.25  # 2.0 where winches may not be late
+        slowed.append(slowness(ROBOT, mae, trajectory, chosen) / max(1.0, fastest / 0.5))
+    # A wire need not be fastest when the joints are, as `fastest` has it.
+    assert 0.9 < min(slowed) <= max(slowed) < 1.5
 
 
 def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_arm(bench):
