@@ -47,7 +47,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
 #: of the way from tension.limit to tension.max that may be demanded; `watch` stops at a half
-BEYOND = 1.0 / 3.0
+FED_BACK = 1.0 / 3.0
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
@@ -399,7 +399,7 @@ class Controller:
         """
         if self.settings.method != 'stiffness' or self.posture.exploring:
             limits = self.robot.tension
-            most = limits.limit + BEYOND * (limits.max - limits.limit)
+            most = limits.limit + FED_BACK * (limits.max - limits.limit)
             length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))
         return Command(LENGTH, length)
 

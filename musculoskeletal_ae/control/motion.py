@@ -30,7 +30,7 @@ from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiff
 from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Pull, Ramp, RestFeedback
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.trajectory import SAMPLES, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -290,7 +290,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     Looked at are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they
     change suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
-    at = trajectory.sample(np.linspace(0.0, 0.999999 * trajectory.duration, SAMPLES + 1))
-    length = mae.lengths(at.theta, np.tile(robot.tension.bias, (SAMPLES + 1, 1)))
-    fastest = np.abs(np.diff(length, axis=0)).max() * SAMPLES / trajectory.duration
-    return float(max(1.0, fastest / (SHARE * settings.rate_limit)))
+    theta = trajectory.postures
+    length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
+    speed = np.diff(length, axis=0) * (len(theta) - 1) / trajectory.duration
+    return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))

@@ -136,13 +136,18 @@ class Trajectory:
 
     def check(self, robot: Robot) -> None:
         """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
-        theta = self.sample(np.linspace(0.0, self.duration, SAMPLES)).theta
+        theta = self.postures
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
             told = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
             raise MessageError('leaves the joint limits', told)
+
+    @property
+    def postures(self) -> Array:
+        """θ [rad] in moments evenly spread over it, (SAMPLES, D)."""
+        return self.sample(np.linspace(0.0, self.duration, SAMPLES)).theta
 
     @property
     def duration(self) -> float:

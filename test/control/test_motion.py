@@ -13,7 +13,7 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 
 from bench.control_nominal import nominal_arm
-from musculoskeletal_ae.control.controller import BEYOND, Controller
+from musculoskeletal_ae.control.controller import FED_BACK, Controller
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
 from musculoskeletal_ae.control.motion import SETTLING, SHARE, Winches, slowness
@@ -278,7 +278,7 @@ def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
     demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
     beyond = (demanded - limits.limit) / (limits.max - limits.limit)
-    assert 0.0 < beyond.max() <= BEYOND + 1e-9 < 0.5
+    assert 0.0 < beyond.max() <= FED_BACK + 1e-9 < 0.5
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
