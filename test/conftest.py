@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
@@ -17,6 +18,9 @@ from hypothesis import settings
 # Each of pytest-xdist's processes has a ROS graph of its own.
 if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
     os.environ['ROS_DOMAIN_ID'] = str(int(os.environ.get('ROS_DOMAIN_ID', '1')) + int(worker))
+
+# What a shell starts in the background is deaf to Ctrl-C, and so would all be that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Compiled code is loaded in somebody's first example; no test here judges time.
 settings.register_profile('no deadline', deadline=None)

@@ -458,6 +458,7 @@ class Trainer:
         """Go on from a network's weights, as calmly as after so many `steps`."""
         self.network = network  # the average: what is published
         self._restless = copy.deepcopy(network)
+        self._weights = [*zip(network.parameters(), self._restless.parameters())]
         self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
         self._rng = np.random.default_rng([seed, 0x7A])
         self.steps = steps  # taken so far, in former lives too
@@ -490,7 +491,7 @@ class Trainer:
     def _average(self) -> None:
         span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
         with torch.no_grad():
-            for mean, now in zip(self.network.parameters(), self._restless.parameters()):
+            for mean, now in self._weights:
                 mean.lerp_(now, 1.0 / span)
 
 
