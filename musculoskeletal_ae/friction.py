@@ -19,6 +19,7 @@ REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
 #: sensor's noise as sliding
 NOISE = 0.0001
 LATEST = 0.15
+SPIKE = 2.0 * NOISE  # [m] by which a reading may lie beyond the last two
 
 
 def slid(direction: Array, moved: Array) -> Array:
@@ -38,8 +39,9 @@ class FrictionDirection:
 
         L ← L + e ē²/(ē² + NOISE²),   e = l − L
 
-    with ē the mean of the latest e. So a wire that rests is not slid by noise, which would turn s
-    away from ±1, and one that slides is not followed late, as it would be by a low pass.
+    with ē the mean of the latest e. So noise slides a wire that rests only a little (that of twice
+    NOISE turns s away from ±1), and one that slides is not followed late, as it would be by a low
+    pass. Of l counts what lies at most SPIKE beyond the last two: one that is off slides little.
     """
 
     def __init__(self) -> None:
@@ -48,9 +50,11 @@ class FrictionDirection:
     def step(self, length: Array) -> Array:
         """Take l [m] (M,); return s (M,)."""
         if self._length is None:
-            self._length = length.copy()
+            self._length, self._read = length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
-        off = length - self._length
+        least, most = np.minimum(*self._read) - SPIKE, np.maximum(*self._read) + SPIKE
+        self._read = self._read[1], length
+        off = np.minimum(np.maximum(length, least), most) - self._length
         self._off = self._off + LATEST * (off - self._off)
         moved = off * self._off**2 / (self._off**2 + NOISE**2)
         self._length = self._length + moved

@@ -21,6 +21,14 @@ def test_friction_acts_against_the_last_sliding_and_ignores_noise():
         assert direction[0] * expected > 0.6
 
 
+@given(st.floats(-0.02, 0.02), st.sampled_from([-1.0, 1.0]))
+def test_a_reading_that_is_off_turns_no_friction_round(error, way):
+    friction, slide = FrictionDirection(), np.arange(0.0, 0.01, 2e-4)
+    for length in way * np.array([*slide, 0.01, 0.01 + error, *np.full(20, 0.01)]):
+        direction = friction.step(np.array([length]))
+    assert way * direction[0] < -0.5
+
+
 @given(st.lists(st.floats(-0.1, 0.1), min_size=1, max_size=50))
 def test_the_direction_of_friction_stays_within_one(lengths):
     friction = FrictionDirection()

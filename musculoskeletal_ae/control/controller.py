@@ -33,7 +33,7 @@ from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import FloatControl, TorqueControl, msc_compensation
-from musculoskeletal_ae.control.motion import MotionControl
+from musculoskeletal_ae.control.motion import MotionControl, slowness
 from musculoskeletal_ae.control.posture import PostureControl, Pull
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
 from musculoskeletal_ae.control.settings import Settings
@@ -48,6 +48,7 @@ from musculoskeletal_ae.robot.robot import Robot
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
 #: of the way from tension.limit to tension.max that may be demanded; `watch` stops at a half
 FED_BACK = 1.0 / 3.0
+EASED = 0.9  # of tension.limit, demanded at most of a muscle that has been above it for long
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
@@ -208,12 +209,13 @@ class Controller:
                 unit = robot.units[points.joints[j]].theta
                 limits = f'legal: {low[j]:.3f} to {high[j]:.3f} {unit}'
                 raise MessageError('beyond the joint limits', f'{told}, {limits}')
-        start, _ = self._ready(max(delay, 0.0))
+        start, mae = self._ready(max(delay, 0.0))
         if points is None:
             self._follow(Trajectory.stopping(start, robot))
         else:
             planned = Trajectory.through(start, points, max(-delay, 0.0))
-            planned.check(robot)
+            # One that is slowed and starts in motion takes another way.
+            planned.scaled(slowness(robot, mae, planned, self.settings)).check(robot)
             _, short = self._within_reach(planned.end)
             self._follow(planned, max(delay, 0.0))
             self.short = short
@@ -319,6 +321,7 @@ class Controller:
     def clock_jumped_back(self) -> None:
         """Count the messages' time from here."""
         self.watch.clock_jumped_back()
+        self._direction.reset()
 
     def reset(self, now: float) -> str:
         """Clear a stop and go on to the last target; return why not, or ''."""
@@ -394,12 +397,14 @@ class Controller:
     def _bounded(self, length: Array, muscles: Muscles) -> Command:
         """Return lengths that demand no tension for which `watch` would stop the arm.
 
-        No plan exceeds tension.limit, but what is fed back is demanded on top of it. Stiffness is
-        as was asked for, whatever pushes the arm.
+        Plans of `proposed` stay within tension.limit; feedback, an arm that does not come along,
+        `second` and preset `paper` demand more. Stiffness is as was asked for, whatever pushes the
+        arm.
         """
         if self.settings.method != 'stiffness' or self.posture.exploring:
             limits = self.robot.tension
             most = limits.limit + FED_BACK * (limits.max - limits.limit)
+            most = np.where(self.watch.strained, EASED * limits.limit, most)
             length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))
         return Command(LENGTH, length)
 
@@ -427,7 +432,7 @@ class Controller:
             (by_tension or posture).start_from(self.safety.last(kind).value)
         if self.follows:
             sent = self.safety.last(LENGTH).value
-            length = self.motion.step(muscles, self._pull, estimate, sent, planned, dt)
+            length = self.motion.step(muscles.length, self._pull, estimate, sent, planned, dt)
             return self._bounded(length, muscles)
         if by_tension is None:
             goal = posture.step(self._pull, estimate, planned, dt)

@@ -5,7 +5,7 @@ At each message, for the θ, θ̇, θ̈ that are desired then (`trajectory`),
 
     τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
     T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,   T at the far ends of the wires
-    l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c| ≤ CORRECTION
+    l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |k_p e + c| ≤ CORRECTION
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Friction: the tension at the motor is T e^{μ s}, with s the direction in which the wire slides along
@@ -27,8 +27,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
-from musculoskeletal_ae.control.posture import CORRECTION, REPLAN, Pull, Ramp, RestFeedback
-from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.control.posture import REPLAN, Pull, Ramp, RestFeedback
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.friction import REVERSAL
@@ -126,7 +125,7 @@ class MotionControl:
         self._resting = self._blend = None
         # T at the far ends and at the motors [N], and s of each wire
         self._tension: Array = self._robot.tension.bias.copy()
-        self._pull: Array = self._tension
+        self._motor: Array = self._tension
         self._sliding: Array = np.zeros(self._robot.muscle_count)
         self.solution, self._solved = None, 0.0  # how long ago [s]
         self._feedback.reset()
@@ -185,16 +184,17 @@ class MotionControl:
     # -- time -----------------------------------------------------------------------------------
 
     def step(
-        self, muscles: Muscles, pull: Pull, theta: Array, sent: Array, limit: Array, dt: float
+        self, length: Array, pull: Pull, theta: Array, sent: Array, limit: Array, dt: float
     ) -> Array:
         """Return the command [m] (M,), dt [s] after the last, of which `sent` left [m] (M,).
 
-        θ [rad] is estimated; `limit` [N] (M,) is the highest tension planned for each muscle.
+        l [m] is measured, θ [rad] estimated; `limit` [N] (M,) is the highest tension planned for
+        each muscle.
         """
         mae, trajectory = self._mae, self.trajectory
         assert mae is not None and trajectory is not None
         if self.moving:
-            self.winches.step(muscles.length, muscles.tension, sent, dt)
+            self.winches.step(length, pull.motor, sent, dt)
         else:  # noise alone says nothing of λ
             self.winches.forget()
         self.time += dt
@@ -212,12 +212,12 @@ class MotionControl:
         feedback = self._feedback
         if self.time < trajectory.duration + SETTLING:
             error = np.zeros_like(theta) if self._stiff else self.error
-            step = INTEGRAL * dt * error
-            feedback.correction = np.clip(feedback.correction + step, -CORRECTION, CORRECTION)
+            step, most = INTEGRAL * dt * error, feedback.most
+            feedback.correction = np.clip(feedback.correction + step, -most, most)
             feedback.moving()
             # Bounded too: an estimate that is wrong at once must not take the arm along.
             shift = feedback.correction + PROPORTIONAL * error
-            self._shift = np.clip(shift, -CORRECTION, CORRECTION)
+            self._shift = np.clip(shift, -most, most)
             command = self._planned(mae, trajectory.sample(self.time + 0.5 * dt), limit, dt)
         else:
             command = self._held(mae, pull, limit, dt)
@@ -243,9 +243,9 @@ class MotionControl:
         self._tension, self.missing_torque = least_tension(
             jacobian, torque, np.minimum(low, limit) / loss, limit / loss, near
         )
-        self._pull = self._tension * loss
+        self._motor = self._tension * loss
         length = mae.lengths(at.theta + self._shift, self._tension)
-        return length + msc_compensation(robot, self._pull) + lag * speed
+        return length + msc_compensation(robot, self._motor) + lag * speed
 
     @property
     def _stiff(self) -> bool:
@@ -275,7 +275,7 @@ class MotionControl:
         if self._resting is None:
             feedback.correction = self._shift
             theta = self.desired.theta
-            length = mae.lengths(theta, self._tension) + msc_compensation(self._robot, self._pull)
+            length = mae.lengths(theta, self._tension) + msc_compensation(self._robot, self._motor)
             self._resting = length, mae.muscle_jacobian(theta, self._tension)
         length, jacobian = self._resting
         gain = 0.0 if self._stiff else self.settings.feedback_gain
@@ -287,10 +287,11 @@ class MotionControl:
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
     """Return how many times longer a trajectory has to take, so that the winches can follow.
 
-    Looked at are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they
-    change suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
+    One that starts in motion keeps that speed, and so needs more than that now and then. Looked at
+    are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they change
+    suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
     theta = trajectory.postures
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
-    speed = np.diff(length, axis=0) * (len(theta) - 1) / trajectory.duration
+    speed = np.diff(length, axis=0) * robot.used * (len(theta) - 1) / trajectory.duration
     return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))

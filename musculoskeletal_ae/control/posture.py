@@ -32,11 +32,11 @@ from musculoskeletal_ae.robot.tension import least_tension
 RAMP_SHARE = 0.6
 PEAK = 1.5  # fastest over mean speed of a ramp
 REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
-CORRECTION = 0.3  # [rad] at most
+CORRECTION = 0.3  # [rad] at most, or times RACK [m]
 #: [m] at most: by what lengths can be off, and by what friction keeps of a wire that was wound in
 RELIEF = 0.01
-#: of estimated error that is left alone [rad]: about the estimate's own, after which an arm with
-#: friction would creep for ever
+#: of estimated error that is left alone [rad], or times RACK [m]: about the estimate's own, after
+#: which an arm with friction would creep for ever
 DEADBAND = 0.03
 BETWEEN = 0.1  # [s] between two programmes of what tension is needless
 SETTLING = 0.5  # [s] after a movement until the arm is taken for resting
@@ -76,6 +76,7 @@ class RestFeedback:
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF        where T > T*
               = gain min(T_end − T*, 0)/K_stiff                      elsewhere
+        (T and T_end no further than T_bias to T_limit)
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
@@ -89,6 +90,8 @@ class RestFeedback:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self._deadband: Array = DEADBAND * robot.kinematics.radian
+        self.most: Array = CORRECTION * robot.kinematics.radian  # of the correction [rad], (D,)
         self.reset()
         self.moving()
 
@@ -112,8 +115,8 @@ class RestFeedback:
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
             return False
-        beyond = np.where(np.abs(error) < DEADBAND, 0.0, error)
-        self.correction = np.clip(self.correction + gain * dt * beyond, -CORRECTION, CORRECTION)
+        beyond = np.where(np.abs(error) < self._deadband, 0.0, error)
+        self.correction = np.clip(self.correction + gain * dt * beyond, -self.most, self.most)
         self._unsolved += dt
         if self._unsolved >= BETWEEN:
             bias, share = self._robot.tension.bias, gain * self._unsolved / self._robot.stiffness

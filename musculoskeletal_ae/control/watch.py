@@ -18,7 +18,7 @@ from collections import deque
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.heat import Heat
@@ -131,6 +131,13 @@ class Watch:
             if now - self._asleep - at > allowed:
                 return f'{what} older than {allowed:.3g} s'
         return ''
+
+    @property
+    def strained(self) -> Bools:
+        """Which muscles have pulled above tension.limit for half the time that stops them, (M,)."""
+        since = self.stepped_at - self._asleep - self._tense_since[0]
+        strained: Bools = since > 0.5 * self.settings.overload_time
+        return strained
 
     @property
     def tense(self) -> list[str]:

@@ -111,7 +111,6 @@ class Gate:
         since, self._time = now - self._time, now
         if not 0.0 <= since < LONGEST_PERIOD:
             self._direction.reset()
-            since = 0.0
         direction = self._direction.step(length)
         if self._anomaly or (self._messages and 0.0 <= now - self._messages[-1][0] < SPACING):
             return
@@ -122,6 +121,7 @@ class Gate:
     def forget(self) -> None:
         """Forget the messages, as when lengths are measured from other zeros."""
         self._messages.clear()
+        self._direction.reset()
 
     def check(self, mae: Mae) -> None:
         """Try a network; a GateError says that it does not explain the arm."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import write_robot
 
 from musculoskeletal_ae.control.posture import (
     BETWEEN,
@@ -114,6 +115,17 @@ def test_errors_within_the_estimates_own_are_left_alone(robot):
     assert not feedback.correction.any()
     step(feedback, robot, 2.0 * error, holding(robot))
     assert feedback.correction == pytest.approx(GAIN * DT * 2.0 * error)
+
+
+def test_of_what_slides_60_mm_count_as_a_radian(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    feedback, slides = rested(robot), robot.kinematics.slides
+    step(feedback, robot, 0.9 * DEADBAND * robot.kinematics.radian, holding(robot))
+    assert not feedback.correction.any()
+    for _ in range(3000):
+        step(feedback, robot, np.ones(robot.joint_count), holding(robot))
+    assert feedback.correction[slides] == pytest.approx(0.06 * CORRECTION)
+    assert feedback.correction[~slides] == pytest.approx(CORRECTION)
 
 
 def test_without_gain_nothing_is_corrected(robot):

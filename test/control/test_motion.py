@@ -281,6 +281,41 @@ def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_
     assert 0.0 < beyond.max() <= FED_BACK + 1e-9 < 0.5
 
 
+@pytest.mark.parametrize('trajectory', [True, False])
+def test_an_arm_that_is_stuck_is_not_stopped_for_what_feedback_demands(bench, trajectory):
+    bench.core.trajectory(points(OTHER)) if trajectory else bench.target(OTHER)
+    pull, highest = ROBOT.tension.bias, 0.0
+    for _ in range(4000):
+        (command,) = bench.step()
+        length, _ = rest_readings(ROBOT, REST, bench.tension)
+        demanded = np.clip(ROBOT.demanded(length, command.value), 0.0, ROBOT.tension.max)
+        bench.tension = pull = pull + 0.3 * (demanded - pull)
+        highest = max(highest, (pull - ROBOT.tension.limit).max())
+    assert highest > 20.0  # [N]
+    assert bench.core.safety.cause == ''
+
+
+def test_a_trajectory_is_judged_as_it_is_followed(monkeypatch):
+    # It starts in motion: slowed for slow winches it takes another way, beyond the joint limits.
+    bench = Bench(rate_limit=0.05)
+    start = Setpoint(np.array([0.5, -0.5]), np.array([-1.4, 1.8]), np.zeros(2))
+    Trajectory.through(start, points((-0.8, -1.1), 0.3), 0.0).check(ROBOT)
+    monkeypatch.setattr(bench.core, '_ready', lambda *_: (start, bench.mae))
+    with pytest.raises(MessageError, match='leaves the joint limits'):
+        bench.core.trajectory(points((-0.8, -1.1), 0.3))
+    assert not bench.core.follows
+
+
+def test_a_muscle_that_is_left_out_slows_nothing():
+    bench, trajectory = Bench(), Trajectory.to(Setpoint.resting(REST), OTHER, 0.2)
+    robot = bench.core.robot
+    length = bench.mae.lengths(trajectory.postures, np.tile(robot.tension.bias, (200, 1)))
+    fastest = int(np.abs(np.diff(length, axis=0)).max(axis=0).argmax())
+    before = slowness(robot, bench.mae, trajectory, Settings())
+    robot.isolate([fastest])
+    assert 1.0 < slowness(robot, bench.mae, trajectory, Settings()) < 0.99 * before
+
+
 def test_slowing_a_slow_trajectory_changes_nothing():
     trajectory = Trajectory.to(Setpoint.resting(REST), OTHER, 20.0)
     assert slowness(ROBOT, Bench().mae, trajectory, Settings()) == 1.0
