@@ -20,6 +20,7 @@ after winding in than after paying out.
 from __future__ import annotations
 
 from itertools import combinations_with_replacement
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.friction import REVERSAL, slid
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
@@ -54,17 +56,22 @@ class ArmState(NamedTuple):
 
 
 class QuasiStatics:
-    """The equations above for one robot and one network."""
+    """The equations above for one robot, and for the network that was given to `use` last."""
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
-        self._robot, self._mae = robot, mae
-        self._load, self._slopes = Load(robot.kinematics), Slopes(robot, mae)
-        # A noisy fit may find a little less than none, which would drive the arm.
-        self._friction = np.maximum(mae.friction, 0.0)
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._load, self._slopes = Load(robot.kinematics), Slopes(robot)
         self._eye = np.eye(robot.joint_count)
         postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
         levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
         self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY) * self._eye
+
+    def use(self, mae: Mae) -> None:
+        """Take a network."""
+        self._mae = mae
+        # A noisy fit may find a little less than none, which would drive the arm.
+        self._friction = np.maximum(mae.friction, 0.0)
+        self._slopes.fit(mae)
 
     def step(
         self,
@@ -170,33 +177,69 @@ class Slopes:
 
     A Newton step needs these slopes in every step, but only roughly: they decide how the simulator
     approaches an equilibrium, never where it lies, which is the network's own word. The network's
-    exact second derivatives would cost ten times the rest of the step.
+    exact second derivatives would cost ten times the rest of the step. Each limb has cubics in its
+    own joints: in all 17 of an upper body they would have 1140 coefficients each, instead of 120.
     """
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
-        """Fit the cubic over the whole joint range, muscles in the middle of their tensions."""
-        joints, muscles = robot.joint_count, robot.muscle_count
-        basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
-        count = POSTURES_PER_COEFFICIENT * len(basis)
-        theta = robot.random_postures(count, np.random.default_rng(0))
+    def __init__(self, robot: Robot) -> None:
+        """Prepare to fit over the whole joint range, muscles in the middle of their tensions."""
+        self._shape = robot.muscle_count, robot.joint_count
+        most = max(len(group.joints) for group in robot.groups)
+        count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
+        self._postures = robot.random_postures(count, np.random.default_rng(0))
         middle = 0.5 * (robot.tension.bias + robot.tension.limit)
-        lengths = mae.lengths(theta, np.full((count, muscles), middle))
-        values = np.stack([theta[:, list(term)].prod(axis=1) for term in basis], axis=1)
-        cubic = np.linalg.lstsq(values, lengths, rcond=None)[0]  # (basis, M)
-        quadratic = [term for term in basis if len(term) <= 2]
-        linear = [term for term in basis if len(term) <= 1]
-        slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
-        bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
-        pairs = [term for term in quadratic if len(term) == 2]
-        self._left, self._right = np.array(pairs).T
-        first = np.einsum('dqb,bm->qmd', slope, cubic)
-        self._shape = (muscles, joints)
-        self._first = np.ascontiguousarray(first.reshape(len(quadratic), -1))
-        second = np.einsum('elq,qmd->mlde', bend, first)
-        self._second = np.ascontiguousarray(second.reshape(muscles * len(linear), -1))
+        self._tension = np.full((count, robot.muscle_count), middle)
+        self._limbs = [Cubics(group, self._postures) for group in robot.groups]
+
+    def fit(self, mae: Mae) -> None:
+        """Fit what a network says."""
+        lengths = mae.lengths(self._postures, self._tension)
+        for limb in self._limbs:
+            limb.fit(lengths)
 
     def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
+        if len(self._limbs) == 1:
+            return self._limbs[0](theta, tension)
+        count, (muscles, joints) = len(theta), self._shape
+        jacobian = np.zeros((count, muscles, joints))
+        curvature = np.zeros((count, joints, joints))
+        for limb in self._limbs:
+            (pulled, turned), (down, across) = limb.of_jacobian, limb.of_curvature
+            own = limb(theta[:, limb.joints], tension[:, limb.muscles])
+            jacobian[:, pulled, turned], curvature[:, down, across] = own
+        return jacobian, curvature
+
+
+class Cubics:
+    """The cubics of one limb."""
+
+    def __init__(self, group: Group, postures: Array) -> None:
+        """Prepare to fit to lengths at some postures θ of the body (N, D) [rad]."""
+        self.joints, self.muscles = map(list, group)
+        #: where the limb's G and Σ T_i ∂²l_i/∂θ² are in those of the body
+        self.of_jacobian = np.ix_(self.muscles, self.joints)
+        self.of_curvature = np.ix_(self.joints, self.joints)
+        theta, joints = postures[:, self.joints], len(self.joints)
+        basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
+        values = np.stack([theta[:, list(term)].prod(axis=1) for term in basis], axis=1)
+        self._inverse = np.linalg.pinv(values)  # (basis, N)
+        quadratic = [term for term in basis if len(term) <= 2]
+        linear = [term for term in basis if len(term) <= 1]
+        self._slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
+        self._bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
+        self._left, self._right = np.array([term for term in quadratic if len(term) == 2]).T
+
+    def fit(self, lengths: Array) -> None:
+        """Fit lengths of the body at those postures (N, M) [m]."""
+        cubic = self._inverse @ lengths[:, self.muscles]  # (basis, M)
+        first = np.einsum('dqb,bm->qmd', self._slope, cubic)
+        self._first = np.ascontiguousarray(first.reshape(len(first), -1))
+        second = np.einsum('elq,qmd->mlde', self._bend, first)
+        self._second = np.ascontiguousarray(second.reshape(-1, len(self.joints) ** 2))
+
+    def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
+        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at the limb's θ, T."""
         count, joints = theta.shape
         linear = np.ones((count, 1 + joints))
         linear[:, 1:] = theta
@@ -204,7 +247,7 @@ class Slopes:
         jacobian = np.concatenate((linear, products), axis=1) @ self._first
         weighted = (tension[:, :, None] * linear[:, None, :]).reshape(count, -1)
         curvature = weighted @ self._second
-        return jacobian.reshape(count, *self._shape), curvature.reshape(count, joints, joints)
+        return jacobian.reshape(count, -1, joints), curvature.reshape(count, joints, joints)
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:

@@ -31,10 +31,14 @@ SEARCH = StepSearch(largest_step=0.2, candidates=10, epochs=3)
 
 
 class PaperDescent:
-    """The descent above for one robot and one network; arguments as for `QuasiStatics`."""
+    """The descent above for one robot; networks and arguments as for `QuasiStatics`."""
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
-        self._robot, self._mae, self._load = robot, mae, Load(robot.kinematics)
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._load = robot, Load(robot.kinematics)
+
+    def use(self, mae: Mae) -> None:
+        """Take a network."""
+        self._mae = mae
 
     def step(
         self,

@@ -50,7 +50,8 @@ class Simulation:
     def __init__(self, robot: Robot, mae: Mae, preset: str = 'default', arms: int = 1) -> None:
         """Put arms at θ = 0 (or the nearest limit) with T_bias and no command."""
         self.robot = copy.copy(robot)
-        self._kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
+        kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
+        self._body = kind(self.robot)
         self.wrench = np.zeros((arms, 6))
         self.fixed = np.full((arms, robot.joint_count), np.nan)
         self.use(mae)
@@ -58,12 +59,12 @@ class Simulation:
 
     def use(self, mae: Mae) -> None:
         """Take a new network; the arms move on to its equilibrium from where they are."""
-        self.mae, self._body = mae, self._kind(self.robot, mae)
+        self.mae = mae
+        self._body.use(mae)
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
         self.robot.isolate(muscles)
-        self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
         """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten."""

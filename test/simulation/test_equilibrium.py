@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from musculoskeletal_ae.robot.robot import Robot
@@ -20,13 +22,36 @@ def test_slopes_are_the_derivatives_of_the_cubic_they_fit():
     robot = Robot.load('arm26')
     theta = robot.random_postures(7, np.random.default_rng(0))
     tension = np.random.default_rng(1).uniform(30.0, 200.0, (7, 6))
-    jacobian, curvature = Slopes(robot, Cubic())(theta, tension)
+    slopes = Slopes(robot)
+    slopes.fit(Cubic())
+    jacobian, curvature = slopes(theta, tension)
     a, b = theta.T
     np.testing.assert_allclose(jacobian[:, 0], np.stack([3 * a * a - b, 2.0 - a], 1), atol=1e-8)
     np.testing.assert_allclose(jacobian[:, 1], np.stack([b * b, 2.0 * a * b], 1), atol=1e-8)
     expected = tension[:, 0] * 6.0 * a + tension[:, 4] * 2.0 * b
     np.testing.assert_allclose(curvature[:, 0, 0], expected, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(curvature, curvature.swapaxes(1, 2), atol=1e-6)
+
+
+def test_each_limb_of_a_body_has_slopes_of_its_own():
+    robot = Robot.load('musashi_upper_body')
+    assert len(robot.groups) == 3
+    theta = robot.random_postures(5, np.random.default_rng(0))
+    tension = np.random.default_rng(1).uniform(30.0, 200.0, (5, robot.muscle_count))
+    slopes = Slopes(robot)
+    slopes.fit(SimpleNamespace(lengths=robot.muscle_lengths))
+    jacobian, curvature = slopes(theta, tension)
+    truth = robot.routes.muscle_jacobian(theta)
+    off = np.sqrt(np.square(jacobian - truth).mean())
+    assert off < 0.1 * np.sqrt(np.square(truth).mean())
+    for limb in robot.groups:
+        others = np.setdiff1d(np.arange(robot.joint_count), limb.joints)
+        assert not jacobian[:, limb.muscles][..., others].any()
+    step = 1e-6
+    for j in range(robot.joint_count):
+        after, _ = slopes(theta + step * np.eye(robot.joint_count)[j], tension)
+        turned = ((after - jacobian) / step * tension[..., None]).sum(axis=1)
+        np.testing.assert_allclose(curvature[:, j], turned, rtol=1e-4, atol=1e-5)
 
 
 def test_modules_wind_at_a_limited_speed_and_never_far_beyond_what_counts():
