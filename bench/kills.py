@@ -170,7 +170,7 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
 
 def main(argv: list[str] | None = None) -> int:
     """Kill, and say what was lost."""
-    parser = argparse.ArgumentParser(prog='learning_kills', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench kills', description=__doc__)
     parser.add_argument('--robot', default='arm26')
     parser.add_argument('--kills', type=int, default=50)
     parser.add_argument('--seed', type=int, default=0, help='of the moments')

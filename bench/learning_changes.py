@@ -162,7 +162,7 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
 
 def main(argv: list[str] | None = None) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog='learning_changes', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench learning_changes', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--seeds', default='0', help='individuals')
     parser.add_argument('--muscle', help='name of the one that changes; the second by default')

@@ -108,7 +108,7 @@ def judged(worst: float, filled: float, most: float, times: list[float]) -> list
 
 def main(argv: list[str] | None = None) -> int:
     """Run the soak."""
-    parser = argparse.ArgumentParser(prog='learning_soak', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench soak', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--hours', type=float, default=24.0, help='of robot time')
     parser.add_argument('--quick', action='store_true', help='two hours, to try things out')

@@ -28,7 +28,7 @@ GOALS = {'wrench_error': 0.2, 'wrench_error_deg': 15.0, 'false_contacts': 0, 'co
 
 def main(argv: list[str] | None = None) -> int:
     """Print the numbers; exit status 0 if their means meet the goals."""
-    parser = argparse.ArgumentParser(prog='touch', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench touch', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
     parser.add_argument('--minutes', type=float, default=10.0, help='of learning')

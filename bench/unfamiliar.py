@@ -204,7 +204,7 @@ def measure(
 
 def main(argv: list[str] | None = None) -> int:
     """Print the table; exit status 0 if the goals are met."""
-    parser = argparse.ArgumentParser(prog='unfamiliar', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench unfamiliar', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
     parser.add_argument('--minutes', type=float, default=4.0, help='of learning')

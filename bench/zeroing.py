@@ -133,7 +133,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 def main(argv: list[str] | None = None) -> int:
     """Print the table; exit status 0 if every individual meets the goals."""
-    parser = argparse.ArgumentParser(prog='zeroing', description=__doc__)
+    parser = argparse.ArgumentParser(prog='bench zeroing', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
     parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
     parser.add_argument(
