@@ -108,6 +108,8 @@ class HostedLearner:
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}'
             self.step()
+            if not self.node.core.training.ready:  # what trains may have the processor
+                time.sleep(DT)
 
 
 @pytest.fixture
