@@ -67,11 +67,11 @@ class QuasiStatics:
         self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY) * self._eye
 
     def use(self, mae: Mae) -> None:
-        """Take a network."""
+        """Take a network; a FloatingPointError says that it has no finite lengths somewhere."""
+        self._slopes.fit(mae)
         self._mae = mae
         # A noisy fit may find a little less than none, which would drive the arm.
         self._friction = np.maximum(mae.friction, 0.0)
-        self._slopes.fit(mae)
 
     def step(
         self,
@@ -192,8 +192,10 @@ class Slopes:
         self._limbs = [Cubics(group, self._postures) for group in robot.groups]
 
     def fit(self, mae: Mae) -> None:
-        """Fit what a network says."""
+        """Fit what a network says; a FloatingPointError says that it cannot be fitted."""
         lengths = mae.lengths(self._postures, self._tension)
+        if not np.isfinite(lengths).all():
+            raise FloatingPointError('lengths within the joint limits that are not finite')
         for limb in self._limbs:
             limb.fit(lengths)
 

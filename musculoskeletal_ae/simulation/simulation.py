@@ -58,9 +58,12 @@ class Simulation:
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
-        """Take a new network; the arms move on to its equilibrium from where they are."""
-        self.mae = mae
+        """Take a new network; the arms move on to its equilibrium from where they are.
+
+        A FloatingPointError says that it cannot be simulated; the one in use stays.
+        """
         self._body.use(mae)
+        self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Let these muscles, places in T and l, pull nothing, and all others as they are told."""

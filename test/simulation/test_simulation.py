@@ -275,6 +275,18 @@ def test_a_nonsense_network_moves_it_within_its_limits_only(arm26, mae, preset):
     assert np.isfinite(arms.settle().length).all()
 
 
+def test_a_network_that_cannot_be_simulated_leaves_the_one_in_use(arm26, mae):
+    simulation = Simulation(arm26, mae)
+    simulation.command = mae.lengths(np.zeros((1, 2)), np.full((1, 6), 50.0)) - 0.01
+    beyond = replace(mae, decoder=tuple((1e30 * w, b) for w, b in mae.decoder))
+    expected = Simulation(arm26, mae)
+    expected.command = simulation.command
+    with np.errstate(all='ignore'), pytest.raises(FloatingPointError, match='not finite'):
+        simulation.use(beyond)
+    assert simulation.mae is mae
+    np.testing.assert_array_equal(simulation.step(0.01).theta, expected.step(0.01).theta)
+
+
 def test_pictures_of_an_arm_at_rest_and_loaded_are_written(arm26, mae, tmp_path):
     files = sim_pictures.save_both(arm26, mae, tmp_path / 'new')
     assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
