@@ -253,7 +253,7 @@ class EagerLengths:
 
 
 def simulation_rows(robot: Robot, preset: str) -> list[Row]:
-    """Return one step of the simulator (its preset default), one arm and many at once."""
+    """Return a step of the simulator (preset default), one arm and many, and a new network."""
     mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
@@ -270,6 +270,7 @@ def simulation_rows(robot: Robot, preset: str) -> list[Row]:
     return [
         Row('simulation step', step(1, mae), step(1, eager), 1, work),
         Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
+        Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
     ]
 
 
