@@ -170,15 +170,15 @@ class Spread:
     def take(self, gate: Gate, mae: Mae, name: str) -> None:
         """Measure a network, and try it."""
         self.count += 1
-        values = {key: share.max() for key, share in gate.posture_errors(mae).items()}
+        values = {key: share.max() for key, share in filter(None, gate.posture_errors(mae))}
         left = gate.message_errors(mae)
         values |= {f'{key} of messages': error.max() for key, error in left.items()}
         if gate.mae is not None:
             for key, before in (gate.message_errors(gate.mae) if left else {}).items():
                 worse = left[key][left[key] > FLOOR[key]] / before[left[key] > FLOOR[key]]
                 values[f'{key} beyond that in use'] = worse.max(initial=0.0)
-        values['d on messages'], cut = np.nan_to_num(gate.detector(mae), nan=[0.0, np.inf])
-        self.least_cut = min(self.least_cut, cut)
+        values['d on messages'], *cuts = [*gate.detector(mae)] or [0.0]
+        self.least_cut = min(self.least_cut, max(cuts, default=np.inf))
         for key, value in values.items():
             self.most[key] = max(self.most[key], float(value))
         try:

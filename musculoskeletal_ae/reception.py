@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from inspect import iscoroutinefunction
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -17,9 +19,15 @@ REORDERING = 1_000_000_000  # [ns]
 class Reception:
     """Counts what is received."""
 
-    def __init__(self, warn: Callable[[str], object]) -> None:
-        """Nothing has come yet; `warn` is told of the first rejection for each reason."""
-        self._warn = warn
+    def __init__(
+        self, warn: Callable[[str], object], heard: Callable[[str, Any], object] | None = None
+    ) -> None:
+        """Nothing has come yet.
+
+        `warn` is told of the first rejection for each reason, `heard` of every message, with its
+        topic, that came neither twice nor late.
+        """
+        self._warn, self._heard = warn, heard
         self.last_rejected = ''  # what was wrong with the last one of them
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         self._received: Counter[str] = Counter()
@@ -28,34 +36,51 @@ class Reception:
         self.turns: Counter[str] = Counter()
 
     def of(
-        self, topic: str, callback: Callable[[Any], object], publishers: Callable[[], int]
-    ) -> Callable[[Any, dict[str, Any]], None]:
+        self, topic: str, callback: Callable[[Any], Any], publishers: Callable[[], int]
+    ) -> Callable[[Any, dict[str, Any]], Any]:
         """Return what to subscribe with: calls `callback` unless the message comes twice or late.
 
         That is, of one publisher, one sent no later than the last that was taken, and numbered no
         higher: numbers go on when its clock steps back. 0 is not known. The callback raises a
-        `MusculoskeletalError` to reject the message. `publishers` counts who publishes there: a
-        message does not say who sent it, and two clocks or counters cannot be compared.
+        `MusculoskeletalError` to reject the message; if it is a coroutine, so is what is returned.
+        `publishers` counts who publishes there: a message does not say who sent it, and two clocks
+        or counters cannot be compared.
         """
         before, last = 0, 0  # when the last one was sent [ns], and its number
 
-        def receive(message: Any, info: dict[str, Any]) -> None:
+        def is_new(message: Any, info: dict[str, Any]) -> bool:
             nonlocal before, last
             sent, number = info['source_timestamp'], info['publication_sequence_number']
             late = sent > 0 and 0 <= before - sent < REORDERING and number <= last
             if late and publishers() == 1:
                 self.rejected[f'{topic}: repeated or reordered'] += 1
-                return
+                return False
             self.turns[topic] += number < last
             before, last = sent, number
-            try:
-                callback(message)
-            except MusculoskeletalError as error:
-                self.reject(topic, error.reason, str(error))
-            else:
-                self._received[topic] += 1
+            if self._heard:
+                self._heard(topic, message)
+            return True
 
-        return receive
+        def receive(message: Any, info: dict[str, Any]) -> None:
+            if is_new(message, info):
+                with self._counting(topic):
+                    callback(message)
+
+        async def receive_in_pieces(message: Any, info: dict[str, Any]) -> None:
+            if is_new(message, info):
+                with self._counting(topic):
+                    await callback(message)
+
+        return receive_in_pieces if iscoroutinefunction(callback) else receive
+
+    @contextmanager
+    def _counting(self, topic: str) -> Iterator[None]:
+        try:
+            yield
+        except MusculoskeletalError as error:
+            self.reject(topic, error.reason, str(error))
+        else:
+            self._received[topic] += 1
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a message or request; say whether it is the first for this reason."""

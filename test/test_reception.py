@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import coroutine
+
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
@@ -86,3 +88,26 @@ def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reaso
     assert len(warnings) == 1
     assert str(error) in warnings[0]
     assert not reception.take_received()
+
+
+def test_what_comes_in_pieces_is_counted_once_the_last_one_has_gone():
+    reception = Reception(print)
+
+    @coroutine
+    def give_way():
+        yield
+
+    async def refuse(text):
+        await give_way()
+        if text:
+            raise MessageError('empty', text)
+
+    receive = reception.of('topic', refuse, lambda: 1)
+    for number, text in ((1, 'no joints'), (2, '')):
+        pieces = receive(text, {'source_timestamp': number, 'publication_sequence_number': number})
+        pieces.send(None)
+        assert not reception.take_received().get('topic')
+        with pytest.raises(StopIteration):
+            pieces.send(None)
+    assert reception.rejected == {'topic: empty': 1}
+    assert reception.take_received() == {'topic': 1}

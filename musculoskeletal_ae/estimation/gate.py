@@ -125,9 +125,20 @@ class Gate:
 
     def check(self, mae: Mae) -> None:
         """Try a network; a GateError says that it does not explain the arm."""
-        with np.errstate(all='ignore'):
-            if faults := [*self._faults(mae)]:
-                raise GateError('; '.join(faults))
+        deque(self.trial(mae), maxlen=0)
+
+    def trial(self, mae: Mae) -> Iterator[None]:
+        """Try a network in pieces, a few milliseconds each, between which a node may go on."""
+        found, pieces = list[str](), self._faults(mae)
+        while True:
+            with np.errstate(all='ignore'):
+                fault = next(pieces, None)
+            if fault is None:
+                break
+            found += [fault] if fault else []
+            yield
+        if found:
+            raise GateError('; '.join(found))
 
     def take(self, mae: Mae, now: float) -> None:
         """Note that a network took over."""
@@ -152,24 +163,30 @@ class Gate:
 
     # -- what is measured -----------------------------------------------------------------------
 
-    def posture_errors(self, mae: Mae) -> dict[str, Array]:
-        """Return shares left unexplained of the fixed postures, of each joint or muscle."""
-        errors, (theta, pull, length) = {}, self._postures
+    def posture_errors(self, mae: Mae) -> Iterator[tuple[str, Array] | None]:
+        """Yield shares left unexplained of the fixed postures, of each joint or muscle.
+
+        None after a piece of work that is not all of a share.
+        """
+        theta, pull, length = self._postures
         own = mae.lengths(theta, pull)
         for mask, sign in zip(Mask, '①②③', strict=True):
             restored = mae.decode(mae.encode(mask, theta, pull, own))
             truth = theta, pull, length if sign == '①' else own
             for name, value, true in zip('θTl', restored, truth, strict=True):
                 spread = np.maximum(true.std(axis=0), LEAST_SPREAD if name == 'l' else 1e-9)
-                errors[f'{name} by {sign}'] = _size(value - true) / spread
+                yield f'{name} by {sign}', _size(value - true) / spread
                 if name == 'θ' and sign != '②':
-                    errors[f'mean θ by {sign}'] = np.abs((value - true).mean(axis=0)) / spread
-        off = mae.muscle_jacobian(*self._postures[:2]) - self._jacobian
+                    yield f'mean θ by {sign}', np.abs((value - true).mean(axis=0)) / spread
+        off = np.empty_like(self._jacobian)
+        for some in np.array_split(np.arange(POSTURES), 4):
+            off[some] = mae.muscle_jacobian(theta[some], pull[some]) - self._jacobian[some]
+            yield None
         by_muscle = (
             part.swapaxes(1, 2).reshape(-1, off.shape[1]) for part in (off, self._jacobian)
         )
         error, size = map(_size, by_muscle)
-        return errors | {'G by ①': error / np.maximum(size, LEAST_ARM)}
+        yield 'G by ①', error / np.maximum(size, LEAST_ARM)
 
     def _seen_by(self, mae: Mae) -> tuple[Array, Array]:
         """Return T_end [N] and l [m] of the messages (N, M), by a network's friction."""
@@ -193,34 +210,37 @@ class Gate:
             row[used] = np.median(np.abs(part[:, used]), axis=0)
         return left
 
-    def detector(self, mae: Mae) -> tuple[float, float]:
-        """Return d over its threshold: of the messages, and of the same with a muscle cut.
+    def detector(self, mae: Mae) -> Iterator[float]:
+        """Yield d over its threshold, the median: of the messages, then with each muscle cut.
 
-        Medians; of the muscle whose cut shows most. NaN where there is no calibrated detector.
+        Nothing where there is no calibrated detector.
         """
         statistics = mae.anomaly
         if statistics is None or not statistics.calibrated or len(self._messages) < LEAST:
-            return np.nan, np.nan
+            return
         threshold = statistics.thresholds.get(DISTANCE, np.inf)
         tension, length = self._seen_by(mae)
 
-        def distances(tension: Array, length: Array) -> Array:
+        def distance(tension: Array, length: Array) -> float:
             state = mae.estimate(tension, length)
             error = residuals(state, tension, length, mae.isolated)
-            return statistics.distances(error) / threshold
+            return float(np.median(statistics.distances(error))) / threshold
 
-        uncut = np.delete(1.0 - np.eye(self._robot.muscle_count), self.isolated, axis=0)
+        yield distance(tension, length)
         # As many messages as say something suffice, times every muscle.
         some = np.linspace(0, len(length) - 1, LEAST).astype(int)
-        cut = np.concatenate([tension[some] * row for row in uncut])
-        cuts = distances(cut, np.tile(length[some], (len(uncut), 1)))
-        by_muscle = np.median(cuts.reshape(len(uncut), -1), axis=1)
-        return float(np.median(distances(tension, length))), float(by_muscle.max())
+        for uncut in np.delete(1.0 - np.eye(self._robot.muscle_count), self.isolated, axis=0):
+            yield distance(tension[some] * uncut, length[some])
 
     def _faults(self, mae: Mae) -> Iterator[str]:
+        """Yield what is wrong, and '' after each piece of work."""
         joints, muscles = self._robot.joints, self._robot.muscles
         mae = mae.without(self.isolated)
-        for name, share in self.posture_errors(mae).items():
+        for item in self.posture_errors(mae):
+            yield ''
+            if item is None:
+                continue
+            name, share = item
             limit = np.full(len(share), LIMITS[name])
             if name[0] == 'θ' and not share.max() <= LIMITS[name]:
                 limit = np.maximum(limit, self._untold)
@@ -232,9 +252,11 @@ class Gate:
                 told = f'{share[worst]:.2g} unexplained {of}'
                 yield f'{name}, {who}: {told}, limit {limit[worst]:.3g}'
         left = self.message_errors(mae)
+        yield ''
         before: dict[str, Array] = {}
         if self.mae is not None and left:
             before = self.message_errors(self.mae.without(self.isolated))
+            yield ''
         for name, error in left.items():
             limit = np.full(len(error), FLOOR[name])
             if name in before:
@@ -244,7 +266,13 @@ class Gate:
                 worst = int(over.argmax())
                 told = f'{error[worst]:.3g} left of own messages, limit {limit[worst]:.3g}'
                 yield f'{name}, {muscles[worst]}: {told}'
-        healthy, cut = self.detector(mae)
+        distances = list[float]()
+        for distance in self.detector(mae):
+            distances.append(distance)
+            yield ''
+        if not distances:
+            return
+        healthy, cut = distances[0], max(distances[1:], default=np.inf)
         if healthy > 1.0:
             yield f'detector: d {healthy:.2g} of its threshold on own messages, limit 1'
         if cut < LEAST_CUT:

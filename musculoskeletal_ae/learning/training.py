@@ -112,7 +112,7 @@ class Training:
 
 # -- a process of its own -------------------------------------------------------------------------
 
-NICENESS = 5
+NICENESS = 5  # beside that of the node
 #: until a training process that was lost is started again [s], doubled each time up to the longest
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
 #: until a process that has not answered is taken to hang [s], and what each step of training adds;

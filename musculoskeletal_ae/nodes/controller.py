@@ -10,7 +10,6 @@ installed.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -19,7 +18,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.duration import Duration
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -90,16 +88,9 @@ class Controller(Shell):
         if self.parameter('explore'):
             self.core.explore(True)
 
-    def listen(
-        self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
-    ) -> None:
-        """Subscribe as every shell does, and remember what came for the next stop's recording."""
-
-        def remembered(message: Any) -> None:
-            self.recording.heard(topic, message)
-            callback(message)
-
-        super().listen(kind, topic, remembered, qos)
+    def heard(self, topic: str, message: Any) -> None:
+        """Remember what came for the next stop's recording."""
+        self.recording.heard(topic, message)
 
     def destroy_node(self) -> None:
         """Let a recording be finished."""

@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import ast
 import gc
+import os
 import signal
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Coroutine, Generator, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from itertools import chain, pairwise
 from pathlib import Path
-from types import SimpleNamespace
+from types import SimpleNamespace, coroutine
 from typing import Any
 
 import rclpy
@@ -54,6 +56,9 @@ PARAMETER_ERRORS = (
 
 
 EVENTS_EVERY = 1  # [s]
+PART = 0.25  # of the time at most goes to callbacks that give way: several nodes do it at once
+#: of nodes that no command waits for: on a busy machine they come second
+NICENESS = {'learner': 5, 'sim': 5}
 ASLEEP: Any = SimpleNamespace(trigger=lambda: None)
 
 
@@ -68,6 +73,12 @@ def parameters_given(arguments: list[str]) -> list[str]:
     return [value.partition(':=')[0].rpartition(':')[2] for value in values]
 
 
+@coroutine
+def give_way() -> Generator[None, None, None]:
+    """Let the executor answer what has come meanwhile; awaited by a callback that takes long."""
+    yield
+
+
 class LeanExecutor(SingleThreadedExecutor):
     """Spins nodes whose callbacks wait for nothing, without what that costs in rclpy.
 
@@ -76,18 +87,21 @@ class LeanExecutor(SingleThreadedExecutor):
     built when the node's entities change, and holds messages, timers and requests. Actions and
     tasks, at once, and events of quality of service, once a second, go rclpy's way.
 
-    What a callback lets out is told to the node, rclpy's own for /clock and parameters included.
+    What a callback lets out is told to the node, rclpy's own for /clock and parameters included. A
+    callback that takes long is a coroutine that awaits `give_way`: it goes on, one at a time and in
+    the order in which they began, a PART of the time, once what has come meanwhile is answered.
     """
 
     _wait_set: Any = None
     _urgent: tuple[tuple[list[Any], Any, str, Any], ...] = ()
     _actions: tuple[Any, ...] = ()
-    _rest_at = 0.0
+    _rest_at = _next_piece = 0.0
     _patience = EVENTS_EVERY * S_TO_NS  # [ns]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._held = ExitStack()
+        self._begun: deque[tuple[Any, Coroutine[Any, Any, None]]] = deque()
 
     def spin(self) -> None:
         """Spin until shutdown."""
@@ -99,6 +113,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Let go of the node's entities, and of this executor's own."""
         self._wait_set, self._urgent, self._actions = None, (), ()
+        self._begun.clear()
         self._held.close()
         return super().shutdown(timeout_sec)
 
@@ -113,7 +128,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 add(entity.handle)
         for action in self._actions:
             action.add_to_wait_set(waiting)
-        waiting.wait(self._patience)
+        waiting.wait(self._pause() if self._begun else self._patience)
         if not self.context.ok():
             raise ExternalShutdownException
         for entities, _, kind, take in self._urgent:
@@ -123,6 +138,8 @@ class LeanExecutor(SingleThreadedExecutor):
             for entity in entities if pointers else ():
                 if entity.handle.pointer in pointers and self._is_due(entity):
                     self._run(entity, take)
+        if self._begun and not self._pause() and not self._goes_on(*self._begun[0]):
+            self._begun.popleft()
         # rclpy asks them again.
         asked = any(action.is_ready(waiting) for action in self._actions)
         return not asked and time.monotonic() < self._rest_at
@@ -133,11 +150,29 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _run(self, entity: Any, take: Callable[[Any], Any]) -> None:
         try:
-            if work := take(entity):
-                with suppress(StopIteration):
-                    work().send(None)
+            work = take(entity)
         except Exception as error:  # noqa: BLE001
             self._escaped(entity, error)
+            return
+        if work and self._goes_on(entity, callback := work()):
+            self._begun.append((entity, callback))
+
+    def _goes_on(self, entity: Any, callback: Coroutine[Any, Any, None]) -> bool:
+        """Run a callback until it ends or gives way; say whether it is to go on."""
+        start = time.monotonic()
+        try:
+            callback.send(None)
+        except StopIteration:
+            return False
+        except Exception as error:  # noqa: BLE001
+            self._escaped(entity, error)
+            return False
+        self._next_piece = start + (time.monotonic() - start) / PART
+        return True
+
+    def _pause(self) -> int:
+        """Return how long [ns] a callback that gave way is still to wait."""
+        return int(max(0.0, self._next_piece - time.monotonic()) * S_TO_NS)
 
     def _build(self) -> None:
         """Hold on to what nodes have now, so that nothing of it goes while it is waited for."""
@@ -219,6 +254,7 @@ def run(name: str) -> None:
             print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
             sys.exit(2)
         check_names(parameters_given(given), name)
+        os.nice(NICENESS.get(name, 0))
         modules = [load(f'musculoskeletal_ae.nodes.{each}') for each in own]
         rclpy.init()
         with LeanExecutor() as executor:

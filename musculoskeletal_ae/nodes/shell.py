@@ -7,7 +7,7 @@ import math
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +41,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
+from musculoskeletal_ae.nodes.running import give_way
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -75,7 +76,9 @@ class Shell(Node):
         #: name of the root link's frame in messages that are published
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
+        self._reception = Reception(
+            lambda text: warn(f'{text} (counted in /diagnostics)'), self.heard
+        )
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
@@ -98,6 +101,9 @@ class Shell(Node):
     def report(self) -> Report:
         """Return what /diagnostics shows: what the core says, where there is one."""
         return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
+
+    def heard(self, topic: str, message: Any) -> None:
+        """Note a message before it is used."""
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
@@ -181,12 +187,14 @@ class Shell(Node):
     ) -> None:
         """Use checkpoints from the parameter and the topic; the last that passes the gate wins.
 
-        `unfit` is told why one that came by topic cannot be used; the one in use stays.
+        `unfit` is told why one that came by topic cannot be used; the one in use stays. It is tried
+        in pieces, between which messages are answered.
         """
         gate = self.gate = Gate(self.robot)
+        newest: UInt8MultiArray | None = None
 
-        def take(mae: Mae) -> None:
-            gate.check(mae)
+        def take(mae: Mae) -> Iterator[None]:
+            yield from gate.trial(mae)
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
@@ -195,12 +203,18 @@ class Shell(Node):
 
         def from_file(path: str) -> None:
             if path:
-                take(checkpoint.load(path, self.robot))
+                deque(take(checkpoint.load(path, self.robot)), maxlen=0)
                 self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
-        def from_topic(message: UInt8MultiArray) -> None:
+        async def from_topic(message: UInt8MultiArray) -> None:
+            nonlocal newest
+            newest = message
+            await give_way()
+            if newest is not message:  # another has come while one before was tried
+                return
             try:
-                take(checkpoint.from_bytes(bytes(message.data), self.robot))
+                for _ in take(checkpoint.from_bytes(bytes(message.data), self.robot)):
+                    await give_way()
             except GateError:  # the one in use goes on
                 raise
             except CheckpointError as error:

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.logging import get_logging_directory
 from rclpy.serialization import serialize_message
@@ -29,12 +29,9 @@ MOST = 50_000  # messages, however fast they come
 FILE = 'cause.txt'  # why the node stopped, in the bag's directory
 
 
-class Heard(NamedTuple):
-    """A message, and when it came on which topic."""
-
-    time: int  # [ns]
-    topic: str
-    message: Any
+#: When a message came [ns], its topic, and its bytes: ten thousands of message objects would be
+#: looked through by Python's garbage collector, for 10 ms of a command.
+Heard = tuple[int, str, bytes]
 
 
 class StopRecording:
@@ -52,12 +49,12 @@ class StopRecording:
 
     def heard(self, topic: str, message: Any) -> None:
         """Remember a message of one of `bags.topics.TOPICS`."""
-        heard = Heard(time.time_ns(), topic, message)
+        now = time.time_ns()
+        heard = now, topic, serialize_message(message)
         if TOPICS[topic].latched:
             self._latched[topic] = heard
         self._recent.append(heard)
-        oldest = heard.time - int(SECONDS * 1e9)
-        while self._recent[0].time < oldest:
+        while self._recent[0][0] < now - int(SECONDS * 1e9):
             self._recent.popleft()
 
     def save(self, cause: str, most: int) -> None:
@@ -65,8 +62,8 @@ class StopRecording:
         messages = list(self._recent)
         if not (messages and most) or (self._writing is not None and self._writing.is_alive()):
             return
-        begin = messages[0].time
-        before = [kept._replace(time=begin) for kept in self._latched.values() if kept.time < begin]
+        begin = messages[0][0]
+        before = [(begin, *kept[1:]) for kept in self._latched.values() if kept[0] < begin]
         self._writing = threading.Thread(target=self._save, args=(cause, most, before + messages))
         self._writing.start()
 
@@ -79,12 +76,12 @@ class StopRecording:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
             with BagWriter(bag) as writer:
-                names = {t: self._resolve(t) for t in dict.fromkeys(m.topic for m in messages)}
+                names = {topic: self._resolve(topic) for _, topic, _ in messages}
                 for topic, name in names.items():
                     kind, latched, _ = TOPICS[topic]
                     writer.add_topic(name, kind, [offered_qos(latched)])
                 for when, topic, message in messages:
-                    writer.write(names[topic], when, when, serialize_message(message))
+                    writer.write(names[topic], when, when, message)
             (bag / FILE).write_text(f'{cause}\n', encoding='utf-8')
             for old in sorted(self._directory.glob(f'stop_*/{FILE}'))[:-most]:
                 shutil.rmtree(old.parent)

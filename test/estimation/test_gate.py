@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -62,6 +64,18 @@ def test_an_attack_is_refused_without_any_message_and_the_figures_are_said(train
     with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
         Gate(ROBOT).check(ATTACKS[attack](trained[preset]))
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
+
+
+def test_a_network_is_tried_in_many_pieces_and_refused_by_the_last(trained):
+    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    gate.take(mae, 0.0)
+    seeing(gate)
+    whole = sum(1 for _ in gate.trial(mae))
+    assert whole > 20
+    trial = gate.trial(ATTACKS['weights × 1.5'](mae))
+    assert len([*islice(trial, whole)]) == whole
+    with pytest.raises(GateError, match='limit'):
+        deque(trial)
 
 
 def test_less_is_asked_only_of_joints_that_the_muscles_do_not_tell(tmp_path):

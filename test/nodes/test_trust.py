@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,18 @@ def test_a_stranger_s_file_is_refused_with_the_figures(arm, trained, trained_fil
         assert not done
         assert 'limit' in reason
     learner.core.close()
+
+
+def test_of_networks_that_come_while_one_is_tried_the_last_is_used(arm, trained):
+    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    nodes = arm.controller, arm.estimator
+    for version in range(1, 6):
+        mae = replace(trained['default'], version=version)
+        publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
+        arm.graph.executor.look()
+    arm.graph.wait(lambda: all(node.gate.mae.version == 5 for node in nodes), 'the last')
+    arm.graph.spin(0.5)
+    assert [node.gate.mae.version for node in nodes] == [5, 5]
 
 
 def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, trained, monkeypatch):
