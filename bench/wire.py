@@ -24,7 +24,9 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,9 +89,10 @@ class System:
     def __init__(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
         """Start them."""
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import qos_profile_sensor_data
         from std_msgs.msg import Float64MultiArray
+
+        from musculoskeletal_ae.nodes.running import LeanExecutor
 
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
         given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
@@ -111,21 +114,25 @@ class System:
             self.nodes[name] = subprocess.Popen(command, **quiet)
         rclpy.init()
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
+        executor = LeanExecutor()
+        executor.add_node(self._node)
         self.stamps: dict[str, list[int]] = defaultdict(list)
         for topic in ('muscle_states', 'muscle_length_command'):
             # rclpy looks at the signature: a partial has none that it understands.
             def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
                 self.stamps[topic].append(info['source_timestamp'])
 
-            self._node.create_subscription(Float64MultiArray, topic, take, qos_profile_sensor_data)
+            # As bytes: whoever listens should take little of what is measured.
+            self._node.create_subscription(
+                Float64MultiArray, topic, take, qos_profile_sensor_data, raw=True
+            )
 
-    def spin(self, seconds: float) -> None:
-        """Listen for so long."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.1)
+        def listen() -> None:
+            with suppress(rclpy.executors.ExternalShutdownException):
+                executor.spin()
+
+        self._listener = Thread(target=listen)
+        self._listener.start()
 
     def end(self) -> None:
         """End the nodes."""
@@ -136,8 +143,9 @@ class System:
                 process.wait(20)
             except subprocess.TimeoutExpired:
                 process.kill()
-        self._node.destroy_node()
         self._rclpy.try_shutdown()
+        self._listener.join()
+        self._node.destroy_node()
 
 
 class Wire(NamedTuple):
@@ -162,12 +170,12 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
     """Listen to a system of nodes that starts."""
     deadline = time.monotonic() + 60.0
     while not system.stamps['muscle_length_command'] and time.monotonic() < deadline:
-        system.spin(0.5)
-    system.spin(WARM_UP)
+        time.sleep(0.5)
+    time.sleep(WARM_UP)
     system.stamps.clear()
     before = {name: cpu(process.pid) for name, process in system.nodes.items()}
     start = time.monotonic()
-    system.spin(seconds)
+    time.sleep(seconds)
     passed = time.monotonic() - start
     used = {
         name: 100.0 * (cpu(process.pid) - before[name]) / passed
