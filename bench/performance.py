@@ -140,9 +140,9 @@ def starting(network: Path) -> tuple[str, float]:
         while not system.stamps['muscle_length_command']:
             if time.monotonic() > deadline:
                 raise MusculoskeletalError(f'no command came within {STARTING:g} s')
-            system.spin(0.1)
+            time.sleep(0.1)
         used = {name: cpu(process.pid) for name, process in system.nodes.items()}
-        system.spin(SETTLING)
+        time.sleep(SETTLING)
         held = {name: resident(process.pid) for name, process in system.nodes.items()}
     finally:
         system.end()
@@ -158,13 +158,11 @@ def flames(network: Path, seconds: float, out: Path) -> str:
     out.mkdir(parents=True, exist_ok=True)
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
-        system.spin(SETTLING)
+        time.sleep(SETTLING)
         for name, process in system.nodes.items():
             command = f'py-spy record --pid {process.pid} --duration {seconds:.0f} --output'.split()
             command.append(str(out / f'{name}.svg'))
-            watching = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-            while watching.poll() is None:
-                system.spin(0.1)
+            subprocess.run(command, stdout=subprocess.DEVNULL)
     finally:
         system.end()
     return FLAMES.format(', '.join(f'[{name}](flames/{name}.svg)' for name in system.nodes))

@@ -202,8 +202,10 @@ class Shell(Node):
             gate.take(mae, time.monotonic())
 
         def from_file(path: str) -> None:
+            nonlocal newest
             if path:
                 deque(take(checkpoint.load(path, self.robot)), maxlen=0)
+                newest = None
                 self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
         async def from_topic(message: UInt8MultiArray) -> None:
@@ -215,6 +217,8 @@ class Shell(Node):
             try:
                 for _ in take(checkpoint.from_bytes(bytes(message.data), self.robot)):
                     await give_way()
+                    if newest is None:  # a file was chosen meanwhile
+                        return
             except GateError:  # the one in use goes on
                 raise
             except CheckpointError as error:

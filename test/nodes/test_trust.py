@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rclpy
 from controlled_arm import RATE_LIMIT, ControlledArm
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
@@ -77,6 +78,18 @@ def test_of_networks_that_come_while_one_is_tried_the_last_is_used(arm, trained)
     arm.graph.wait(lambda: all(node.gate.mae.version == 5 for node in nodes), 'the last')
     arm.graph.spin(0.5)
     assert [node.gate.mae.version for node in nodes] == [5, 5]
+
+
+def test_a_file_that_is_chosen_while_a_message_is_tried_is_used(arm, trained, tmp_path):
+    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    chosen = tmp_path / 'chosen.safetensors'
+    checkpoint.save(replace(trained['default'], version=7), chosen)
+    publisher.publish(bytes_message(checkpoint.to_bytes(trained['paper'])))
+    arm.graph.wait(lambda: arm.graph.executor._begun, 'the trial')
+    for node in (arm.controller, arm.estimator):
+        assert node.set_parameters([Parameter('checkpoint', value=str(chosen))])[0].successful
+    arm.graph.wait(lambda: not arm.graph.executor._begun, 'the end of the trial')
+    assert [node.gate.mae.version for node in (arm.controller, arm.estimator)] == [7, 7]
 
 
 def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, trained, monkeypatch):
