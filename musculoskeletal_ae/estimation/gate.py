@@ -128,7 +128,7 @@ class Gate:
         deque(self.trial(mae), maxlen=0)
 
     def trial(self, mae: Mae) -> Iterator[None]:
-        """Try a network in pieces, a few milliseconds each, between which a node may go on."""
+        """Try a network in pieces of some milliseconds, between which a node may go on."""
         found, pieces = list[str](), self._faults(mae)
         while True:
             with np.errstate(all='ignore'):
@@ -224,7 +224,7 @@ class Gate:
         def distance(tension: Array, length: Array) -> float:
             state = mae.estimate(tension, length)
             error = residuals(state, tension, length, mae.isolated)
-            return float(np.median(statistics.distances(error))) / threshold
+            return float(np.median(statistics.distances(error) / threshold))
 
         yield distance(tension, length)
         # As many messages as say something suffice, times every muscle.
@@ -252,11 +252,10 @@ class Gate:
                 told = f'{share[worst]:.2g} unexplained {of}'
                 yield f'{name}, {who}: {told}, limit {limit[worst]:.3g}'
         left = self.message_errors(mae)
-        yield ''
         before: dict[str, Array] = {}
         if self.mae is not None and left:
             before = self.message_errors(self.mae.without(self.isolated))
-            yield ''
+        yield ''
         for name, error in left.items():
             limit = np.full(len(error), FLOOR[name])
             if name in before:

@@ -36,6 +36,8 @@ JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 class Learner(Shell):
     """Node shell of online learning."""
 
+    hurried = False
+
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)
         value = self.parameter

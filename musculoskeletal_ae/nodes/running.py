@@ -33,7 +33,6 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions, uninstall_signal_handlers
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
@@ -57,8 +56,7 @@ PARAMETER_ERRORS = (
 
 EVENTS_EVERY = 1  # [s]
 PART = 0.25  # of the time at most goes to callbacks that give way: several nodes do it at once
-#: of nodes that no command waits for: on a busy machine they come second
-NICENESS = {'learner': 5, 'sim': 5}
+NICENESS = 5  # of nodes that no command waits for
 ASLEEP: Any = SimpleNamespace(trigger=lambda: None)
 
 
@@ -138,8 +136,11 @@ class LeanExecutor(SingleThreadedExecutor):
             for entity in entities if pointers else ():
                 if entity.handle.pointer in pointers and self._is_due(entity):
                     self._run(entity, take)
-        if self._begun and not self._pause() and not self._goes_on(*self._begun[0]):
-            self._begun.popleft()
+        if self._begun and not self._pause():
+            start = time.monotonic()
+            if not self._goes_on(*self._begun[0]):
+                self._begun.popleft()
+            self._next_piece = start + (time.monotonic() - start) / PART
         # rclpy asks them again.
         asked = any(action.is_ready(waiting) for action in self._actions)
         return not asked and time.monotonic() < self._rest_at
@@ -159,7 +160,6 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _goes_on(self, entity: Any, callback: Coroutine[Any, Any, None]) -> bool:
         """Run a callback until it ends or gives way; say whether it is to go on."""
-        start = time.monotonic()
         try:
             callback.send(None)
         except StopIteration:
@@ -167,7 +167,6 @@ class LeanExecutor(SingleThreadedExecutor):
         except Exception as error:  # noqa: BLE001
             self._escaped(entity, error)
             return False
-        self._next_piece = start + (time.monotonic() - start) / PART
         return True
 
     def _pause(self) -> int:
@@ -238,7 +237,7 @@ def run(name: str) -> None:
 
     What cannot be used (a robot, a parameter, a checkpoint) ends with one clear line and status 1.
     """
-    own, nodes = COMBINED.get(name, (name,)), list[Node]()
+    own, nodes = COMBINED.get(name, (name,)), list[Any]()
     if {'--help', '-h'} & set(sys.argv[1:]):
         # Not by importing the node, which takes a second.
         for each in own:
@@ -254,12 +253,14 @@ def run(name: str) -> None:
             print(f'{name}: error: unknown option {extra[0]!r}; {told}', file=sys.stderr)
             sys.exit(2)
         check_names(parameters_given(given), name)
-        os.nice(NICENESS.get(name, 0))
         modules = [load(f'musculoskeletal_ae.nodes.{each}') for each in own]
         rclpy.init()
         with LeanExecutor() as executor:
             for module, each in zip(modules, own, strict=True):
-                nodes.append(getattr(module, each.title().replace('_', ''))())
+                kind = getattr(module, each.title().replace('_', ''))
+                _come_second(kind)  # processes that it starts do as well
+                nodes.append(kind())
+                _come_second(nodes[-1])
                 executor.add_node(nodes[-1])
             # What is here by now stays: looking through it again takes 40 ms of a command.
             gc.collect()
@@ -284,6 +285,12 @@ def run(name: str) -> None:
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _come_second(node: Any) -> None:
+    """Let others go first on a busy machine, if no command waits for a node."""
+    if not node.hurried:
+        os.nice(max(0, NICENESS - os.nice(0)))
 
 
 # -- tools ----------------------------------------------------------------------------------------

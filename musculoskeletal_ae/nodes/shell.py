@@ -58,6 +58,7 @@ class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
 
     core: Any = None  # what computes
+    hurried = True  # whether commands wait for it
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
@@ -185,13 +186,15 @@ class Shell(Node):
     def follow_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Use checkpoints from the parameter and the topic; the last that passes the gate wins.
+        """Use checkpoints from the parameter and the topic that pass the gate.
 
         `unfit` is told why one that came by topic cannot be used; the one in use stays. It is tried
-        in pieces, between which messages are answered.
+        in pieces, between which messages are answered; of those that come meanwhile the last is
+        tried next. A trial is given up if a file is chosen, or an anomaly is detected.
         """
         gate = self.gate = Gate(self.robot)
-        newest: UInt8MultiArray | None = None
+        given_up = 0  # how often trials were
+        waiting: tuple[UInt8MultiArray, int] | None = None  # to be tried next, and given_up before
 
         def take(mae: Mae) -> Iterator[None]:
             yield from gate.trial(mae)
@@ -202,23 +205,25 @@ class Shell(Node):
             gate.take(mae, time.monotonic())
 
         def from_file(path: str) -> None:
-            nonlocal newest
+            nonlocal given_up
             if path:
                 deque(take(checkpoint.load(path, self.robot)), maxlen=0)
-                newest = None
+                given_up += 1
                 self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
         async def from_topic(message: UInt8MultiArray) -> None:
-            nonlocal newest
-            newest = message
-            await give_way()
-            if newest is not message:  # another has come while one before was tried
+            nonlocal waiting
+            one_waits, waiting = waiting is not None, (message, given_up)
+            if one_waits:  # its callback tries this one
                 return
+            await give_way()
+            (message, before), waiting = waiting, None
             try:
-                for _ in take(checkpoint.from_bytes(bytes(message.data), self.robot)):
-                    await give_way()
-                    if newest is None:  # a file was chosen meanwhile
-                        return
+                if before == given_up:
+                    for _ in take(checkpoint.from_bytes(bytes(message.data), self.robot)):
+                        await give_way()
+                        if before != given_up:
+                            return
             except GateError:  # the one in use goes on
                 raise
             except CheckpointError as error:
@@ -226,6 +231,8 @@ class Shell(Node):
                 raise
 
         def anomaly(detected: bool) -> None:
+            nonlocal given_up
+            given_up += detected and gate.mae is not None
             before = gate.anomaly(detected, time.monotonic())
             if before is not None:
                 self.get_logger().warning(f'back to checkpoint version {before.version}')

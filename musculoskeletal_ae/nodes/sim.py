@@ -36,7 +36,7 @@ class Sim(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
         Markers(self, 'sim', self._lines)
-        as_robot = self.parameter('as_robot')
+        self.hurried = as_robot = self.parameter('as_robot')
         self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)

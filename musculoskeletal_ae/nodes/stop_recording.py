@@ -76,7 +76,7 @@ class StopRecording:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
             with BagWriter(bag) as writer:
-                names = {topic: self._resolve(topic) for _, topic, _ in messages}
+                names = {t: self._resolve(t) for t in {topic for _, topic, _ in messages}}
                 for topic, name in names.items():
                     kind, latched, _ = TOPICS[topic]
                     writer.add_topic(name, kind, [offered_qos(latched)])

@@ -101,7 +101,11 @@ def test_a_detector_that_sleeps_or_would_stop_a_healthy_arm_is_refused(trained):
     gate, mae = Gate(ROBOT), calibrated(trained['default'])
     seeing(gate)
     gate.check(mae)
-    for times, told in ((100.0, 'with a muscle cut'), (0.01, 'on own messages')):
+    for times, told in (
+        (100.0, 'with a muscle cut'),
+        (0.01, 'on own messages'),
+        (0.0, 'on own messages'),
+    ):
         thresholds = {DISTANCE: times * mae.anomaly.thresholds[DISTANCE]}
         with pytest.raises(GateError, match=told):
             gate.check(replace(mae, anomaly=replace(mae.anomaly, thresholds=thresholds)))

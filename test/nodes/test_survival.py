@@ -27,6 +27,7 @@ from type_description_interfaces.srv import GetTypeDescription
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.running import NICENESS
 
 NODES = {
     'hardware_emulator': ['hardware_emulator/reset'],
@@ -120,6 +121,9 @@ def test_no_request_or_clock_ends_a_node(graph, node):
     assert graph.set_parameter(node, 'use_sim_time', False)[0]
     before = len(states(graph, node))
     graph.wait(lambda: len(states(graph, node)) > before + 1, 'its diagnostics')
+    process, own = graph.processes[-1].process.pid, os.nice(0)
+    second = node in ('learner', 'sim')  # no command waits for those
+    assert os.getpriority(os.PRIO_PROCESS, process) == (max(own, NICENESS) if second else own)
     values = {value.key: value.value for value in states(graph, node)[-1].values}
     counted = [key for key in values if 'ValueError' in key]
     assert any('set_parameters' in key for key in counted), values

@@ -70,26 +70,40 @@ def test_a_stranger_s_file_is_refused_with_the_figures(arm, trained, trained_fil
 
 def test_of_networks_that_come_while_one_is_tried_the_last_is_used(arm, trained):
     publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    nodes = arm.controller, arm.estimator
-    for version in range(1, 6):
+    nodes, begun = (arm.controller, arm.estimator), []
+    for version in range(1, 21):
         mae = replace(trained['default'], version=version)
         publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
         arm.graph.executor.look()
-    arm.graph.wait(lambda: all(node.gate.mae.version == 5 for node in nodes), 'the last')
-    arm.graph.spin(0.5)
-    assert [node.gate.mae.version for node in nodes] == [5, 5]
+        begun.append(len(arm.graph.executor._begun))
+    arm.graph.wait(lambda: all(node.gate.mae.version == 20 for node in nodes), 'the last')
+    assert 0 < max(begun) <= 4  # one is tried, one waits, in each node
+
+
+def try_another(arm, mae):
+    """Let the controller begin to try a network."""
+    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
+    begun, own = arm.graph.executor._begun, [*arm.controller.subscriptions]
+    arm.graph.wait(lambda: any(entity in own for entity, _ in begun), 'the trial')
 
 
 def test_a_file_that_is_chosen_while_a_message_is_tried_is_used(arm, trained, tmp_path):
-    publisher = arm.graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     chosen = tmp_path / 'chosen.safetensors'
     checkpoint.save(replace(trained['default'], version=7), chosen)
-    publisher.publish(bytes_message(checkpoint.to_bytes(trained['paper'])))
-    arm.graph.wait(lambda: arm.graph.executor._begun, 'the trial')
-    for node in (arm.controller, arm.estimator):
-        assert node.set_parameters([Parameter('checkpoint', value=str(chosen))])[0].successful
+    try_another(arm, trained['paper'])
+    parameter = Parameter('checkpoint', value=str(chosen))
+    assert arm.controller.set_parameters([parameter])[0].successful
     arm.graph.wait(lambda: not arm.graph.executor._begun, 'the end of the trial')
-    assert [node.gate.mae.version for node in (arm.controller, arm.estimator)] == [7, 7]
+    assert arm.controller.gate.mae.version == 7
+
+
+def test_a_network_that_is_tried_when_an_anomaly_is_detected_is_given_up(arm, trained):
+    first = arm.controller.gate.mae
+    try_another(arm, trained['paper'])
+    arm.controller.take_anomaly(True)
+    arm.graph.wait(lambda: not arm.graph.executor._begun, 'the end of the trial')
+    assert arm.controller.core.mae is arm.controller.gate.mae is first
 
 
 def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, trained, monkeypatch):
