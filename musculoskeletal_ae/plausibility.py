@@ -35,14 +35,18 @@ LENGTH = 'length beyond what the joints allow'
 TEMPERATURE = 'temperature of no module'
 
 
+def length_range(robot: Robot, outside: float = 0.0) -> tuple[Array, Array]:
+    """Return least and greatest l [m] (M,) in the joints' ranges and a share of them beyond."""
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0), outside)
+    slack = np.zeros((POSTURES, robot.muscle_count))
+    length = [robot.muscle_lengths(theta, slack + pull) for pull in (0.0, robot.tension.max)]
+    return np.min(length, axis=(0, 1)), np.max(length, axis=(0, 1))
+
+
 def longest_lengths(robot: Robot) -> Array:
     """Return |l| of every muscle that no posture passes [m], shape (M,)."""
-    theta = robot.random_postures(POSTURES, np.random.default_rng(0), OUTSIDE)
-    slack = np.zeros((POSTURES, robot.muscle_count))
-    length = np.abs(
-        [robot.muscle_lengths(theta, slack + pull) for pull in (0.0, robot.tension.max)]
-    )
-    longest: Array = length.max(axis=(0, 1)) + LENGTH_MARGIN
+    low, high = length_range(robot, OUTSIDE)
+    longest: Array = np.maximum(-low, high) + LENGTH_MARGIN
     return longest
 
 

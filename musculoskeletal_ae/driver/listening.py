@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.plausibility import length_range
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 
@@ -56,12 +57,8 @@ class Listening:
         self._times: list[float] = []  # of all messages
         self._read: list[tuple[Array, Array]] = []  # (3, M), and θ then or NaN (D,)
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
-        theta = robot.random_postures(500, np.random.default_rng(0))
-        ones, most = np.ones(robot.muscle_count), robot.tension.max
-        pulls = np.zeros((500, 1)) * ones, np.tile(most, (500, 1))
-        spans = [robot.muscle_lengths(theta, pull) for pull in pulls]
-        low, high = np.min(spans, axis=(0, 1)), np.max(spans, axis=(0, 1))
-        beyond, (coldest, hottest) = BEYOND[not zeroed], TEMPERATURES
+        (low, high), most = length_range(robot), robot.tension.max
+        ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
         #: what values are possible, (3, M)
         self._low = np.stack([low - beyond, -0.02 * most, coldest * ones])
         self._high = np.stack([high + beyond, 1.1 * most, hottest * ones])
