@@ -133,15 +133,20 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
 
 def read_wrench(message: Any, root_link: str) -> Array:
     """Return force [N] and torque [N·m] (6,) of a WrenchStamped; no frame means the root link."""
-    force, torque = message.wrench.force, message.wrench.torque
-    wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     if message.header.frame_id not in ('', root_link):
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
-    if not np.isfinite(wrench).all():
-        raise MessageError('not finite', 'a force or torque')
-    if (np.abs(wrench) > MOST_WRENCH).any():
-        raise MessageError('oversized', f'{wrench}, at most {MOST_WRENCH}')
-    return wrench
+    wrench = message.wrench
+    return _six(wrench.force, wrench.torque, MOST_WRENCH, 'a force or torque')
+
+
+def _six(first: Any, second: Any, most: Array, what: str) -> Array:
+    """Return two vectors as one (6,), all finite and no larger than `most` (6,)."""
+    values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
+    if not np.isfinite(values).all():
+        raise MessageError('not finite', what)
+    if (np.abs(values) > most).any():
+        raise MessageError('oversized', f'{values}, at most {most}')
+    return values
 
 
 def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
@@ -193,13 +198,8 @@ def read_twist(message: Any, frame: str) -> Array:
     """Return the linear [m/s] and angular velocity [rad/s] (6,) of a TwistStamped in `frame`."""
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
-    linear, angular = message.twist.linear, message.twist.angular
-    twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
-    if not np.isfinite(twist).all():
-        raise MessageError('not finite', 'a linear or angular velocity')
-    if (np.abs(twist) > MOST_TWIST).any():
-        raise MessageError('oversized', f'{twist}, at most {MOST_TWIST}')
-    return twist
+    twist = message.twist
+    return _six(twist.linear, twist.angular, MOST_TWIST, 'a linear or angular velocity')
 
 
 def without_orientation(message: Any) -> bool:
