@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
-from std_msgs.msg import Bool, Float64
+from std_msgs.msg import Float64
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR
+from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.robot.robot import Robot
@@ -47,8 +47,7 @@ class BringupStatus(Shell):
         self.follow_posture('joint_states', partial(setattr, self, 'theta'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        detected = partial(setattr, self.situation, 'detected')
-        self.listen(Bool, 'anomaly_detected', lambda m: detected(m.data), LATCHED)
+        self.follow_anomaly(partial(setattr, self.situation, 'detected'))
         self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
         self.states: Array | None = None
         self.screen = open_screen()
@@ -108,9 +107,8 @@ def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> An
     table = Table(box=None, padding=(0, 1))
     for title in ('muscle', 'l [mm]', 'T [N]', '', '°C'):
         table.add_column(title, justify='left' if title in ('muscle', '') else 'right')
-    for m, name in enumerate(robot.muscles if states is not None else ()):
-        length, tension, temperature = states[:, m]  # type: ignore[index]
-        limit = float(robot.tension.limit[m])
+    rows = () if states is None else zip(robot.muscles, robot.tension.limit, states.T)
+    for name, limit, (length, tension, temperature) in rows:
         colour = 'blue' if tension < limit else 'dark_orange'
         bar = Bar(limit, 0.0, max(tension, 0.0), width=30, color=colour)
         table.add_row(name, f'{1e3 * length:.0f}', f'{tension:.0f}', bar, f'{temperature:.0f}')

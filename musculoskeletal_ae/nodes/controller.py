@@ -19,7 +19,7 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -29,7 +29,7 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
+from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
@@ -78,7 +78,7 @@ class Controller(Shell):
             self.action = module.FollowJointTrajectory(
                 self, kind, self.core, self._trajectory, refuse
             )
-        self.listen(Bool, 'anomaly_detected', self._anomaly, LATCHED)
+        self.follow_anomaly(self._anomaly)
         self.follow_isolated(self.core.isolate)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
@@ -110,9 +110,9 @@ class Controller(Shell):
         if self.zeros.known:
             self.gate.message(muscles.tension, muscles.length, now)
 
-    def _anomaly(self, message: Bool) -> None:
-        self.core.anomaly(message.data)
-        self.take_anomaly(message.data)
+    def _anomaly(self, detected: bool) -> None:
+        self.core.anomaly(detected)
+        self.take_anomaly(detected)
 
     def _estimated(self, theta: Array) -> None:
         self.core.estimated(theta, time.monotonic())
@@ -131,9 +131,8 @@ class Controller(Shell):
 
     def _trajectory(self, message: JointTrajectory) -> None:
         points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
-        now = self.get_clock().now().nanoseconds * 1e-9
         begin = stamp.sec + 1e-9 * stamp.nanosec  # 0: now
-        self.core.trajectory(points, begin - now if begin > 0.0 else 0.0)
+        self.core.trajectory(points, begin - self.now() if begin > 0.0 else 0.0)
         self._tell_slowed()
 
     def _pose(self, message: PoseStamped) -> None:
@@ -189,7 +188,7 @@ class Controller(Shell):
             self._step()
 
     def _step(self) -> None:
-        command = self.core.step(time.monotonic(), self.get_clock().now().nanoseconds * 1e-9)
+        command = self.core.step(time.monotonic(), self.now())
         if command is not None:
             value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
             message = array_message(value, 'muscle')

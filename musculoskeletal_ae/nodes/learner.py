@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import Imu
-from std_msgs.msg import Bool, UInt8MultiArray
+from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -62,13 +62,13 @@ class Learner(Shell):
         self.needed = ['muscle_states']
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.insert(0, topic)
-            self.follow_posture(topic, lambda theta: core.joints(self._now(), theta), some=True)
+            self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.listen(Imu, 'imu', self._take_imu, SENSOR)
         self.follow_zeros(lambda known, _: core.zeros(known))
         # length, tension, temperature
-        self.follow_muscle_states(lambda states: core.muscles(self._now(), *states[1::-1]))
-        self.listen(Bool, 'anomaly_detected', lambda m: self.core.anomaly(m.data), LATCHED)
+        self.follow_muscle_states(lambda states: core.muscles(self.now(), *states[1::-1]))
+        self.follow_anomaly(core.anomaly)
         self.told = False
         self.gate = self.core.gate
         self.follow_isolated(self._isolate)
@@ -105,12 +105,9 @@ class Learner(Shell):
 
     # -- messages -------------------------------------------------------------------------------
 
-    def _now(self) -> float:
-        return self.get_clock().now().nanoseconds * 1e-9
-
     def _take_imu(self, message: Imu) -> None:
         prefix = self.parameter('frame_prefix')
-        self.core.imu(self._now(), *read_imu(message, self.links, prefix))
+        self.core.imu(self.now(), *read_imu(message, self.links, prefix))
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         # An estimator that has just started knows of none before it has our network.
@@ -132,7 +129,7 @@ class Learner(Shell):
         return f'learning anew: {", ".join(names)}; the others stay'
 
     def _poll(self) -> None:
-        data = self.core.poll(self._now())
+        data = self.core.poll(self.now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
         if bool(self.core.trouble) != self.troubled:  # is told at once, not with the next report

@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
@@ -245,6 +245,10 @@ class Shell(Node):
 
     # -- messages -------------------------------------------------------------------------------
 
+    def now(self) -> float:
+        """Return the time of a message that comes now, by the ROS clock [s]."""
+        return self.get_clock().now().nanoseconds * 1e-9
+
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
@@ -336,6 +340,10 @@ class Shell(Node):
             isolate(muscles)
 
         self.listen(String, 'isolated_muscles', take, LATCHED)
+
+    def follow_anomaly(self, follow: Callable[[bool], object]) -> None:
+        """Tell whether the estimator has detected an anomaly, whenever it says so."""
+        self.listen(Bool, 'anomaly_detected', lambda m: follow(m.data), LATCHED)
 
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False

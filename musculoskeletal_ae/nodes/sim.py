@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm, Markers
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE
+from musculoskeletal_ae.nodes.messages import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
@@ -49,7 +48,7 @@ class Sim(Arm):
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not as_robot:
             self.follow_muscle_states(self._note)
-        self.listen(Bool, 'anomaly_detected', lambda m: self.take_anomaly(m.data), LATCHED)
+        self.follow_anomaly(self.take_anomaly)
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()

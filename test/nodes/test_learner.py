@@ -66,7 +66,7 @@ class HostedLearner:
         self.node = graph.host(Learner, robot='arm26', **{**QUICK, **parameters})
         graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.arm = Arm(graph, robot)
-        self.node._now = lambda: self.arm.time
+        self.node.now = lambda: self.arm.time
         self.taken = 0
         muscles = self.node.core.muscles
 
