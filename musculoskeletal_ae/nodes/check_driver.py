@@ -13,14 +13,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.start import load
 
@@ -42,7 +41,7 @@ class CheckDriver:
     """Listens to one driver, and winds its muscles in."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
-        self.node: Node = rclpy.create_node('check_driver')
+        self.node = Node('check_driver')
         self.robot, self.options = robot, options
         self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
         self.muscles: Callable[[Float64MultiArray], object] = lambda _: None
@@ -50,12 +49,8 @@ class CheckDriver:
         subscribe: Any = self.node.create_subscription
         subscribe(Float64MultiArray, STATES, lambda message: self.muscles(message), SENSOR)
         subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
-        self._spin(DISCOVERY)
-
-    def _spin(self, longest: float, until: Callable[[], bool] = lambda: False) -> None:
-        end = time.monotonic() + longest
-        while not until() and (left := end - time.monotonic()) > 0.0:
-            rclpy.spin_once(self.node, timeout_sec=min(0.1, left))
+        self.spin_until = Spinner(self.node).spin_until
+        self.spin_until(lambda: False, DISCOVERY)
 
     def _mistyped(self) -> str:
         kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(STATES)}
@@ -68,13 +63,13 @@ class CheckDriver:
         listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
         self.muscles = lambda message: listening.muscles(message, time.monotonic())
         self.joints = listening.joints
-        self._spin(2.0, lambda: listening.count > 0)
+        self.spin_until(lambda: listening.count, 2.0)
         if not listening.count:
             _say(f'waiting for {self.topic} (ROS_DOMAIN_ID {node.context.get_domain_id()})')
             wait = math.inf if chosen.wait else chosen.seconds
-            self._spin(wait, lambda: listening.count > 0 or self._mistyped() != '')
+            self.spin_until(lambda: listening.count or self._mistyped(), wait)
         if listening.count:
-            self._spin(chosen.seconds)
+            self.spin_until(lambda: False, chosen.seconds)
         verdict: Verdict = listening.verdict()
         if wrong := self._mistyped():
             verdict.failed('type', topic=self.topic, type=wrong)
@@ -100,7 +95,7 @@ class CheckDriver:
         winding = kind(verdict, muscles, self.options.tension)
         read = load('musculoskeletal_ae.validity').read_array
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
-        self._spin(3.0, lambda: publisher.get_subscription_count() > 0)
+        self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
             verdict.failed('deaf', topic=self.command)
             return
@@ -126,7 +121,7 @@ class CheckDriver:
             # On a busy machine another node may be discovered late.
             return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
 
-        self._spin(math.inf, ended)
+        self.spin_until(ended, math.inf)
         if not winding.done:
             verdict.failed('silence', gap=SILENCE)
 

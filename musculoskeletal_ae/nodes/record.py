@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -12,14 +13,13 @@ from functools import partial
 from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from musculoskeletal_ae.bags.metadata import Qos, offered_qos
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
-from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
 
 # What the recorder may lose when it is killed is what is younger than this.
@@ -46,7 +46,7 @@ class Record(Node):
             receive = partial(self._receive, resolved, topic)
             self.create_subscription(message_class(topic.type), name, receive, qos, raw=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(FLUSH_PERIOD, writer.flush, clock=steady)
+        self.create_timer(FLUSH_PERIOD, writer.flush, clock=steady)
 
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
@@ -76,16 +76,13 @@ def _record(options: Namespace, arguments: list[str]) -> None:
     out = options.out or Path(f'{datetime.now():%Y_%m_%d-%H_%M_%S}_bag')  # noqa: DTZ005 - local
     with BagWriter(out, options.compression) as writer:
         node = Record(writer, options.topics)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        spinner = Spinner(node)
         print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
-        end = time.monotonic() + (options.duration or float('inf'))
-        while not stop and time.monotonic() < end:
-            executor.spin_once(timeout_sec=min(0.1, max(0.0, end - time.monotonic())))
+        spinner.spin_until(lambda: stop, options.duration or math.inf)
         drained, before = time.monotonic() + DRAIN_TIME, -1
         while time.monotonic() < drained and node.received != before:
             before = node.received
-            executor.spin_once(timeout_sec=0.05)
+            spinner.spin_once(timeout_sec=0.05)
         node.destroy_node()
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
 

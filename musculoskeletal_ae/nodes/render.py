@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-import time
 from argparse import Namespace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import rclpy
+from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import SENSOR
-from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
@@ -35,12 +34,10 @@ def _lines(message: MarkerArray) -> list[Line]:
 
 def _render(options: Namespace, arguments: list[str]) -> int:
     start_ros(arguments)
-    node = rclpy.create_node('render')
+    node = Node('render')
     received: list[MarkerArray] = []
     node.create_subscription(MarkerArray, options.topic, received.append, SENSOR)
-    deadline = time.monotonic() + options.timeout
-    while not received and time.monotonic() < deadline:
-        rclpy.spin_once(node, timeout_sec=0.1)
+    Spinner(node).spin_until(lambda: received, options.timeout)
     lines = _lines(received[0]) if received else []
     if not lines:
         raise MusculoskeletalError(

@@ -13,9 +13,9 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
@@ -28,7 +28,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
-from musculoskeletal_ae.nodes.running import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, positive
 
 # Deep enough that a reader that is late by a second still gets everything.
@@ -51,6 +51,7 @@ class Replay(Node):
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
+        self.length = (self._stop - self._start) / 1e9  # [s]
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher = {
             recorded: self.create_publisher(
@@ -67,7 +68,7 @@ class Replay(Node):
         self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
         self._sought: int | None = None  # where to go on [ns]
         told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
-        number = FloatingPointRange(from_value=0.0, to_value=(self._stop - self._start) / 1e9)
+        number = FloatingPointRange(from_value=0.0, to_value=self.length)
         told.floating_point_range = [number]
         self.declare_parameter('position', 0.0, told)
         self.add_post_set_parameters_callback(self._seek)
@@ -76,16 +77,12 @@ class Replay(Node):
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
             self._timeline.hold(True, time.monotonic())
-        self._spinner = SingleThreadedExecutor()
-        self._spinner.add_node(self)
+        self._spinner = Spinner(self)
 
     def get_ready(self, longest: float) -> None:
         """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
-        end = time.monotonic() + longest
         topics = [*self._publisher.values(), *filter(None, [self._recorded_time])]
-        while time.monotonic() < end and not all(t.get_subscription_count() for t in topics):
-            self._spinner.spin_once(timeout_sec=0.02)
-        time.sleep(SETTLE_TIME if longest else 0.0)
+        _await_subscribers(self._spinner, topics, longest)
         for work in (self.pause, self.resume, self.step):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
@@ -132,7 +129,7 @@ class Replay(Node):
                 self._spinner.spin_once(timeout_sec=wait)
                 if now > self._next_report:
                     self._next_report = now + 1.0
-                    seconds = np.array([self._done(), (self._stop - self._start) / 1e9])
+                    seconds = np.array([self._done(), self.length])
                     self._told.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
             else:
@@ -176,6 +173,12 @@ class Replay(Node):
         return f'{(self._start - self._bag.start) / 1e9 + self._done():.6f} s'
 
 
+def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: float) -> None:
+    """Wait until every topic has a subscriber that takes messages, at most so long [s]."""
+    spinner.spin_until(lambda: all(p.get_subscription_count() for p in publishers), longest)
+    time.sleep(SETTLE_TIME if longest else 0.0)
+
+
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     """Publish what a hand showed as one trajectory."""
     names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
@@ -189,11 +192,8 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     start_ros(arguments)
     node = Node('replay')
     topic = name.removesuffix(SHOWN) + 'joint_trajectory'
-    publisher, end = node.create_publisher(JointTrajectory, topic, RELIABLE), options.wait
-    end += time.monotonic()
-    while not publisher.get_subscription_count() and time.monotonic() < end:
-        time.sleep(SLEPT)
-    time.sleep(SETTLE_TIME if options.wait else 0.0)
+    publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
+    _await_subscribers(Spinner(node), [publisher], options.wait)
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
     if not publisher.get_subscription_count():
@@ -210,14 +210,13 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     if options.as_trajectory:
         return _teach(bag, options, arguments)
     names = select(bag, options.topics, options.from_namespace, options.keep_names)
-    start, stop = window(bag, options.start, options.duration)
     if options.loop and not options.clock:
         problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
         print(f'warning: --loop: {problem}', file=sys.stderr)
     start_ros(arguments)
     node = Replay(bag, names, options)
     bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
-    with tqdm(total=(stop - start) / 1e9, bar_format=bar, disable=None, leave=False) as progress:
+    with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
         node.get_ready(options.wait)
         node.play(progress, options.loop)
     node.acknowledge()

@@ -33,6 +33,7 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions, uninstall_signal_handlers
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
@@ -305,6 +306,20 @@ def message_class(type_name: str) -> Any:
         raise MusculoskeletalError(
             f'message type {type_name} is not installed; install the ROS package {package}'
         ) from error
+
+
+class Spinner(SingleThreadedExecutor):
+    """Spins the node of a tool, as long as the tool wants."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self.add_node(node)
+
+    def spin_until(self, condition: Callable[[], object], longest: float) -> None:
+        """Handle what comes until a condition holds, at most so long [s]."""
+        end = time.monotonic() + longest
+        while not condition() and (left := end - time.monotonic()) > 0.0:
+            self.spin_once(timeout_sec=min(0.1, left))
 
 
 def start_ros(arguments: list[str]) -> None:

@@ -21,7 +21,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3, WrenchStamped
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -32,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
@@ -83,8 +82,7 @@ class View(Node):
         self.ruptured: list[str] = []
         self.payload = 0.0
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
-        self.spinner = SingleThreadedExecutor()
-        self.spinner.add_node(self)
+        self.spinner = Spinner(self)
         self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
         self.pushes: list[Any] = []
         if not options.read_only:
