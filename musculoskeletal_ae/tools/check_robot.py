@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
@@ -37,7 +36,3 @@ def main(argv: list[str] | None = None) -> int:
         parser.error('--reach goes with --suggest')
     args.reach = args.reach or REACH
     return exit_status(lambda: load('musculoskeletal_ae.tools.robot_report').check(args))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from argparse import ArgumentTypeError
 from pathlib import Path
 
@@ -52,7 +51,3 @@ def _names(text: str) -> tuple[str, ...]:
     if unknown := [name for name in names if name not in NAMES]:
         raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)} or all')
     return names
-
-
-if __name__ == '__main__':
-    sys.exit(main())

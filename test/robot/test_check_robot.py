@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from graph import executable
 from matplotlib.figure import Figure
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 from scipy.linalg import eigh
@@ -293,7 +294,7 @@ def test_a_bad_declaration_is_refused_naming_the_line(tmp_path, capsys, rows, fr
 
 
 def test_as_a_program_it_exits_1_without_a_traceback(tmp_path):
-    command = [sys.executable, '-m', 'musculoskeletal_ae.tools.check_robot', str(tmp_path / 'none')]
+    command = [*executable('check_robot'), str(tmp_path / 'none')]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert 'none' in done.stderr
