@@ -8,6 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from musculoskeletal_ae.control.watch import LONGEST_STEP
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
@@ -76,6 +77,11 @@ class ControlledArm:
         """Return all commands of a kind so far."""
         messages = self.graph.received[f'muscle_{kind}_command']
         return np.array([read_array(m, 1, self.robot.muscle_count) for m in messages])
+
+    def never_jumped(self, since=0):
+        """Check that no length command went faster than the rate limit, after a pause either."""
+        steps = np.abs(np.diff(self.sent()[since:], axis=0))
+        assert steps.max() <= RATE_LIMIT * LONGEST_STEP + 1e-9
 
     def posture(self):
         return np.array(self.graph.next('joint_states').position)

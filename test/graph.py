@@ -20,7 +20,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from std_msgs.msg import UInt8MultiArray
 
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.running import LeanExecutor
 from musculoskeletal_ae.report import Report
 
@@ -55,8 +57,12 @@ class Process:
         """Stop it; return exit status and output."""
         if self.alive():
             self.process.send_signal(number)
+        return self.ended()
+
+    def ended(self) -> tuple[int, str]:
+        """Wait for its end; return exit status and output."""
         try:
-            output, _ = self.process.communicate(timeout=DEADLINE)
+            output, _ = self.process.communicate(timeout=2 * DEADLINE)
         except subprocess.TimeoutExpired:
             self.process.kill()
             output, _ = self.process.communicate()
@@ -88,6 +94,7 @@ class Graph:
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.processes: list[Process] = []
         self.hosted: list[Node] = []
+        self.networks: Any = None  # their publisher, once there is one
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -119,6 +126,11 @@ class Graph:
         self.executor.remove_node(node)
         node.destroy_node()
 
+    def ended(self, process: Process, number: int | None = None) -> tuple[int, str]:
+        """Return exit status and output of a process that ends, if need be by a signal."""
+        self.processes.remove(process)
+        return process.ended() if number is None else process.end(number)
+
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
         """Subscribe; return the list that messages are appended to."""
         self.node.create_subscription(kind, topic, self.received[topic].append, qos)
@@ -129,6 +141,12 @@ class Graph:
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {topic}')
         return publisher
+
+    def send_network(self, data: bytes) -> None:
+        """Publish the bytes of a checkpoint once somebody listens."""
+        if self.networks is None:
+            self.networks = self.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        self.networks.publish(bytes_message(data))
 
     def spin(self, seconds: float) -> None:
         """Handle messages for a while."""

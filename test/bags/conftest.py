@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import subprocess
@@ -11,11 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from graph import DEADLINE, Graph
+from graph import DEADLINE
+from nodes.conftest import graph
 
 from bench import bag_samples as samples
 
-_counter = itertools.count(1)
+__all__ = ['graph']
 
 
 @pytest.fixture(scope='session')
@@ -75,14 +75,6 @@ def tool():
         if one.process.poll() is None:
             one.process.kill()
             one.process.communicate()
-
-
-@pytest.fixture
-def graph():
-    """Return a graph whose topics no other test sees: a namespace of its own."""
-    graph = Graph(f'/bags_{os.getpid()}_{next(_counter)}')
-    yield graph
-    graph.close()
 
 
 @pytest.fixture(autouse=True, scope='session')

@@ -42,6 +42,7 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
     told.diagnosed(said('/right/controller', 'stopped: by request'))
     assert told.trouble() == ''
     told.diagnosed(said('/left/controller', 'exploring'))
+    assert told.trouble() == ''
     told.diagnosed(said('/left/controller', 'stopped: anomaly'))
     told.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
     told.detected = True
@@ -50,6 +51,11 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
         'controller/explore)'
     )
     assert (told.distance, told.limit) == (12.5, 9.0)
+    told.detected = False
+    told.diagnosed(said('/left/controller', 'holding'))
+    assert told.trouble() == ''
+    told.diagnosed(said('/left/controller', 'stopped: a cause'))
+    assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
 
 
 def test_a_terminal_shows_every_muscle_and_the_trouble_where_rich_is_there(arm26):

@@ -4,20 +4,16 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph import DEADLINE, executable
+from graph import Process, executable
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
-
-from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 
 
 def check(graph, *options):
     command = [*executable('check_driver'), '--robot', 'arm26', *options]
     command += ['--ros-args', '-r', f'__ns:={graph.namespace}']
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return Process('check_driver', command)
 
 
 def started(graph, **parameters):
@@ -26,19 +22,14 @@ def started(graph, **parameters):
     graph.next('muscle_states')
 
 
-def ended(process, deadline=2 * DEADLINE):
-    output, _ = process.communicate(timeout=deadline)
-    return process.returncode, output
-
-
 def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
     started(graph)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
     # A busy machine may keep a sound driver waiting: it is listened to until it is heard well.
-    assert ended(check(graph, '--wait', '--seconds', '2'))[0] == 0
+    assert check(graph, '--wait', '--seconds', '2').ended()[0] == 0
     assert not commands
     one = ['--move', '--muscles', 'biceps_long']
-    status, output = ended(check(graph, '--wait', '--seconds', '2', *one))
+    status, output = check(graph, '--wait', '--seconds', '2', *one).ended()
     faults = [line for line in output.splitlines() if line.startswith('fault: ')]
     assert {line.split()[1] for line in faults} <= {'latency', 'rate'}, output
     assert status == 0 or faults
@@ -59,7 +50,7 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
 )
 def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
     started(graph, faults=[fault])
-    status, output = ended(check(graph, '--seconds', '2', *options))
+    status, output = check(graph, '--seconds', '2', *options).ended()
     assert status == 1, output
     assert told in output
     assert 'change: ' in output
@@ -67,7 +58,7 @@ def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
 
 def test_it_says_what_it_waits_for_and_what_is_wrong_until_it_is_right(graph):
     waiting = check(graph, '--wait', '--seconds', '2')
-    lines = iter(waiting.stdout.readline, '')
+    lines = iter(waiting.process.stdout.readline, '')
     assert f'waiting for {graph.namespace}/muscle_states' in next(lines)
     graph.start('hardware_emulator', robot='arm26', faults=['bias:biceps_long:0.1'])
     for line in lines:
@@ -75,14 +66,14 @@ def test_it_says_what_it_waits_for_and_what_is_wrong_until_it_is_right(graph):
             break
         assert 'keeps its contract' not in line
     assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]
-    status, output = ended(waiting)
+    status, output = waiting.ended()
     assert status == 0
     assert 'the driver keeps its contract' in output
 
 
 def test_a_topic_of_another_type_is_told(graph):
     graph.node.create_publisher(Float32MultiArray, 'muscle_states', 10)
-    status, output = ended(check(graph, '--seconds', '1'))
+    status, output = check(graph, '--seconds', '1').ended()
     assert status == 1
     assert 'is a std_msgs/msg/Float32MultiArray' in output
 
@@ -90,7 +81,7 @@ def test_a_topic_of_another_type_is_told(graph):
 def test_it_does_not_move_what_a_controller_moves(graph):
     started(graph)
     graph.publisher(Float64MultiArray, 'muscle_length_command')
-    status, output = ended(check(graph, '--seconds', '1', '--move'))
+    status, output = check(graph, '--seconds', '1', '--move').ended()
     assert status == 1
     assert 'stop the controller' in output
 
@@ -101,16 +92,15 @@ def test_it_stops_winding_when_a_controller_starts(graph):
     process = check(graph, '--wait', '--seconds', '1', '--move')
     graph.wait(lambda: commands, 'the first command')
     graph.publisher(Float64MultiArray, 'muscle_length_command')
-    status, output = ended(process)
+    status, output = process.ended()
     assert status == 1
     assert 'stop the controller' in output
 
 
 def test_ctrl_c_ends_it_without_a_traceback(graph):
     waiting = check(graph)
-    waiting.stdout.readline()
-    waiting.send_signal(signal.SIGINT)
-    status, output = ended(waiting)
+    waiting.process.stdout.readline()
+    status, output = waiting.end(signal.SIGINT)
     assert status == 130 and output == ''
 
 
@@ -124,21 +114,3 @@ def test_nodes_say_what_they_wait_for(graph):
     assert len(waiting) == 1
     assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting[0]
     assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting[0]
-
-
-def test_the_status_line_names_every_step_to_go_on(graph):
-    status = graph.host(BringupStatus, robot='arm26').situation
-
-    def controller_says(message):
-        name = f'{graph.namespace}/controller: state'
-        status.diagnosed(DiagnosticArray(status=[DiagnosticStatus(name=name, message=message)]))
-        return status.trouble()
-
-    assert controller_says('exploring') == ''
-    status.detected, status.suspect = True, 'brachialis'
-    steps = 'mend it, estimator/reset, controller/reset, controller/explore'
-    told = controller_says('stopped: anomaly_detected')
-    assert told == f'ANOMALY: brachialis, STOPPED: anomaly_detected (to go on: {steps})'
-    status.detected = False
-    assert controller_says('holding') == ''
-    assert controller_says('stopped: a cause') == 'STOPPED: a cause (to go on: controller/reset)'

@@ -28,13 +28,9 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
     graph.wait(lambda: graph.report('controller').message == 'exploring', 'exploration')
     done, why = graph.set_parameter('estimator', 'anomaly_threshold', -1.0)
     assert not done and 'anomaly_threshold' in why
-    graph.processes.remove(process)
-    assert process.end(signal.SIGINT)[0] == 0
+    assert graph.ended(process, signal.SIGINT)[0] == 0
 
 
 def test_a_parameter_that_only_another_node_has_is_refused(graph):
-    process = graph.start('combined', payload=1.0)
-    graph.processes.clear()
-    process.process.wait()
-    status, output = process.end()
+    status, output = graph.ended(graph.start('combined', payload=1.0))
     assert status == 1 and 'combined has no parameter' in output

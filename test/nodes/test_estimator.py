@@ -14,15 +14,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray, UInt8MultiArray
+from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 
 @pytest.fixture
@@ -120,8 +119,7 @@ def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refu
     copy = shutil.copy(trained_file, tmp_path / 'copy.safetensors')
     assert estimator.set_parameter('estimator', 'checkpoint', str(copy)) == (True, '')
     mae = replace(checkpoint.load(trained_file), version=41)
-    publisher = estimator.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    publisher.publish(bytes_message(checkpoint.to_bytes(mae)))
+    estimator.send_network(checkpoint.to_bytes(mae))
     core, rejected = estimator.estimator.core, estimator.estimator.rejected
     estimator.wait(lambda: core.mae.version == 41, 'version 41')
     singular = replace(mae.anomaly, covariance=np.ones((12, 12)) + 1e-15 * np.eye(12))
@@ -131,7 +129,7 @@ def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refu
         checkpoint.to_bytes(replace(mae, anomaly=singular)),
     )
     for count, data in enumerate(unfit, start=1):
-        publisher.publish(bytes_message(data))
+        estimator.send_network(data)
         estimator.wait(
             lambda count=count: rejected['mae_checkpoint: unfit checkpoint'] == count,
             f'refusal {count}',
@@ -209,11 +207,6 @@ def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, a
     estimator.wait(lambda: arrived() and rejected['marker_pose: wrong frame'], 'the refusal')
 
 
-def test_every_parameter_that_is_settable_is_followed(estimator):
-    settable = {name for name, p in PARAMETERS['estimator'].items() if p.settable}
-    assert settable == set(estimator.estimator._setters)
-
-
 @pytest.mark.parametrize(
     ('parameters', 'error', 'expected'),
     [
@@ -235,8 +228,7 @@ def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected
 def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
     process = graph.start('estimator', robot='arm26', checkpoint=trained_file)
     graph.wait(lambda: graph.node.count_publishers('anomaly') > 0, 'the estimator')
-    status, output = process.end(signal.SIGINT)
-    graph.processes.remove(process)
+    status, output = graph.ended(process, signal.SIGINT)
     assert status == 0
     assert 'Traceback' not in output
 
@@ -246,10 +238,8 @@ def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
     [({'robot': 'no_such_arm'}, 'musashi_left_arm'), ({'anomaly_threshold': 1}, 'type')],
 )
 def test_a_wrong_parameter_is_one_clear_line(graph, parameters, expected):
-    process = graph.start('estimator', **parameters)
-    graph.processes.remove(process)
-    output, _ = process.process.communicate(timeout=300)
-    assert process.process.returncode == 1
+    status, output = graph.ended(graph.start('estimator', **parameters))
+    assert status == 1
     assert output.startswith('error: ') and output.count('\n') == 1
     assert expected in output
 

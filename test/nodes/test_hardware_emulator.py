@@ -15,7 +15,6 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.validity import read_array
 
 
@@ -180,11 +179,6 @@ def test_without_joint_sensors_there_are_no_joint_states(graph):
     graph.host(HardwareEmulator, robot='arm26', joint_sensors=False)
     graph.next('muscle_states', 10)
     assert graph.node.count_publishers('joint_states') == 0
-
-
-def test_every_parameter_that_is_settable_is_followed(arm):
-    settable = {name for name, p in PARAMETERS['hardware_emulator'].items() if p.settable}
-    assert settable == set(arm.emulator._setters)
 
 
 def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):

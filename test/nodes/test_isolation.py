@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm
-from std_msgs.msg import Bool, String, UInt8MultiArray
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
+from musculoskeletal_ae.nodes.messages import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 
@@ -78,8 +78,7 @@ def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, tr
     assert arm.controller.core.robot.isolated == (1, 2)
     # A learner's network that knows of none is told again who they are.
     count = len(graph.received['isolated_muscles'])
-    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    network.publish(bytes_message(checkpoint.to_bytes(trained['default'])))
+    graph.send_network(checkpoint.to_bytes(trained['default']))
     graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
     assert arm.estimator.core.robot.isolated == (1, 2)
 
@@ -90,8 +89,7 @@ def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
     known = replace(trained['default'].without((4,)), version=5)
     told = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
-    network = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    network.publish(bytes_message(checkpoint.to_bytes(known)))
+    graph.send_network(checkpoint.to_bytes(known))
     graph.wait(lambda: told, 'the list')
     assert told[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)

@@ -279,8 +279,7 @@ def test_a_killed_learner_goes_on_from_disk(graph, arm26, trained_file, state):
     learn(graph, arm, lambda: samples(graph) >= 4, 'samples')
     stored, version = samples(graph), versions(graph, arm26)[-1]
     worker = int(values(graph)['training process'])
-    process.end(signal.SIGKILL)
-    graph.processes.remove(process)
+    graph.ended(process, signal.SIGKILL)
     graph.received['/diagnostics'].clear()
     start(graph, checkpoint='/no/such/file', state_directory=state)
     graph.wait(lambda: samples(graph) >= stored, 'the samples of before')
@@ -338,9 +337,8 @@ def test_learning_needs_no_joint_sensors(host, graph):
 def test_two_learners_do_not_share_a_directory(graph, host, state):
     host(state_directory=state)
     second = graph.start('learner', robot='arm26', state_directory=state)
-    graph.processes.remove(second)
-    output, _ = second.process.communicate(timeout=300)
-    assert second.process.returncode == 1
+    status, output = graph.ended(second)
+    assert status == 1
     assert 'another learner' in output
     assert 'Traceback' not in output
 
@@ -349,8 +347,7 @@ def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained_f
     process = start(graph, checkpoint=trained_file, state_directory='')
     graph.wait(lambda: 'training process' in values(graph), 'the training process')
     worker = int(values(graph)['training process'])
-    status, output = process.end(signal.SIGINT)
-    graph.processes.remove(process)
+    status, output = graph.ended(process, signal.SIGINT)
     assert status == 0
     assert 'Traceback' not in output
     assert not alive(worker)

@@ -12,7 +12,12 @@ import yaml
 from graph import DEADLINE, executable
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, yaml_text
+from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.parameters import Parameter
 
 FILE = Path(__file__).resolve().parents[2] / 'config' / 'nodes.yaml'
@@ -66,6 +71,14 @@ def test_every_number_has_a_range_in_which_its_default_is(node):
             assert parameter.within is not None, name
             low, high = parameter.within
             assert low <= first <= high, name
+
+
+@pytest.mark.parametrize('kind', [Controller, Estimator, HardwareEmulator, Learner, Sim])
+def test_every_parameter_that_is_settable_is_followed(graph, monkeypatch, tmp_path, kind):
+    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
+    node = graph.host(kind, robot='arm26')
+    settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
+    assert settable - {'stop_recordings'} == set(node._setters)  # it is read at every stop
 
 
 @pytest.mark.parametrize(

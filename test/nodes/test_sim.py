@@ -10,13 +10,13 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.validity import read_array
@@ -144,11 +144,10 @@ def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, 
     graph.host(Sim, robot='arm26')
     graph.wait(lambda: 'waiting for a checkpoint' in graph.report('sim').message, 'the report')
     assert not graph.received['sim/joint_states']
-    sender = graph.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    sender.publish(bytes_message(b'not a network'))
+    graph.send_network(b'not a network')
     graph.wait(lambda: 'rejected mae_checkpoint' in str(graph.report('sim').values), 'the refusal')
     for version in (41, 42):
-        sender.publish(bytes_message(checkpoint.to_bytes(replace(mae, version=version))))
+        graph.send_network(checkpoint.to_bytes(replace(mae, version=version)))
         said = f"'checkpoint version': '{version}'"
         graph.wait(lambda said=said: said in str(graph.report('sim').values), said)
     graph.next('sim/joint_states', 3)

@@ -9,7 +9,6 @@ import signal
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from graph import DEADLINE
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -149,10 +148,8 @@ def test_no_escape_from_a_message_reaches_the_terminal(graph, capsys):
     printed = capsys.readouterr().out
     assert 'STOPPED' in printed and all(line.isprintable() for line in printed.splitlines())
     assert str(MessageError('wrong', '\x1b[2J\ud800')).isprintable()
-    process = graph.start('controller', robot='arm26\x1b[2J')
-    graph.processes.clear()
-    output, _ = process.process.communicate(timeout=DEADLINE)
-    assert process.process.returncode == 1 and '\x1b' not in output
+    code, output = graph.ended(graph.start('controller', robot='arm26\x1b[2J'))
+    assert code == 1 and '\x1b' not in output
 
 
 def test_the_status_line_waits_for_a_slow_start_and_not_for_ever(graph):
@@ -170,8 +167,6 @@ def test_what_ends_the_interpreter_says_where(graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     process = graph.start('hardware_emulator', robot='arm26')
     graph.wait(lambda: states(graph, 'hardware_emulator'), 'its diagnostics')
-    os.kill(process.process.pid, signal.SIGSEGV)
-    graph.processes.clear()
-    status, output = process.end()
+    status, output = graph.ended(process, signal.SIGSEGV)
     assert status == -signal.SIGSEGV
     assert 'Segmentation fault' in output and 'File "' in output

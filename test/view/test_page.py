@@ -121,6 +121,6 @@ def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     with visit(port, f'http://localhost:{port}') as mine:
         assert mine.recv(timeout=300)
     second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
-    output, _ = second.process.communicate(timeout=300)
-    assert second.process.returncode == 1
+    status, output = second.ended()
+    assert status == 1
     assert f'port {port} of 127.0.0.1 is in use' in output and 'Traceback' not in output
