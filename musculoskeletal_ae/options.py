@@ -150,12 +150,12 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--plot', type=Path, metavar='FILE.png', help=f'draw {text}')
 
 
-def save_plot(file: Path | None, save: Callable[[Path], None]) -> None:
-    """Save a plot, if one is wanted, and say where; an error says that it cannot be written."""
+def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
+    """Save the figure that `draw` returns, if one is wanted, and say where, or why it cannot be."""
     if file is None:
         return
     try:
-        save(file)
+        draw().savefig(file, dpi=110)
     except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
         raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
     print(f'plot: {file}')

@@ -7,6 +7,7 @@ import math
 from argparse import Namespace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def fit(args: Namespace) -> None:
         f'series_elastic: {{force: {force:.2f}, rate: {rate:.3f}, wire_stretch: {stretch:.4e}}}\n'
         f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
     )
-    save_plot(args.plot, lambda file: plot(table, constants, residual, file))
+    save_plot(args.plot, lambda: plot(table, constants, residual))
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
@@ -121,8 +122,8 @@ def write_example(args: Namespace) -> None:
     print(f'wrote {file}')
 
 
-def plot(table: Array, constants: SeriesElastic, residual: Array, file: Path) -> None:
-    """Draw the fit over tension, one curve a muscle length, and the residual."""
+def plot(table: Array, constants: SeriesElastic, residual: Array) -> Any:
+    """Return a figure of the fit over tension, one curve a muscle length, and the residual."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout='constrained')
@@ -142,4 +143,4 @@ def plot(table: Array, constants: SeriesElastic, residual: Array, file: Path) ->
         fit.legend(title='muscle length')
     rest.axhline(0.0, color='black', linewidth=0.8)
     rest.set(xlabel='tension [N]', ylabel='table − fit [mm]', title='residual')
-    figure.savefig(file, dpi=110)
+    return figure

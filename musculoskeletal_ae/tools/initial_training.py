@@ -8,6 +8,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -78,7 +79,7 @@ def train(args: Namespace) -> None:
     print(joint_table(robot, planned))
     checkpoint.save(trained.mae, args.out)
     print(f'checkpoint: {args.out}')
-    save_plot(args.plot, lambda file: plot(robot, trained, planned, file))
+    save_plot(args.plot, lambda: plot(robot, trained, planned))
 
 
 def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
@@ -174,8 +175,8 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
     return '\n'.join(['', '② → θ, mean |error| of each joint', *lines, ''])
 
 
-def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) -> None:
-    """Draw the loss, the nine errors and every joint's and muscle's error."""
+def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
+    """Return a figure of the loss, the nine errors and every joint's and muscle's error."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -220,4 +221,4 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError], file: Path) ->
         axes.xaxis.set_major_locator(MaxNLocator(4))
     handles, labels = lengths.get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside lower center', ncols=3)
-    figure.savefig(file, dpi=110)
+    return figure

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def check(args: Namespace) -> int:
     if not args.quiet:
         print(summary(robot, result, args.seed))
         print(moment_arm_table(robot, result))
-    save_plot(args.plot, lambda file: plot(robot, result, file))
+    save_plot(args.plot, lambda: plot(robot, result))
     for told in robot.description.warnings:
         print(f'warning: {told}')
     for warning in result.warnings:
@@ -125,8 +125,8 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     return '\n'.join([*lines, ''])
 
 
-def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
-    """Draw the moment arms over the range of each joint, the stiffness and the held share."""
+def plot(robot: Robot, result: RobotCheck) -> Any:
+    """Return a figure of the moment arms over each joint's range, stiffness and held share."""
     from matplotlib.figure import Figure
 
     columns = min(3, robot.joint_count + 1)
@@ -160,4 +160,4 @@ def plot(robot: Robot, result: RobotCheck, file: Path) -> None:
     for unused in axes[robot.joint_count + 1 :]:
         unused.set_axis_off()
     figure.suptitle(robot.description.directory.name)
-    figure.savefig(file, dpi=110)
+    return figure

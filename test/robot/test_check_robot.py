@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from graph import executable
-from matplotlib.figure import Figure
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 from scipy.linalg import eigh
 
@@ -93,13 +92,12 @@ def test_the_same_seed_gives_the_same_postures_and_another_seed_others():
     assert not np.array_equal(one, three)
 
 
-def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path, monkeypatch):
-    robot, figures = Robot.load(write_robot(tmp_path, slider=True)), list[Figure]()
-    monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: figures.append(figure))
-    plot(robot, check_robot(robot, 5), tmp_path / 'plot.png')
-    labels = [panel.get_xlabel() for panel in figures[0].axes[:4]]
+def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    panels = plot(robot, check_robot(robot, 5)).axes
+    labels = [panel.get_xlabel() for panel in panels[:4]]
     assert labels == ['joint angle [deg]'] * 3 + ['position [mm]']
-    assert [panel.get_ylabel() for panel in figures[0].axes[2:4]] == [
+    assert [panel.get_ylabel() for panel in panels[2:4]] == [
         'moment arm −G [mm]',
         'pull −G [%]',
     ]
