@@ -118,6 +118,11 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
     return np.array([values[name][0] if name in values else np.nan for name in joints])
 
 
+def read_names(message: Any) -> list[str]:
+    """Return the names in a String, with commas between; they may have spaces within."""
+    return [name for part in message.data.split(',') if (name := part.strip())]
+
+
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
     """Return the link and the acceleration [m/s²] (3,) of an Imu, whose frame is that link."""
     link, read = message.header.frame_id.removeprefix(prefix), message.linear_acceleration

@@ -46,7 +46,7 @@ from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
@@ -334,8 +334,7 @@ class Shell(Node):
         """Tell which muscles the estimator has isolated, places in T and l, when that changes."""
 
         def take(message: String) -> None:
-            names = filter(None, map(str.strip, message.data.split(',')))
-            muscles = tuple(sorted({*self.robot.muscle_indices(names)}))
+            muscles = tuple(sorted({*self.robot.muscle_indices(read_names(message))}))
             self.gate.isolated = self.left_out = muscles
             isolate(muscles)
 

@@ -38,7 +38,7 @@ from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.start import load
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -107,8 +107,7 @@ class View(Node):
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
             ('detected', Bool, 'anomaly_detected', LATCHED, lambda m: m.data),
-            ('isolated', String, 'isolated_muscles', LATCHED,
-             lambda m: m.data.replace(',', ' ').split()),
+            ('isolated', String, 'isolated_muscles', LATCHED, read_names),
             ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
         ]  # fmt: skip
 
