@@ -116,12 +116,11 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'as_robot': Parameter(False, 'publish joint_states and muscle_states instead of sim/…'),
     },
     'learner': {
-        **SHARED,
+        **NETWORK,
         'checkpoint': replace(
             CHECKPOINT,
             meaning='trained network to start from if no state is saved (set later: replaces it)',
         ),
-        'preset': PRESET,
         'seed': SEED,
         'joint_source': Parameter(
             'sensor',
