@@ -25,6 +25,7 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.stops import STOP, ZERO, sensor_zeros
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 DIFFERENCE = 1e-6  # [rad] or [m]
 # Where a joint slides, [rad] below are times RACK [m].
-ZERO = np.deg2rad(2.0)  # spread of the joint sensors' zeros [rad]
 #: What the body does not know is common to all samples, so that they count as no more than these
 #: in what they say of a zero; and torque and stops of joints that no sensor reads, in how much all
 #: that leaves open.
@@ -45,9 +45,9 @@ FIRST_NOISE, LEAST_NOISE = 0.002, 0.0008
 #: and the zeros of the tension sensors are common to all samples.
 TORQUE = 0.3
 LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
-#: from a limit, where a joint that muscles push there is taken to be at its stop, how many such
-#: spreads that takes, and how far such a joint is from the limit [rad]
-NEAR_STOP, PUSHED, STOP = 0.05, 3.0, 0.01
+#: from a limit, where a joint that muscles push there is taken to be at its stop [rad], and how
+#: many such spreads that takes
+NEAR_STOP, PUSHED = 0.05, 3.0
 ROUNDS = 12
 #: decrease, in variances for each length, that ends the rounds: the step was then far shorter than
 #: what the samples leave open, and the noise has settled (with ten times as much, a joint sensor
@@ -114,7 +114,9 @@ class _GroupFit:
         self._tilt = np.where(self._tilted, seen.gravity, 0.0)
         self.noise = np.full(len(muscles), FIRST_NOISE)
         self._repeated = np.maximum(1.0, self._own.sum(axis=0) / ALIKE)
-        self._zero_precision = self._repeated / (ZERO * self._radian) ** 2
+        read = np.where(self._own, seen.theta, np.nan)
+        self._zero, zero_spread = sensor_zeros(read, robot.lower, robot.upper, self._radian)
+        self._zero_precision = self._repeated / zero_spread**2
         self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
         self._near = self._radian * np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
@@ -230,7 +232,7 @@ class _GroupFit:
             + (by_stop * stop**2).sum()
             + (self._by_gravity * rows.gravity**2).sum()
             + self._precision @ rows.prior**2
-            + self._zero_precision @ zero**2
+            + self._zero_precision @ (zero - self._zero) ** 2
         )
 
     # -- one step -------------------------------------------------------------------------------
@@ -275,7 +277,7 @@ class _GroupFit:
         zeros = size + np.arange(places)
         mixed[:, np.arange(places), zeros] = own
         outer[zeros, zeros] = own.sum(axis=0) + self._zero_precision
-        right[zeros] = (own * rows.angle).sum(axis=0) - self._zero_precision * zero
+        right[zeros] = (own * rows.angle).sum(axis=0) + self._zero_precision * (self._zero - zero)
         outer[np.arange(size), np.arange(size)] += self._precision
         right[:size] += self._precision * rows.prior
 

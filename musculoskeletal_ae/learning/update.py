@@ -209,6 +209,8 @@ class BodyUpdater(Updater):
         seen = job.seen
         body = self.body = self._body_to_go_on_from(seen)
         fit = fit_body(body, seen, self._prior_mean, _estimate(self._mae, seen))
+        learned, judging = map(self._at_angles, (job.healthy.learned, job.healthy.judging))
+        job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         known, self._known = self._known, self._mean_length()
         self._trainer.move(self._known - known)
         contradicted = contradicted_muscles(seen, fit)
@@ -231,6 +233,10 @@ class BodyUpdater(Updater):
             contradicted if alone else (),
             () if alone else tuple(muscle for muscle, _ in contradicted),
         )
+
+    def _at_angles(self, read: Observations | None) -> Observations | None:
+        """Return messages with θ less what the joint sensors' zeros were found to be."""
+        return read and replace(read, theta=read.theta - self.body.zero)
 
     def _body_to_go_on_from(self, seen: Observations) -> CorrectedBody:
         """Return the body so far, unless the network's turns out to be that of another arm.

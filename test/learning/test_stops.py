@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The zeros of joint sensors, told by where the joints stop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.learning.stops import STOP, ZERO, sensor_zeros
+
+LOWER, UPPER = np.array([-0.4, -1.5, -0.8]), np.array([1.2, 0.1, 0.8])
+TRUE = np.array([0.05, -0.04, 0.0])  # zeros of the sensors [rad]
+
+
+def rests(count: int = 150, beyond: float = 0.1, seed: int = 0) -> np.ndarray:
+    """Return true θ [rad] (N, D) of an arm that is stopped at its limits."""
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(LOWER - beyond, UPPER + beyond, (count, len(LOWER)))
+    give = 0.003 * rng.exponential(size=theta.shape)
+    return np.clip(theta, LOWER - give, UPPER + give)
+
+
+def within(margin: float) -> np.ndarray:
+    """Return true θ [rad] of an arm that stays so far within its limits."""
+    return np.random.default_rng(3).uniform(LOWER + margin, UPPER - margin, (150, 3))
+
+
+def found(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
+    ones = np.ones(len(LOWER))
+    return sensor_zeros(read * radian, LOWER * radian, UPPER * radian, radian * ones)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_readings_that_pile_up_tell_the_zeros(seed):
+    noise = 0.002 * np.random.default_rng(9).standard_normal((150, 3))
+    zero, spread = found(rests(seed=seed) + TRUE + noise)
+    assert zero == pytest.approx(TRUE, abs=STOP)
+    assert (spread < 0.5 * ZERO).all()
+
+
+def test_a_sensor_whose_zero_is_right_is_left_alone():
+    zero, _ = found(rests())
+    assert zero == pytest.approx(np.zeros(3), abs=0.005)
+
+
+def test_joints_that_never_reach_a_limit_say_nothing():
+    zero, spread = found(within(0.1) + TRUE)
+    assert zero == pytest.approx(np.zeros(3), abs=0.003)
+    assert (spread > 0.5 * ZERO).all()
+
+
+def test_one_posture_near_a_limit_is_no_stop_however_often_it_is_held():
+    theta = within(0.1)
+    held = LOWER + 0.04 + 0.001 * np.random.default_rng(1).standard_normal((40, 3))
+    zero, _ = found(np.vstack([theta, held]))
+    assert zero == pytest.approx(np.zeros(3), abs=0.005)
+
+
+def test_limits_that_stop_nothing_are_not_taken_for_stops():
+    rng = np.random.default_rng(2)
+    theta = rng.uniform(LOWER - 0.1, UPPER + 0.1, (150, 3))
+    zero, _ = found(theta)
+    assert zero == pytest.approx(np.zeros(3), abs=STOP)
+
+
+def test_a_joint_that_no_sensor_reads_has_no_zero():
+    read = rests() + TRUE
+    read[:, 1] = np.nan
+    zero, spread = found(read)
+    assert zero == pytest.approx(TRUE * [1, 0, 1], abs=STOP)
+    assert np.isfinite(spread).all()
+    read[:] = np.nan
+    assert found(read[:0])[0] == pytest.approx(np.zeros(3))
+
+
+def test_joints_that_slide_are_told_by_what_counts_as_a_radian():
+    read = rests() + TRUE
+    (zero, spread), (slid, slid_spread) = found(read), found(read, 0.02)
+    assert slid == pytest.approx(0.02 * zero)
+    assert slid_spread == pytest.approx(0.02 * spread)
