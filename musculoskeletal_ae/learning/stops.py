@@ -22,7 +22,7 @@ from musculoskeletal_ae.arrays import Array
 ZERO, ZEROED = np.deg2rad(2.0), 0.003  # spread of zeros that are set roughly, or well [rad]
 STOP = 0.01  # how far stops are from the limits [rad]
 ZEROS = np.linspace(-4.0 * ZERO, 4.0 * ZERO, 281)  # that are tried [rad]
-PILED = 0.03  # π, the share of rests at a stop
+PILED = 0.06  # π, the share of rests at a stop
 WIDTH, GIVE = 0.004, 0.008  # σ of readings there, and beyond the limit, as stops give way [rad]
 BEYOND = 0.01  # density of readings beyond a limit, as a share of what it is within
 NO_STOPS = 0.1  # probability that limits are no stops
@@ -44,7 +44,7 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
 
 
 def _zero(theta: Array, j: int, lower: float, upper: float) -> tuple[float, float]:
-    own = _different(theta, j, np.minimum(theta[:, j] - lower, upper - theta[:, j]))
+    own = _different(theta, j, lower, upper)
     log = np.zeros_like(ZEROS)
     for limit, inwards in ((lower, 1.0), (upper, -1.0)):
         near = own[inwards * (own - limit) < NEAR]
@@ -62,10 +62,15 @@ def _zero(theta: Array, j: int, lower: float, upper: float) -> tuple[float, floa
     return zero, float(np.sqrt(weight @ (ZEROS - zero) ** 2))
 
 
-def _different(theta: Array, j: int, within: Array) -> Array:
-    """Return readings of joint j near its limits, one for each of many rests in one posture."""
+def _different(theta: Array, j: int, lower: float, upper: float) -> Array:
+    """Return readings of joint j near its limits, of rests that it moved to.
+
+    Of many in one posture there is one: an arm that is commanded there again is no joint stopped.
+    """
+    theta = theta[np.isfinite(theta[:, j])]
+    theta = theta[np.abs(np.diff(theta[:, j], prepend=np.inf)) > SAME]
     own, others = theta[:, j], np.delete(theta, j, axis=1)
-    kept: list[int] = []
+    within, kept = np.minimum(own - lower, upper - own), list[int]()
     for n in np.argsort(within)[: np.count_nonzero(within < NEAR)]:
         alike = np.abs(own[kept] - own[n]) < SAME
         alike &= ~(np.abs(others[kept] - others[n]) > ELSEWHERE).any(axis=1)

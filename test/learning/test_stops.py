@@ -56,6 +56,13 @@ def test_one_posture_near_a_limit_is_no_stop_however_often_it_is_held():
     assert zero == pytest.approx(np.zeros(3), abs=0.005)
 
 
+def test_a_joint_parked_near_a_limit_while_others_move_is_not_stopped():
+    theta = within(0.1)
+    theta[50:] = LOWER + 0.04 + 0.001 * theta[50:] * [1, 0, 0] + within(0.1)[50:] * [0, 1, 1]
+    zero, _ = found(theta)
+    assert zero[0] == pytest.approx(0.0, abs=0.005)
+
+
 def test_limits_that_stop_nothing_are_not_taken_for_stops():
     rng = np.random.default_rng(2)
     theta = rng.uniform(LOWER - 0.1, UPPER + 0.1, (150, 3))
