@@ -2,6 +2,7 @@
 """`python -m bench` lists the benches; `python -m bench NAME [options]` runs one.
 
 A bench is a module of this folder with a `main(argv)` that returns an exit status, or None for 0.
+What the package refuses is one line and status 1, as of a tool.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import ast
 import importlib
 import sys
 from pathlib import Path
+
+from musculoskeletal_ae.options import exit_status
 
 
 def benches() -> dict[str, str]:
@@ -34,7 +37,7 @@ def main(argv: list[str]) -> int:
     if argv[0] not in listed:
         print(f'error: no bench {argv[0]!r}; there are: {", ".join(listed)}', file=sys.stderr)
         return 2
-    return importlib.import_module(f'bench.{argv[0]}').main(argv[1:]) or 0
+    return exit_status(lambda: importlib.import_module(f'bench.{argv[0]}').main(argv[1:]))
 
 
 if __name__ == '__main__':

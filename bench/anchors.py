@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tells an arm without joint sensors where it is: stops, and a posture that somebody states.
 
-python -m bench.anchors [--robot …] [--seeds 0,1] [--minutes 10] [--folder DIR]
+python -m bench anchors [--robot …] [--seeds 0,1] [--minutes 10] [--folder DIR]
 
 One exploration teaches learners that read no joint angle. Printed is the error [rad] on the motion
 never learned from:
@@ -18,7 +18,6 @@ What a marker and an accelerometer are worth is told by `experiment sensors`.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
@@ -40,7 +39,7 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.learning import postures
 from musculoskeletal_ae.learning.learner import MARKER, NONE, Learner
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 300.0  # [s]
@@ -90,7 +89,7 @@ def measure(robot: Robot, seed: int, folder: Path, minutes: float) -> dict[str, 
     }
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print a line for each individual."""
     parser = Parser('anchors', 'What stops and a stated posture are worth without joint sensors.')
     parser.add_robot()
@@ -100,16 +99,9 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        with TemporaryDirectory() as scratch:
-            for seed in args.seeds:
-                errors = measure(robot, seed, args.folder or Path(scratch), args.minutes)
-                said = ', '.join(f'{title} {error:.4f}' for title, error in errors.items())
-                print(f'individual {seed}: {said} rad', flush=True)
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    with TemporaryDirectory() as scratch:
+        for seed in args.seeds:
+            errors = measure(robot, seed, args.folder or Path(scratch), args.minutes)
+            said = ', '.join(f'{title} {error:.4f}' for title, error in errors.items())
+            print(f'individual {seed}: {said} rad', flush=True)

@@ -16,7 +16,6 @@ their limits; ask for a stop; set a parameter to a legal value.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -162,7 +161,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
     ]
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Attack, and print the table."""
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
     parser.add_argument('--quick', action='store_true', help='two minutes of it')
@@ -193,7 +192,3 @@ def main(argv: list[str] | None = None) -> int:
         print(''.join(f'    {what[:400]}\n' for what in row.broken[:5]), end='')
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

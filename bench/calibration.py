@@ -34,7 +34,6 @@ before any learning, in rad):
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -47,7 +46,7 @@ from musculoskeletal_ae.experiments.least_squares import nominal, oracle
 from musculoskeletal_ae.experiments.recording import estimation_error, record
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 # Never used for learning.
@@ -114,7 +113,7 @@ def _line(name: str, values: Sequence[float]) -> str:
     )
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Train both presets, record the motion on every individual and print the errors."""
     parser = Parser('calibration', 'Prints how far the emulated arms are from their model.')
     parser.add_robot()
@@ -122,14 +121,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_minutes('duration of the held-out motion', 5.0)
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
-        seeds = tqdm(args.seeds, unit='individual', disable=None)
-        print(table(calibration(robot, default, paper, seeds, args.minutes)))
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
+    seeds = tqdm(args.seeds, unit='individual', disable=None)
+    print(table(calibration(robot, default, paper, seeds, args.minutes)))

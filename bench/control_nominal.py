@@ -12,8 +12,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
@@ -24,7 +22,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
@@ -180,7 +178,7 @@ def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> s
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the tables."""
     parser = Parser('control_nominal', 'What control does on the nominal body.')
     parser.add_robot()
@@ -189,13 +187,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_quick('few postures')
     args = parser.parse_args(argv)
 
-    def tables() -> None:
-        robot = Robot.load(args.robot)
-        mae, paper = (checkpoint.load(f, robot) for f in (args.checkpoint, args.paper_checkpoint))
-        print(nominal_tables(robot, mae, paper, args.quick))
-
-    return exit_status(tables)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    mae, paper = (checkpoint.load(f, robot) for f in (args.checkpoint, args.paper_checkpoint))
+    print(nominal_tables(robot, mae, paper, args.quick))

@@ -12,7 +12,6 @@ that nearly all of a motion lies inside or outside: only the mean over individua
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -34,7 +33,7 @@ from musculoskeletal_ae.learning.learner import NONE, Learner
 from musculoskeletal_ae.learning.training import Job, Training
 from musculoskeletal_ae.learning.update import make_updater
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -62,7 +61,7 @@ def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: floa
     return mae
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print a line for each individual, and the means."""
     parser = Parser('covariance', 'Whether arms without joint sensors know how wrong they are.')
     parser.add_robot()
@@ -72,23 +71,16 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
 
-    def work() -> None:
-        robot, rows = Robot.load(args.robot), list[tuple[float, float]]()
-        with TemporaryDirectory() as scratch:
-            folder = args.folder or Path(scratch)
-            folder.mkdir(parents=True, exist_ok=True)
-            driver = initial(robot, folder)
-        for seed in args.seeds:
-            arm = EmulatedArm(robot, seed)
-            mae = taught(robot, driver, arm, seed, args.minutes)
-            held_out = record(arm, driver, HELD_OUT_STREAM, HELD_OUT)
-            rows.append((estimation_error(mae, held_out), ellipsoid_share(mae, held_out)))
-            print(f'individual {seed}: {rows[-1][0]:.3f} rad, {rows[-1][1]:.3f} inside', flush=True)
-        error, inside = np.mean(rows, axis=0)
-        print(f'mean of {len(rows)}: {error:.3f} rad, {inside:.3f} inside (goal: 0.93 to 0.97)')
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot, rows = Robot.load(args.robot), list[tuple[float, float]]()
+    with TemporaryDirectory() as scratch:
+        folder = args.folder or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        driver = initial(robot, folder)
+    for seed in args.seeds:
+        arm = EmulatedArm(robot, seed)
+        mae = taught(robot, driver, arm, seed, args.minutes)
+        held_out = record(arm, driver, HELD_OUT_STREAM, HELD_OUT)
+        rows.append((estimation_error(mae, held_out), ellipsoid_share(mae, held_out)))
+        print(f'individual {seed}: {rows[-1][0]:.3f} rad, {rows[-1][1]:.3f} inside', flush=True)
+    error, inside = np.mean(rows, axis=0)
+    print(f'mean of {len(rows)}: {error:.3f} rad, {inside:.3f} inside (goal: 0.93 to 0.97)')

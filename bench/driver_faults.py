@@ -18,7 +18,7 @@ from typing import Any
 from musculoskeletal_ae.options import Parser
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print the verdicts; exit status 1 if a fault is not found by the check that it belongs to."""
     Parser('driver_faults', 'What check_driver says of drivers that err.').parse_args(argv)
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))

@@ -46,7 +46,7 @@ def margins(robot: Robot) -> tuple[float, float, float, float]:
     return max(offsets), min(slopes), max(slopes), max(doubtful)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print the margins; exit status 1 if a sound arm is found wanting."""
     Parser('driver_margins', 'How far sound arms are from their model.').parse_args(argv)
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))

@@ -11,7 +11,6 @@ more after the first five minutes, ended, or the arm did not move again.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -28,7 +27,7 @@ GROWTH = 1.05
 BROKEN, WHOLE = (1.0, 8.0), (5.0, 20.0)  # [s] that a fault lasts, and until the next
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Run, print, judge."""
     from bench.attack_graph import LENGTH, Attack
 
@@ -71,7 +70,3 @@ def main(argv: list[str] | None = None) -> int:
     for promise, cases in findings.items():
         print(f'broken: {promise}: {len(cases)} times, first: {cases[0]}')
     return int(grown or bool(findings))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -39,7 +39,7 @@ def commands() -> list[str]:
     return run
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Follow the guide; exit status 1 if a command fails or the arm does not learn."""
     Parser('first_run', 'From nothing to an arm that learns, by the guide.').parse_args(argv)
     with tempfile.TemporaryDirectory(prefix='first_run_') as folder:

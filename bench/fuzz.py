@@ -14,7 +14,6 @@ import random
 import resource
 import shutil
 import struct
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -165,7 +164,7 @@ def fuzz(count: int, seed: int) -> tuple[Counter[str], list[str], float]:
     return outcomes, failures, slowest
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print a summary; exit status 1 if there was a failure."""
     parser = Parser('fuzz', 'Damages bags at random and reads them.')
     parser.add_argument('--count', type=whole(1, 10_000_000), default=10_000, help='bags')
@@ -184,7 +183,3 @@ def main(argv: list[str] | None = None) -> int:
     )
     print('\n'.join(failures[:20]))
     return 1 if failures else 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -14,7 +14,6 @@ Exit status 1 if a healthy network was refused, or an attack was not.
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -38,7 +37,7 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLIP, TOO_TENSE, outside_limits
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
@@ -217,7 +216,7 @@ def limit(name: str) -> float:
     return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'beyond' in name else 1.0)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Measure, attack and print."""
     parser = Parser(
         'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
@@ -227,40 +226,31 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_minutes('duration of learning', 10.0)
     args = parser.parse_args(argv)
-    failed = False
-
-    def work() -> None:
-        nonlocal failed
-        torch.set_num_threads(1)
-        robot, spread = Robot.load(args.robot), Spread()
-        initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
-        networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
-        for _, mae in networks:
-            spread.take(Gate(robot), mae, 'initial')
-        for seed in args.seeds:
-            for preset, mae in initial.items():
-                arm = make_arm(robot, seed, args.reality)
-                last = learned(arm, mae, initial['default'], seed, args.minutes, spread)
-                networks.append((f'individual {seed}, {preset}', last))
-        print(f'{spread.count} healthy networks: largest of each measure, limit')
-        for name, value in spread.most.items():
-            print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
-        print(f'  {"d with a muscle cut (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
-        print('\n'.join(['refused:', *(spread.refused or ['none'])]))
-        for attack, change in ATTACKS.items():
-            passed = []
-            for name, mae in networks:
-                try:
-                    Gate(robot).check(change(mae))
-                    passed.append(name)
-                except GateError:
-                    pass
-            print(f'{attack:<30}refused {len(networks) - len(passed)} of {len(networks)}', *passed)
-            failed |= bool(passed)
-        failed |= bool(spread.refused)
-
-    return exit_status(work) or int(failed)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    torch.set_num_threads(1)
+    robot, spread = Robot.load(args.robot), Spread()
+    initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
+    networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
+    for _, mae in networks:
+        spread.take(Gate(robot), mae, 'initial')
+    for seed in args.seeds:
+        for preset, mae in initial.items():
+            arm = make_arm(robot, seed, args.reality)
+            last = learned(arm, mae, initial['default'], seed, args.minutes, spread)
+            networks.append((f'individual {seed}, {preset}', last))
+    print(f'{spread.count} healthy networks: largest of each measure, limit')
+    for name, value in spread.most.items():
+        print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
+    print(f'  {"d with a muscle cut (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
+    print('\n'.join(['refused:', *(spread.refused or ['none'])]))
+    failed = bool(spread.refused)
+    for attack, change in ATTACKS.items():
+        passed = []
+        for name, mae in networks:
+            try:
+                Gate(robot).check(change(mae))
+                passed.append(name)
+            except GateError:
+                pass
+        print(f'{attack:<30}refused {len(networks) - len(passed)} of {len(networks)}', *passed)
+        failed |= bool(passed)
+    return int(failed)

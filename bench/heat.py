@@ -8,7 +8,6 @@ An arm with the network of the geometric model explores and holds a weight in tu
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.study import Measured, Study
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HEAT_STREAM = 8000
@@ -65,7 +64,7 @@ def measure(study: Study, seed: int) -> Measured:
     return Measured(numbers, {'error': errors, 'core': core})
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the numbers of each individual."""
     parser = Parser('heat', "Prints by how much estimated windings' temperatures are off.")
     parser.add_robot()
@@ -73,18 +72,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_quick('half a minute')
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        mae = initial_mae(robot).mae
-        with tempfile.TemporaryDirectory() as folder:
-            for seed in args.seeds:
-                study = Study(robot, 'default', args.seeds, 0.0, args.quick, Path(folder))
-                checkpoint.save(mae, study.network_file('default', seed))
-                said = measure(study, seed).numbers
-                print(seed, ', '.join(f'{k} {v:.3g}' for k, v in said.items()), flush=True)
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    mae = initial_mae(robot).mae
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in args.seeds:
+            study = Study(robot, 'default', args.seeds, 0.0, args.quick, Path(folder))
+            checkpoint.save(mae, study.network_file('default', seed))
+            said = measure(study, seed).numbers
+            print(seed, ', '.join(f'{k} {v:.3g}' for k, v in said.items()), flush=True)

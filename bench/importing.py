@@ -23,7 +23,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import control, online_learning
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.importing.convert import check_verdict, import_robot
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
@@ -67,7 +67,7 @@ def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
     return cells
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the table."""
     parser = Parser('importing', 'Imports public models that you have fetched.')
     parser.add_argument('files', nargs='+', type=Path, metavar='FILE')
@@ -76,14 +76,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_minutes('duration of the exploration', 10.0)
     args = parser.parse_args(argv)
 
-    def run() -> None:
-        head = IMPORTED + LEARNED * args.learn
-        print(f'| {" | ".join(head)} |\n{"|---" * len(head)}|')
-        with tempfile.TemporaryDirectory() as folder:
-            for i, file in enumerate(args.files):
-                out = (args.out or Path(folder)) / f'{i}_{file.resolve().parent.name}_{file.stem}'
-                cells = row(file, out, args.minutes if args.learn else None)
-                cells += [''] * (len(head) - len(cells))
-                print(f'| {" | ".join(cells)} |', flush=True)
-
-    return exit_status(run)
+    head = IMPORTED + LEARNED * args.learn
+    print(f'| {" | ".join(head)} |\n{"|---" * len(head)}|')
+    with tempfile.TemporaryDirectory() as folder:
+        for i, file in enumerate(args.files):
+            out = (args.out or Path(folder)) / f'{i}_{file.resolve().parent.name}_{file.stem}'
+            cells = row(file, out, args.minutes if args.learn else None)
+            cells += [''] * (len(head) - len(cells))
+            print(f'| {" | ".join(cells)} |', flush=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kills a learner with SIGKILL at random moments and looks at what is on its disk afterwards.
 
-python -m bench.kills [--kills 50] [--seed 0]
+python -m bench kills [--kills 50] [--seed 0]
 
 A child process runs the `Learner` that the node runs, with its training process, on samples that a
 seed draws, and says when it has accepted a sample and published a network. After each kill the next
@@ -83,9 +83,8 @@ class Child:
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
         """Start it."""
-        words = [sys.executable, '-m', __spec__.name, '--robot', str(robot), '--live', str(life)]
-        words += ['--directory', str(directory), '--initial', str(initial)]
-        # Its own module, on the interpreter that runs this.
+        words = [sys.executable, '-m', 'bench', 'kills', '--robot', str(robot)]
+        words += ['--live', str(life), '--directory', str(directory), '--initial', str(initial)]
         self._process = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -168,7 +167,7 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
     return [store, more]
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Kill, and say what was lost."""
     parser = argparse.ArgumentParser(prog='bench kills', description=__doc__)
     parser.add_argument('--robot', default='arm26')
@@ -189,7 +188,3 @@ def main(argv: list[str] | None = None) -> int:
             initial = Path(folder) / 'initial.safetensors'
             checkpoint.save(initial_mae(robot).mae, initial)
         return int(bool(run(robot, Path(folder) / 'state', initial, args.kills, args.seed)))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

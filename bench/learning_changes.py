@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning under other conditions: a camera instead of joint sensors, and a body that changes.
 
-python -m bench.learning_changes [--robot …] [--seeds 0,1] [--quick]
+python -m bench learning_changes [--robot …] [--seeds 0,1] [--quick]
 
 - camera: what `joint_source: marker` learns of the same motion as `sensor`; a marker on the hand at
   33 Hz, with a camera's noise, and inverse kinematics started from the estimate.
@@ -160,7 +160,7 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str]) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(prog='bench learning_changes', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
@@ -175,7 +175,3 @@ def main(argv: list[str] | None = None) -> None:
     (muscle,) = robot.muscle_indices([args.muscle or robot.muscles[1]])
     for seed in map(int, args.seeds.split(',')):
         print(report(robot, mae, seed, muscle, args.quick), flush=True)
-
-
-if __name__ == '__main__':
-    main()

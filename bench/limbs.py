@@ -11,14 +11,13 @@ torso. Every number is chosen. Pairs beyond the first hang below it, on the same
 from __future__ import annotations
 
 import csv
-import sys
 from math import cos, radians, sin
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.files import read_yaml
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.entries import refusal
 
@@ -210,14 +209,10 @@ def write_body(name: str, out: Path) -> Path:
     return out
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Write a body."""
     parser = Parser('limbs', 'Writes a body of several limbs as a robot directory.')
     parser.add_argument('body', choices=BODIES, nargs='?', default='17x40')
     parser.add_argument('out', type=Path, metavar='DIR')
     args = parser.parse_args(argv)
-    return exit_status(lambda: print(write_body(args.body, args.out)))
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    print(write_body(args.body, args.out))

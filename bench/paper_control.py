@@ -13,7 +13,6 @@ true body; the arm goes to a start with `first`, on to the target, and is read a
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,7 +40,7 @@ from musculoskeletal_ae.mae.descent import Term, descend
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 TARGETS, STARTS = 5, 2
@@ -183,7 +182,7 @@ def table(rows: list[dict[str, tuple[float, float]]]) -> str:
     return '\n'.join([*lines, f'| least ‖T‖ that holds θ_eval | | {mean["bound"][1]:.0f} | |'])
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the table."""
     parser = Parser('paper_control', 'Readings of the paper’s `proposed`.')
     parser.add_robot()
@@ -193,20 +192,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_quick('one target and start')
     args = parser.parse_args(argv)
 
-    def measure() -> None:
-        robot, rows = Robot.load(args.robot), []
-        with TemporaryDirectory() as folder:
-            study = Study(
-                robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder), args.reality
-            )
-            checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
-            for seed in args.seeds:
-                rows.append(individual(study, seed))
-                print(f'individual {seed}\n{table(rows[-1:])}\n', flush=True)
-        print(f'individuals {", ".join(map(str, args.seeds))}\n{table(rows)}')
-
-    return exit_status(measure)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot, rows = Robot.load(args.robot), []
+    with TemporaryDirectory() as folder:
+        study = Study(
+            robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder), args.reality
+        )
+        checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
+        for seed in args.seeds:
+            rows.append(individual(study, seed))
+            print(f'individual {seed}\n{table(rows[-1:])}\n', flush=True)
+    print(f'individuals {", ".join(map(str, args.seeds))}\n{table(rows)}')

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -27,7 +26,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status, number
+from musculoskeletal_ae.options import Parser, number
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -185,7 +184,7 @@ def machine() -> str:
     return f'{os.cpu_count()} cores of {", ".join(sorted(names)) or platform.machine()}'
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
@@ -194,22 +193,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(ARM)
-        with tempfile.TemporaryDirectory() as folder:
-            training, update, network = learning(robot, Path(folder))
-            start, shared = starting(network)
-            page = PAGE.format(
-                day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
-                wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared,
-                training=training, update=update,
-                flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
-            )  # fmt: skip
-        args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / 'performance.md').write_text(page, encoding='utf-8')
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(ARM)
+    with tempfile.TemporaryDirectory() as folder:
+        training, update, network = learning(robot, Path(folder))
+        start, shared = starting(network)
+        page = PAGE.format(
+            day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
+            wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared,
+            training=training, update=update,
+            flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
+        )  # fmt: skip
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / 'performance.md').write_text(page, encoding='utf-8')

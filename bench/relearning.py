@@ -15,7 +15,6 @@ new samples; `whole` is what the learner of all muscles had from the beginning.
 from __future__ import annotations
 
 import copy
-import sys
 import tempfile
 from itertools import count
 from pathlib import Path
@@ -33,7 +32,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 OFFSET = 0.020  # [m]
@@ -122,7 +121,7 @@ def report(robot: Robot, seed: int, muscles: list[int], quick: bool) -> str:
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the tables."""
     parser = Parser('relearning', 'Prints what a re-tied and an added muscle cost.')
     parser.add_robot()
@@ -131,13 +130,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_quick('three minutes instead of ten')
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot, muscles = Robot.load(args.robot), [*map(int, args.muscles.split(','))]
-        for seed in args.seeds:
-            print(report(robot, seed, muscles, args.quick), flush=True)
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot, muscles = Robot.load(args.robot), [*map(int, args.muscles.split(','))]
+    for seed in args.seeds:
+        print(report(robot, seed, muscles, args.quick), flush=True)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import resource
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -43,7 +42,7 @@ from musculoskeletal_ae.learning.training import Job
 from musculoskeletal_ae.learning.update import make_updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import random_states
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
@@ -162,7 +161,7 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
     draw(rows, out / 'scaling.png')
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Measure bodies."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
     text = f'of {", ".join((SMALLEST, *BODIES))}'
@@ -172,8 +171,4 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_out('DIR', 'networks, rows and plot')
     args = parser.parse_args(argv)
-    return exit_status(lambda: run(args.bodies, args.minutes, args.out))
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    run(args.bodies, args.minutes, args.out)

@@ -28,7 +28,6 @@ With the middles of the ranges, and half of the wires without kinks, eight of th
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -54,7 +53,7 @@ from musculoskeletal_ae.experiments.roles import shoulder
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status, names
+from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -114,7 +113,7 @@ def true_lengths(arm: ForeignArm, theta: Array) -> Array:
     )
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Train both presets, measure every individual and print the table."""
     parser = Parser('second_body', 'Prints how the second body compares with Musashi.')
     parser.add_robot()
@@ -123,28 +122,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--off', type=names, default=[], metavar='EFFECT,…', help='without these')
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        try:
-            effects = replace(Effects(), **dict.fromkeys(args.off, 0.0))
-        except TypeError as error:
-            raise MusculoskeletalError(f'--off: {error}') from error
-        default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
-        print(HEAD)
-        rows = []
-        for seed in tqdm(args.seeds, unit='individual', disable=None):
-            rows.append(measured(robot, default, paper, seed, effects, 0.1 if args.quick else 1.0))
-            print(line(str(seed), rows[-1]), flush=True)
-        print(line('mean', Row(*np.mean(rows, axis=0))), PAPER, sep='\n')
-
-    return exit_status(work)
+    robot = Robot.load(args.robot)
+    try:
+        effects = replace(Effects(), **dict.fromkeys(args.off, 0.0))
+    except TypeError as error:
+        raise MusculoskeletalError(f'--off: {error}') from error
+    default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
+    print(HEAD)
+    rows = []
+    for seed in tqdm(args.seeds, unit='individual', disable=None):
+        rows.append(measured(robot, default, paper, seed, effects, 0.1 if args.quick else 1.0))
+        print(line(str(seed), rows[-1]), flush=True)
+    print(line('mean', Row(*np.mean(rows, axis=0))), PAPER, sep='\n')
 
 
 def line(name: str, row: Row) -> str:
     """Return a line of the table."""
     text = f'{name:>4}{row.least_squares:21.3f}{row.off:12.0f}'
     return text + f'{row.before:21.3f}{row.after:7.3f}{row.simulated:15.0f}{row.refused:9.2f}'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

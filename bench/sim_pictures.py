@@ -9,7 +9,6 @@ makes the same picture.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -56,7 +55,7 @@ def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
     return files
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Write both pictures."""
     parser = Parser('sim_pictures', 'Pictures of the simulated arm: at rest, and loaded.')
     parser.add_robot()
@@ -64,12 +63,5 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('DIR', default=Path('doc'))
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        print(*save_both(robot, checkpoint.load(args.checkpoint, robot), args.out), sep='\n')
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    print(*save_both(robot, checkpoint.load(args.checkpoint, robot), args.out), sep='\n')

@@ -13,7 +13,6 @@ which, unlike the emulated arm, can hold joints fast.
 
 from __future__ import annotations
 
-import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from musculoskeletal_ae.emulator.mechanics import STOP_STIFFNESS
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -232,7 +231,7 @@ def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:
         print_responses(robot, mae, preset)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the measurements for a checkpoint."""
     parser = Parser('simulation_nominal', 'The simulator beside the nominal body.')
     parser.add_robot()
@@ -241,12 +240,5 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_quick('fewer commands')
     args = parser.parse_args(argv)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)

@@ -17,7 +17,6 @@ than one and a half of that in the first.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
@@ -106,7 +105,7 @@ def judged(worst: float, filled: float, most: float, times: list[float]) -> list
     return problems
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Run the soak."""
     parser = argparse.ArgumentParser(prog='bench soak', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
@@ -167,7 +166,3 @@ def main(argv: list[str] | None = None) -> int:
     problems = judged(worst, filled, most, training.seconds)
     print('; '.join(problems) or 'all within what is tolerated')
     return int(bool(problems))
-
-
-if __name__ == '__main__':
-    sys.exit(main())

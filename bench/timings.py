@@ -27,7 +27,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -313,10 +313,10 @@ def show(robot: Robot, preset: str) -> None:
         print(f'{row.name:<42}{"".join(told)}')
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Measure on one robot with one preset."""
     parser = Parser('timings', 'Times each step of the core beside the same in plain torch.')
     parser.add_robot()
     parser.add_preset()
     args = parser.parse_args(argv)
-    return exit_status(lambda: show(Robot.load(args.robot), args.preset))
+    show(Robot.load(args.robot), args.preset)

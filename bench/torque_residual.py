@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does the torque balance at rest, g(θ) + G(θ)ᵀ T = 0, hold for what was learned, and add to it?
 
-python -m bench.torque_residual [--robot …] [--seeds 0,1] [--minutes 10]
+python -m bench torque_residual [--robot …] [--seeds 0,1] [--minutes 10]
 
 (PIMBS learns a body image from this residual at rest.) For the samples of an exploration it prints
 the residual with the true G, with that of the learned body and with the geometric model's, and how
@@ -12,7 +12,6 @@ the lengths have told G already, and far more exactly than the torques could.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 FITS = 3  # each goes on fitting from where the last one ended
@@ -62,7 +61,7 @@ def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
     return '\n'.join(lines)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> None:
     """Print the table."""
     parser = Parser('torque_residual', 'The torque balance at rest of what was learned.')
     parser.add_robot()
@@ -72,14 +71,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
 
-    def work() -> None:
-        robot = Robot.load(args.robot)
-        mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
-        for seed in args.seeds:
-            print(table(robot, mae, seed, args.minutes), flush=True)
-
-    return exit_status(work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    robot = Robot.load(args.robot)
+    mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
+    for seed in args.seeds:
+        print(table(robot, mae, seed, args.minutes), flush=True)

@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 GOALS = {'wrench_error': 0.2, 'wrench_error_deg': 15.0, 'false_contacts': 0, 'collision_s': 0.1}
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print the numbers; exit status 0 if their means meet the goals."""
     parser = argparse.ArgumentParser(prog='bench touch', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')

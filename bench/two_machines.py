@@ -233,7 +233,8 @@ def learn(initial: Path, minutes: float, seed: int, bad: tuple[float, float, flo
             node(arm, 'estimator', robot=ROBOT, checkpoint=initial)
             node(arm, 'controller', robot=ROBOT, checkpoint=initial, explore='true')
             node(far, 'learner', robot=ROBOT, checkpoint=initial, state_directory=state)
-            observer = start(arm, '-m', 'bench.two_machines', '--observe', output=subprocess.PIPE)
+            watch = '-m', 'bench', 'two_machines', '--observe'
+            observer = start(arm, *watch, output=subprocess.PIPE)
             end = math.inf
             for line in observer.stdout or ():
                 now, seen = time.monotonic(), json.loads(line)
@@ -264,7 +265,7 @@ def learn(initial: Path, minutes: float, seed: int, bad: tuple[float, float, flo
     )
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Compare learning across both links."""
     if argv == ['--observe']:
         return observe()
@@ -304,7 +305,3 @@ def main(argv: list[str] | None = None) -> int:
     for fault, there in faults.items():
         print(f'{fault}: {"YES" if there else "no"}')
     return int(any(faults.values()))
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """False alarms and cut muscles in postures held out of learning.
 
-python -m bench.unfamiliar [--robot …] [--seeds 0,1,2,3,4] [--minutes 4] [--folder DIR] [--out FILE]
+python -m bench unfamiliar [--robot …] [--seeds 0,1,2,3,4] [--minutes 4] [--folder DIR] [--out FILE]
 
 Each individual learns a few minutes with one joint (another for each individual) in the lower 60 %
 of its range. Then it moves an hour, over all individuals, through all postures with the upper 40 %
@@ -202,7 +202,7 @@ def measure(
     return {**result, 'at rest': at_rest(robot, seed, mae, RESTS)}
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print the table; exit status 0 if the goals are met."""
     parser = argparse.ArgumentParser(prog='bench unfamiliar', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')

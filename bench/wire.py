@@ -208,7 +208,7 @@ def systems(
                     system.end()
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Measure every combination and print a table."""
     parser = Parser('wire', (__doc__ or '').partition('\n')[0])
     parser.add_argument('--robots', default='arm26,musashi_left_arm', help='names or directories')
@@ -222,7 +222,3 @@ def main(argv: list[str] | None = None) -> int:
         for rate, kind, wire in systems(robot, rates, kinds, args.seconds):
             print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<18}{wire}', flush=True)
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Length zeros found after power-on: with joint sensors, without, and in a stated posture.
 
-python -m bench.zeroing [--robot …] [--seeds 0,1,2,3,4] [--folder DIR] [--out FILE]
+python -m bench zeroing [--robot …] [--seeds 0,1,2,3,4] [--folder DIR] [--out FILE]
 
 An individual that learned for ten minutes is switched off and on: it hangs, and every length sensor
 reads 50–130 mm too much or too little. Estimator and controller run as their nodes do. Printed is
@@ -131,7 +131,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     }
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str]) -> int:
     """Print the table; exit status 0 if every individual meets the goals."""
     parser = argparse.ArgumentParser(prog='bench zeroing', description=__doc__)
     parser.add_argument('--robot', default='musashi_left_arm')
