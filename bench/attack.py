@@ -164,7 +164,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
 def main(argv: list[str]) -> int:
     """Attack, and print the table."""
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
-    parser.add_argument('--quick', action='store_true', help='two minutes of it')
+    parser.add_quick('two minutes of it')
     parser.add_argument('--messages', type=whole(1, 10_000_000), help='instead of 100 000')
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')

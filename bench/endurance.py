@@ -19,7 +19,7 @@ import numpy as np
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, number, whole
+from musculoskeletal_ae.options import Parser, number
 from musculoskeletal_ae.robot.robot import Robot
 
 SETTLED, WINDOW = 300.0, 60.0  # [s] until memory is compared, and over which it is averaged
@@ -34,7 +34,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('endurance', (__doc__ or '').partition('\n')[0])
     parser.add_argument('--minutes', type=number(6.0, 6000.0), default=60.0, help='how long')
     parser.add_argument('--rate', type=number(10.0, 1000.0), default=200.0, help='of messages [Hz]')
-    parser.add_argument('--seed', type=whole(0, 2**31), default=0, help='of the faults')
+    parser.add_seed('of the faults')
     args = parser.parse_args(argv)
     largest = 0.0
     with tempfile.TemporaryDirectory() as name:

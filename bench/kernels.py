@@ -7,13 +7,14 @@ each combination that this processor can run must pass, whatever it picks by its
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from musculoskeletal_ae.options import Parser
 
 BLAS = ('Haswell', 'SkylakeX', 'Zen', 'Prescott')
 TORCH = ('default', 'avx2')
@@ -28,7 +29,7 @@ def runs(environment: dict[str, str]) -> bool:
 
 def main(argv: list[str]) -> int:
     """Run pytest once for each combination; return how many failed."""
-    parser = argparse.ArgumentParser('bench kernels', description=__doc__.splitlines()[0])
+    parser = Parser('kernels', 'Runs the tests with the arithmetic of other machines.')
     parser.add_argument('--blas', nargs='+', default=BLAS, help='values of OPENBLAS_CORETYPE')
     parser.add_argument('--torch', nargs='+', default=TORCH, help='of ATEN_CPU_CAPABILITY')
     options, pytest = parser.parse_known_args(argv)

@@ -29,6 +29,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 6.0  # [s] until a child is killed: it starts, trains and saves within
@@ -169,10 +170,10 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
 
 def main(argv: list[str]) -> int:
     """Kill, and say what was lost."""
-    parser = argparse.ArgumentParser(prog='bench kills', description=__doc__)
-    parser.add_argument('--robot', default='arm26')
-    parser.add_argument('--kills', type=int, default=50)
-    parser.add_argument('--seed', type=int, default=0, help='of the moments')
+    parser = Parser('kills', 'Kills a learner at random moments: is anything lost?')
+    parser.add_robot(default='arm26')
+    parser.add_argument('--kills', type=int, default=50, help='how many')
+    parser.add_seed('of the moments')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
     parser.add_argument('--live', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--directory', type=Path, help=argparse.SUPPRESS)

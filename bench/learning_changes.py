@@ -15,7 +15,6 @@ a learner that starts over; `told` is a learner whose `relearn_muscles` names th
 
 from __future__ import annotations
 
-import argparse
 import copy
 from pathlib import Path
 from typing import NamedTuple
@@ -40,6 +39,7 @@ from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -162,16 +162,16 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
 
 def main(argv: list[str]) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog='bench learning_changes', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0', help='individuals')
+    parser = Parser('learning_changes', 'Learning by a camera, and of a body that changes.')
+    parser.add_robot()
+    parser.add_seeds((0,))
     parser.add_argument('--muscle', help='name of the one that changes; the second by default')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
-    parser.add_argument('--quick', action='store_true', help='a minute instead of ten')
+    parser.add_quick('a minute instead of ten')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
     mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
     (muscle,) = robot.muscle_indices([args.muscle or robot.muscles[1]])
-    for seed in map(int, args.seeds.split(',')):
+    for seed in args.seeds:
         print(report(robot, mae, seed, muscle, args.quick), flush=True)

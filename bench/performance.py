@@ -26,7 +26,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, number
+from musculoskeletal_ae.options import Parser, names, number
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -188,7 +188,7 @@ def main(argv: list[str]) -> None:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
-    parser.add_argument('--robots', default=SIZES, help='at the wire: names or directories')
+    parser.add_argument('--robots', type=names, default=SIZES, help='of the wire, or directories')
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
@@ -199,7 +199,7 @@ def main(argv: list[str]) -> None:
         start, shared = starting(network)
         page = PAGE.format(
             day=date.today().isoformat(), machine=machine(), arm=ARM, core=core(robot),  # noqa: DTZ011
-            wire=wire(args.robots.split(','), args.seconds), start=start, shared=shared,
+            wire=wire(args.robots, args.seconds), start=start, shared=shared,
             training=training, update=update,
             flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
         )  # fmt: skip

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import copy
 import tempfile
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.options import Parser, seeds
 from musculoskeletal_ae.robot.robot import Robot
 
 OFFSET = 0.020  # [m]
@@ -76,7 +77,7 @@ def learned(learner: Learner, after: Recording, held_out: Recording, start: floa
     return errors
 
 
-def report(robot: Robot, seed: int, muscles: list[int], quick: bool) -> str:
+def report(robot: Robot, seed: int, muscles: Sequence[int], quick: bool) -> str:
     """Return the tables of one individual."""
     minutes, held_out = (3.0, 30.0) if quick else (10.0, HELD_OUT_TIME)
     mae, steps = initial_mae(robot, 'default').mae, len(NEW)
@@ -126,10 +127,10 @@ def main(argv: list[str]) -> None:
     parser = Parser('relearning', 'Prints what a re-tied and an added muscle cost.')
     parser.add_robot()
     parser.add_seeds((0, 1))
-    parser.add_argument('--muscles', default='2', help='numbers of muscles, from 0')
+    parser.add_argument('--muscles', type=seeds, default='2', help='their numbers, from 0')
     parser.add_quick('three minutes instead of ten')
     args = parser.parse_args(argv)
 
-    robot, muscles = Robot.load(args.robot), [*map(int, args.muscles.split(','))]
+    robot = Robot.load(args.robot)
     for seed in args.seeds:
-        print(report(robot, seed, muscles, args.quick), flush=True)
+        print(report(robot, seed, args.muscles, args.quick), flush=True)

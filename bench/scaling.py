@@ -42,7 +42,7 @@ from musculoskeletal_ae.learning.training import Job
 from musculoskeletal_ae.learning.update import make_updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import random_states
-from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
@@ -165,9 +165,7 @@ def main(argv: list[str]) -> None:
     """Measure bodies."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
     text = f'of {", ".join((SMALLEST, *BODIES))}'
-    parser.add_argument(
-        '--bodies', type=lambda t: t.split(','), default=[SMALLEST, *BODIES], help=text
-    )
+    parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_out('DIR', 'networks, rows and plot')
     args = parser.parse_args(argv)

@@ -16,7 +16,6 @@ than one and a half of that in the first.
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from musculoskeletal_ae.learning.training import Job, Training
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 PART = 300.0  # [s] of robot time that is recorded and learned at once
@@ -107,15 +107,15 @@ def judged(worst: float, filled: float, most: float, times: list[float]) -> list
 
 def main(argv: list[str]) -> int:
     """Run the soak."""
-    parser = argparse.ArgumentParser(prog='bench soak', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
+    parser = Parser('soak', 'Learns for a day: do error, memory and time stay down?')
+    parser.add_robot()
     parser.add_argument('--hours', type=float, default=24.0, help='of robot time')
-    parser.add_argument('--quick', action='store_true', help='two hours, to try things out')
+    parser.add_quick('two hours, to try things out')
     parser.add_argument('--every', type=int, default=20, help='samples between updates')
     parser.add_argument('--creep', type=float, default=0.0, help='of every wire [mm/h]')
     parser.add_argument('--moving', type=float, default=PART, help='of every five minutes [s]')
     parser.add_argument('--steps', type=int, default=STEPS, help='of training per update')
-    parser.add_argument('--seed', type=int, default=0, help='which individual')
+    parser.add_seed('of the individual')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)

@@ -9,7 +9,6 @@ Individuals that learned for ten minutes (`learned_arm`); what is measured is in
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from musculoskeletal_ae.experiments.results import combined
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.experiments.touch import forces, measure
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 GOALS = {'wrench_error': 0.2, 'wrench_error_deg': 15.0, 'false_contacts': 0, 'collision_s': 0.1}
@@ -28,24 +28,24 @@ GOALS = {'wrench_error': 0.2, 'wrench_error_deg': 15.0, 'false_contacts': 0, 'co
 
 def main(argv: list[str]) -> int:
     """Print the numbers; exit status 0 if their means meet the goals."""
-    parser = argparse.ArgumentParser(prog='bench touch', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
-    parser.add_argument('--minutes', type=float, default=10.0, help='of learning')
+    parser = Parser('touch', 'Pushes felt, collisions, false contacts, and the floating arm.')
+    parser.add_robot()
+    parser.add_seeds((0, 1, 2, 3, 4))
+    parser.add_minutes('duration of learning', 10.0)
     parser.add_argument('--folder', type=Path, default=Path('bench_touch'), help='what was learned')
-    parser.add_argument('--quick', action='store_true', help='a tenth of it')
+    parser.add_quick('a tenth of it')
     parser.add_argument('--out', type=Path, help='JSON file of the numbers; a plot beside it')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    robot, seeds = Robot.load(args.robot), tuple(map(int, args.seeds.split(',')))
-    study, rows = Study(robot, 'default', seeds, args.minutes, args.quick, args.folder), {}
-    for seed in seeds:
+    robot, rows = Robot.load(args.robot), {}
+    study = Study(robot, 'default', args.seeds, args.minutes, args.quick, args.folder)
+    for seed in args.seeds:
         learned = learned_arm(robot, seed, args.folder, args.minutes)
         checkpoint.save(learned.mae, study.network_file('default', seed))
         rows[seed] = measure(study, seed)
         print(seed, json.dumps(rows[seed].numbers), flush=True)
     result = combined(study, rows)
-    print(json.dumps({key: result[key] for key in rows[seeds[0]].numbers}, indent=1))
+    print(json.dumps({key: result[key] for key in rows[args.seeds[0]].numbers}, indent=1))
     if args.out:
         args.out.write_text(json.dumps(result, indent=1) + '\n')
         forces(study, rows)[0].savefig(args.out.with_suffix('.png'), dpi=DPI)

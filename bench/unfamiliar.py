@@ -15,7 +15,6 @@ of the true body at rest anywhere, and at all joint limits at once, where motion
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -43,6 +42,7 @@ from musculoskeletal_ae.experiments.detection import (
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, record, rows_between
 from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 LEARNED = 0.6  # of the range of the joint
@@ -204,10 +204,10 @@ def measure(
 
 def main(argv: list[str]) -> int:
     """Print the table; exit status 0 if the goals are met."""
-    parser = argparse.ArgumentParser(prog='bench unfamiliar', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
-    parser.add_argument('--minutes', type=float, default=4.0, help='of learning')
+    parser = Parser('unfamiliar', 'False alarms and cut muscles in postures held out of learning.')
+    parser.add_robot()
+    parser.add_seeds((0, 1, 2, 3, 4))
+    parser.add_minutes('duration of learning', 4.0)
     parser.add_argument('--healthy', type=float, default=HEALTHY, help='seconds, over all of them')
     parser.add_argument('--rounds', type=int, default=2, help='in which all muscles are cut')
     parser.add_argument('--folder', type=Path, default=Path('bench_unfamiliar'))
@@ -215,9 +215,8 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, rows = Robot.load(args.robot), dict[str, Any]()
-    seeds = [int(seed) for seed in args.seeds.split(',')]
-    for seed in seeds:
-        part = args.healthy / len(seeds)
+    part = args.healthy / len(args.seeds)
+    for seed in args.seeds:
         rows[str(seed)] = measure(robot, seed, args.folder, args.minutes, part, args.rounds)
         print(f'individual {seed}: {json.dumps(rows[str(seed)])}', flush=True)
         if args.out:

@@ -10,7 +10,6 @@ looks, and at most 0.5 % while nobody does.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import threading
@@ -25,6 +24,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 from bench.wire import cpu
 from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.view import ARM_TOPICS
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 MOST, MOST_IDLE = 0.10, 0.005  # of a core
@@ -90,9 +90,9 @@ def visit(ended: threading.Event) -> int:
 
 def main(argv: list[str]) -> int:
     """Measure."""
-    parser = argparse.ArgumentParser('bench view', description=__doc__)
-    parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--robot', default='musashi_left_arm')
+    parser = Parser('view', 'What the page costs.')
+    parser.add_argument('--seconds', type=float, default=20.0, help='of each')
+    parser.add_robot()
     options = parser.parse_args(argv)
     start = 'import sys; from musculoskeletal_ae.nodes.view import main; sys.exit(main({}))'
     arguments = ['--robot', options.robot, '--port', str(PORT)]

@@ -33,7 +33,7 @@ import numpy as np
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, number, whole
+from musculoskeletal_ae.options import Parser, names, number, numbers, whole
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
@@ -208,17 +208,16 @@ def systems(
                     system.end()
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str]) -> None:
     """Measure every combination and print a table."""
     parser = Parser('wire', (__doc__ or '').partition('\n')[0])
-    parser.add_argument('--robots', default='arm26,musashi_left_arm', help='names or directories')
-    parser.add_argument('--rates', default='100,200,500', help='of messages [Hz]')
+    robots = 'arm26,musashi_left_arm'
+    parser.add_argument('--robots', type=names, default=robots, help='names or directories')
+    parser.add_argument('--rates', type=numbers, default='100,200,500', help='of messages [Hz]')
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='each takes')
     parser.add_argument('--repeat', type=whole(1, 100), default=1, help='so many times')
     args = parser.parse_args(argv)
     print('latency [ms]: 50 %, 99 %, largest; late and missed messages [%]; CPU [% of a core]')
-    for robot in args.robots.split(','):
-        rates, kinds = map(float, args.rates.split(',')), [*KINDS] * args.repeat
-        for rate, kind, wire in systems(robot, rates, kinds, args.seconds):
+    for robot in args.robots:
+        for rate, kind, wire in systems(robot, args.rates, [*KINDS] * args.repeat, args.seconds):
             print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<18}{wire}', flush=True)
-    return 0

@@ -13,7 +13,6 @@ stay untouched, so that nothing else learned can be lost.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 LEAST, MOST = 0.05, 0.13  # [m]
@@ -133,9 +133,9 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 def main(argv: list[str]) -> int:
     """Print the table; exit status 0 if every individual meets the goals."""
-    parser = argparse.ArgumentParser(prog='bench zeroing', description=__doc__)
-    parser.add_argument('--robot', default='musashi_left_arm')
-    parser.add_argument('--seeds', default='0,1,2,3,4', help='individuals')
+    parser = Parser('zeroing', 'Length zeros found after power-on.')
+    parser.add_robot()
+    parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_argument(
         '--folder', type=Path, default=Path('bench_zeroing'), help='what was learned'
     )
@@ -143,7 +143,7 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, numbers, passed = Robot.load(args.robot), dict[str, Any](), True
-    for seed in map(int, args.seeds.split(',')):
+    for seed in args.seeds:
         learned = learned_arm(robot, seed, args.folder, MINUTES)
         arm = EmulatedArm(robot, seed)
         held_out = record(arm, learned.driver, HELD_OUT_STREAM, HELD_OUT)
