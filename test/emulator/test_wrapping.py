@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import slopes
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -17,14 +18,9 @@ def test_true_jacobian_is_the_derivative_of_true_lengths(name):
     robot = Robot.load(name)
     body = Individual(robot, 3, Spread(wrap=0.9))
     theta = robot.random_postures(20, np.random.default_rng(0))
-    jacobian = body.muscle_jacobian(theta)
-    step = 1e-6
-    for joint in range(robot.joint_count):
-        shift = step * np.eye(robot.joint_count)[joint]
-        up, down = body.absolute_lengths(theta + shift), body.absolute_lengths(theta - shift)
-        # A posture within `step` of touching a bone has no derivative there: allow one in twenty.
-        error = np.abs((up - down) / (2 * step) - jacobian[:, :, joint]).max(axis=1)
-        assert np.sum(error > 1e-6) <= 1
+    off = np.abs(slopes(body.absolute_lengths, theta) - body.muscle_jacobian(theta))
+    # A posture within a step of touching a bone has no derivative there: allow one in twenty.
+    assert (np.sum(off.max(axis=1) > 1e-6, axis=0) <= 1).all()
 
 
 def test_the_nominal_body_is_the_geometric_model():

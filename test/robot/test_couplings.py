@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from differences import slopes
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -34,25 +35,19 @@ def energy(robot, theta):
     return pin.computePotentialEnergy(kin.model, kin.data, kin.tree_angles(theta))
 
 
-def slope(function, theta, step=1e-6):
-    shifts = step * np.eye(len(theta))
-    ends = [function(theta + d) - function(theta - d) for d in shifts]
-    return np.stack(ends, axis=-1) / (2 * step)
-
-
 def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
     kin = robot.kinematics
     assert robot.joints == ('bend', 'lift', 'swing')
     for theta in robot.random_postures(4, np.random.default_rng(0)):
         assert kin.tree_angles(theta).shape == (4,)
-        gravity = slope(lambda t: np.array(energy(robot, t)), theta)
+        gravity = slopes(lambda t: energy(robot, t), theta)
         np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
-        gradient = slope(kin.holding_torque, theta)
+        gradient = slopes(kin.holding_torque, theta)
         np.testing.assert_allclose(kin.gravity_gradient(theta), gradient, atol=1e-5)
         load, load_slope = Load(kin)(theta[None])
         np.testing.assert_allclose(load[0], kin.holding_torque(theta), atol=1e-9)
         np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)
-        lengths = slope(robot.routes.absolute_lengths, theta)
+        lengths = slopes(robot.routes.absolute_lengths, theta)
         np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), lengths, atol=1e-7)
         inertia = pin.crba(kin.model, kin.data, kin.tree_angles(theta))
         whole = kin.transmission.T @ (np.triu(inertia) + np.triu(inertia, 1).T) @ kin.transmission

@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from differences import slopes
 from robots import JOINTS, write_robot
 
 from musculoskeletal_ae.robot.robot import Robot
@@ -36,24 +37,19 @@ def test_batched_points_are_where_pinocchio_puts_them(robot):
 def test_holding_torque_is_the_gradient_of_potential_energy(robot):
     model = robot.description.model
     data = model.createData()
-    step = 1e-6
+
+    def energy(theta):
+        return pin.computePotentialEnergy(model, data, full_configuration(robot, theta))
+
     for theta in robot.random_postures(5, np.random.default_rng(2)):
-        energy = [
-            [
-                pin.computePotentialEnergy(model, data, full_configuration(robot, theta + d))
-                for d in (step * unit, -step * unit)
-            ]
-            for unit in np.eye(robot.joint_count)
-        ]
-        gradient = [(up - down) / (2 * step) for up, down in energy]
+        gradient = slopes(energy, theta)
         np.testing.assert_allclose(robot.kinematics.holding_torque(theta), gradient, atol=1e-6)
 
 
 def test_gravity_gradient_is_the_derivative_of_the_holding_torque(robot):
-    kin, step = robot.kinematics, 1e-5
+    kin = robot.kinematics
     for theta in robot.random_postures(5, np.random.default_rng(8)):
-        ahead, behind = (kin.holding_torque(theta + s * step * np.eye(len(theta))) for s in (1, -1))
-        expected = (ahead - behind).T / (2 * step)
+        expected = slopes(kin.holding_torque, theta, 1e-5)
         np.testing.assert_allclose(kin.gravity_gradient(theta), expected, atol=1e-7)
         np.testing.assert_allclose(expected, expected.T, atol=1e-7)  # it has a potential
 

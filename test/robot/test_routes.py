@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+from differences import slopes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,19 +12,9 @@ from musculoskeletal_ae.robot.robot import Robot
 MUSASHI = Robot.load('musashi_left_arm')
 
 
-def differences(function, theta, step):
-    return np.stack(
-        [
-            (function(theta + d) - function(theta - d)) / (2 * step)
-            for d in step * np.eye(len(theta))
-        ],
-        axis=-1,
-    )
-
-
 def test_muscle_jacobian_is_the_derivative_of_length(robot):
     for theta in robot.random_postures(10, np.random.default_rng(0)):
-        expected = differences(robot.routes.absolute_lengths, theta, 1e-6)
+        expected = slopes(robot.routes.absolute_lengths, theta)
         np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), expected, atol=1e-8)
 
 
@@ -31,7 +22,7 @@ def test_muscle_jacobian_is_the_derivative_of_length(robot):
 @given(st.lists(st.floats(-3.0, 3.0), min_size=5, max_size=5))
 def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angles):
     theta = np.array(angles)
-    expected = differences(MUSASHI.routes.absolute_lengths, theta, 1e-6)
+    expected = slopes(MUSASHI.routes.absolute_lengths, theta)
     # A line that runs through a joint's centre bends sharply: hence the relative part.
     np.testing.assert_allclose(
         MUSASHI.routes.muscle_jacobian(theta), expected, atol=1e-6, rtol=1e-3

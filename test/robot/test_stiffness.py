@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+from differences import slopes
 
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 
@@ -24,11 +25,7 @@ def test_joint_stiffness_is_the_slope_of_restoring_torque_with_the_motors_held(r
         pull = tension + k * (robot.routes.absolute_lengths(moved) - length)
         return -robot.routes.muscle_jacobian(moved).T @ pull
 
-    step = 1e-5
-    slope = np.stack(
-        [(torque(theta + d) - torque(theta - d)) / (2 * step) for d in step * np.eye(len(theta))],
-        axis=-1,
-    )
+    slope = slopes(torque, theta, 1e-5)
     np.testing.assert_allclose(nominal(robot, theta, tension, k), -slope, rtol=1e-4, atol=1e-3)
 
 
