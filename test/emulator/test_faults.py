@@ -10,14 +10,8 @@ from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.robot import Robot
 
 MUSCLE = 2
-
-
-@pytest.fixture(scope='module')
-def robot():
-    return Robot.load('arm26')
 
 
 @pytest.fixture

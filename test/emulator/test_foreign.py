@@ -26,11 +26,6 @@ EFFECTS = {field.name: getattr(Effects(), field.name) or 1.0 for field in fields
 
 
 @pytest.fixture(scope='module')
-def robot():
-    return Robot.load('arm26')
-
-
-@pytest.fixture(scope='module')
 def coupled(tmp_path_factory):
     """Return an arm with a coupled joint and a described wrap."""
     directory = write_robot(tmp_path_factory.mktemp('coupled'), finger=True)

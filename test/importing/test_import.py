@@ -127,8 +127,6 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
     assert result.errors == pytest.approx({'front': 0.0}, abs=1e-9)  # it has no lengths of wraps
     assert any('muscle still: it moves no joint' in note for note in result.notes)
-    cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
-    assert import_robot(cardsflow, tmp_path / 'two').robot.muscles == ('front', 'front_')
 
 
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
@@ -356,7 +354,7 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
     assert 'no DOCTYPE is allowed' in capsys.readouterr().err
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(['OSIM', 'CARDSFLOW', 'URDF', 'SDF']), st.data())
 def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, format_, data):
     """Words of a file are replaced or left out, elements cut away."""

@@ -7,11 +7,20 @@ import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 
+from bench.attack_files import chain
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, read_urdf
+
+
+def refused(directory, *fragments):
+    """Reading a robot directory ends in an error that says all of these."""
+    with pytest.raises(RobotDescriptionError) as error:
+        load_description(directory)
+    for fragment in fragments:
+        assert fragment in str(error.value)
 
 
 def put(path, value):
@@ -85,10 +94,7 @@ def test_a_bad_entry_is_refused_naming_file_entry_and_what_is_legal(tmp_path, ca
     document = read_muscles(directory)
     edit(document)
     write_muscles(directory, document)
-    with pytest.raises(RobotDescriptionError) as error:
-        load_description(directory)
-    for fragment in ['muscles.yaml', *fragments]:
-        assert fragment in str(error.value)
+    refused(directory, 'muscles.yaml', *fragments)
 
 
 @pytest.mark.parametrize(
@@ -106,10 +112,7 @@ def test_a_bad_entry_is_refused_naming_file_entry_and_what_is_legal(tmp_path, ca
 def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, fragments):
     directory = copy_robot('arm26', tmp_path)
     (directory / 'muscles.yaml').write_text(text)
-    with pytest.raises(RobotDescriptionError) as error:
-        load_description(directory)
-    for fragment in ['muscles.yaml', *fragments]:
-        assert fragment in str(error.value)
+    refused(directory, 'muscles.yaml', *fragments)
 
 
 BAD_URDF = {
@@ -147,10 +150,7 @@ def test_a_bad_urdf_is_refused_naming_the_part(tmp_path, case):
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new))
-    with pytest.raises(RobotDescriptionError) as error:
-        load_description(directory)
-    for fragment in [str(directory), *fragments]:
-        assert fragment in str(error.value)
+    refused(directory, str(directory), *fragments)
 
 
 @pytest.mark.parametrize('missing', ['robot.urdf', 'muscles.yaml'])
@@ -215,16 +215,6 @@ def test_shipped_arms_have_the_sizes_and_names_the_paper_gives_them():
 
 
 # -- URDFs that nobody writes by mistake ----------------------------------------------------------
-
-
-def chain(links):
-    """A URDF of so many links, one below the other."""
-    joints = ''.join(
-        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
-        f'<child link="l{i + 1}"/></joint>'
-        for i in range(links)
-    )
-    return f'<robot name="r"><link name="l0"/>{joints}</robot>'
 
 
 def in_arm26(old, new):

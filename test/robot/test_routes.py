@@ -18,7 +18,7 @@ def test_muscle_jacobian_is_the_derivative_of_length(robot):
         np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), expected, atol=1e-8)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=5, max_size=5))
 def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angles):
     theta = np.array(angles)

@@ -17,7 +17,7 @@ def constants(force, rate, wire_stretch):
     return SeriesElastic(np.array([force]), np.array([rate]), np.array([wire_stretch]))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.floats(20.0, 300.0), st.floats(10.0, 80.0), st.floats(0.0, 1e-4), st.floats(0.0, 500.0))
 def test_compliance_and_length_slope_are_the_derivatives_of_elongation(force, rate, wire, pull):
     elastic, length = constants(force, rate, wire), np.array([0.3])
@@ -38,7 +38,7 @@ def test_a_wire_that_cannot_push_does_not_shorten():
     assert constants(100.0, 30.0, 2e-5).elongation(np.array([0.3]), np.array([-50.0])) == 0.0
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(40.0, 250.0), st.floats(15.0, 60.0), st.floats(5e-6, 1e-4))
 def test_the_fit_recovers_known_constants(force, rate, wire_stretch):
     tension, length = (a.ravel() for a in np.meshgrid([5, 20, 60, 150, 300, 500], [0.2, 0.4, 0.6]))

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
@@ -12,7 +12,6 @@ from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 LOW, HIGH = 30.0, 200.0
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 60.0]))
 def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_nearer(seed, desired):
     rng = np.random.default_rng(seed)
@@ -60,7 +59,6 @@ def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
         )
 
 
-@settings(max_examples=100)
 @given(st.integers(0, 10_000), st.floats(0.0, 3.0))
 def test_muscles_that_are_held_at_one_tension_leave_a_problem_that_is_solved(seed, share):
     rng = np.random.default_rng(seed)
