@@ -42,6 +42,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from bench.processes import memory
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
@@ -100,11 +101,8 @@ class Process:
 
     def look(self) -> None:
         """Note how much memory it holds."""
-        try:
-            pages = int(Path(f'/proc/{self.process.pid}/statm').read_text('ascii').split()[1])
-        except OSError:
-            return
-        self.memory.append((time.monotonic() - self.started, pages * 4096 / 1e6))
+        with suppress(OSError):  # it has just ended
+            self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
         """End it as a power cut would."""

@@ -19,8 +19,9 @@ from datetime import date
 from pathlib import Path
 
 from bench import timings
+from bench.processes import cpu
 from bench.scaling import update_time
-from bench.wire import KINDS, System, cpu, systems
+from bench.wire import KINDS, System, systems
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record

@@ -16,12 +16,14 @@ than one and a half of that in the first.
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from bench.processes import memory
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.experiments.recording import (
@@ -75,12 +77,6 @@ class RareTraining(Training):
     def ready(self) -> bool:
         """Whether so many samples have come."""
         return self.samples >= min(self.every, 1 + len(self.seconds) // 4)
-
-
-def memory() -> float:
-    """Return what this process holds now [MB]."""
-    pages = int(Path('/proc/self/statm').read_text('ascii').split()[1])
-    return pages * 4096 / 1e6
 
 
 def judged(worst: float, filled: float, most: float, times: list[float]) -> list[str]:
@@ -148,9 +144,9 @@ def main(argv: list[str]) -> int:
         if now >= SETTLED:
             least, worst = min(least, error), max(worst, error / least)
         if now == FILLED:
-            filled = memory()
+            filled = memory(os.getpid())
         if now >= FILLED:
-            most = max(most, memory())
+            most = max(most, memory(os.getpid()))
         if now % REPORT == 0.0:
             anomaly = learner.mae.anomaly
             threshold = anomaly.thresholds.get(DISTANCE, np.nan) if anomaly else np.nan
@@ -158,7 +154,7 @@ def main(argv: list[str]) -> int:
                 f'{now / 3600.0:5.1f} h  samples {len(learner.samples)} '
                 f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
                 f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {reopened}  '
-                f'{memory():.0f} MB  '
+                f'{memory(os.getpid()):.0f} MB  '
                 f'update {np.median(training.seconds[reported:]):.2f} s',
                 flush=True,
             )

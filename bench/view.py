@@ -21,7 +21,7 @@ import rclpy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
-from bench.wire import cpu
+from bench.processes import cpu
 from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, joint_message
 from musculoskeletal_ae.nodes.view import ARM_TOPICS
 from musculoskeletal_ae.options import Parser

@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.processes import cpu
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
@@ -45,7 +46,6 @@ KINDS = {
     'plain node, torch': ('hardware_emulator', 'plain'),
 }
 WARM_UP = 8.0  # [s] until the first message counts
-TICK = os.sysconf('SC_CLK_TCK')
 PLAIN = """
 import sys, numpy as np, rclpy, torch
 from rclpy.node import Node
@@ -72,15 +72,6 @@ class Plain(Node):
         self.out.publish(Float64MultiArray(data=goal.tolist()))
 rclpy.init(); rclpy.spin(Plain())
 """
-
-
-def cpu(pid: int) -> float:
-    """Return the processor time of a process and of its children, alive or gone [s]."""
-    total = 0.0
-    for child in Path(f'/proc/{pid}/task/{pid}/children').read_text('ascii').split():
-        total += cpu(int(child))
-    fields = Path(f'/proc/{pid}/stat').read_text('ascii').rpartition(')')[2].split()
-    return total + sum(map(int, fields[11:15])) / TICK
 
 
 class System:
