@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -62,7 +61,14 @@ class Individual:
         nominal = robot.routes
         off = rng.normal(0.0, spread.attachment, nominal.point.shape)
         thickness = rng.uniform(0.8, 1.2, len(nominal.first))
-        routes = partial(_routes, robot, spread.wrap, seed, thickness)
+
+        def routes(off: Array) -> WrappedRoutes:
+            """Return the true routes of points that are off by so much [m], (P, 3)."""
+            point = nominal.point + off
+            objects = _objects(robot, point, spread.wrap, seed, thickness)
+            segments = nominal.first, nominal.second, nominal.muscle
+            return WrappedRoutes(nominal.joint, point, *segments, objects)
+
         self.routes = routes(off)
         if nominal.objects is not None:
             again = np.random.default_rng([seed, 0x1A7])
@@ -121,16 +127,6 @@ class Individual:
         """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
         absolute = self.absolute_lengths(theta)
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
-
-
-def _routes(
-    robot: Robot, quantile: float, seed: int, thickness: Array, off: Array
-) -> WrappedRoutes:
-    """Return the true routes of points that are off by so much [m], (P, 3)."""
-    nominal, point = robot.routes, robot.routes.point + off
-    objects = _objects(robot, point, quantile, seed, thickness)
-    segments = nominal.first, nominal.second, nominal.muscle
-    return WrappedRoutes(nominal.joint, point, *segments, objects)
 
 
 def _objects(
