@@ -11,8 +11,12 @@ from musculoskeletal_ae.experiments.control import METHODS, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 
 
-def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm26, trained):
-    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
+@pytest.fixture(scope='module')
+def ended(arm26, trained):
+    return protocol(nominal_arm(arm26), trained, seed=0, count=1)
+
+
+def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(ended):
     error = {name: np.linalg.norm(offset) for name, offset in ended.offset.items()}
     assert set(error) == set(METHODS)
     assert error['proposed'] < 0.1
@@ -20,9 +24,8 @@ def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(arm
     assert ended.tension['proposed'].mean() == pytest.approx(ended.bound.mean(), rel=0.15)
 
 
-def test_a_posture_at_the_target_needs_the_bound(arm26, trained):
+def test_a_posture_at_the_target_needs_the_bound(ended):
     """Where an arm came close to θ_eval, holding it there takes what holding θ_eval takes."""
-    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 

@@ -19,6 +19,8 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.tools.check_robot import main
 from musculoskeletal_ae.tools.robot_report import plot
 
+#: a route that crosses no joint
+IDLE = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]
 SHIPPED = ['musashi_left_arm', 'musashi_upper_body', 'arm26']
 
 
@@ -211,8 +213,7 @@ def test_soft_muscles_are_a_fault_naming_the_softest_joint(tmp_path, capsys):
 
 def test_a_muscle_that_crosses_no_joint_never_matters(tmp_path, capsys):
     def idle(document):
-        route = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]
-        document['muscles'].append({'name': 'idler', 'route': route})
+        document['muscles'].append({'name': 'idler', 'route': IDLE})
 
     status, printed, _ = verdict(capsys, change(write_robot(tmp_path), idle))
     assert status == 1
@@ -378,7 +379,7 @@ def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
 def test_where_nothing_helps_it_says_so(tmp_path):
     def idle(document):
         for muscle in document['muscles']:
-            muscle['route'] = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]
+            muscle['route'] = IDLE
 
     lines, _ = remedies_of(change(write_robot(tmp_path), idle), 'not_held', 10)
     assert lines[0].startswith('none of these helps: limits, moment arms, mass, series_elastic')
