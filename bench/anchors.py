@@ -26,10 +26,11 @@ import numpy as np
 import torch
 
 from bench.learned_arm import STEPS, LearnedArm, Seldom, learned_arm
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
-    SAMPLE_TIME,
     Recording,
     end_tensions,
     estimation_error,
@@ -55,10 +56,11 @@ def taught(arm: LearnedArm, robot: Robot, seed: int, stated: bool = False) -> Ma
     learner = Learner(
         robot, arm.driver, seed=seed, steps=STEPS, training=Seldom, joint_source=source
     )
-    for n, (theta, _, length, tension, _) in enumerate(zip(*arm.exploring)):
-        told = theta + off if stated and not len(learner.samples) else None
-        learner.step(n * SAMPLE_TIME, told, tension, length)
-    return learner.mae
+
+    def see(learner: Learner, _n: int, true: Array, _read: Array) -> Array | None:
+        return true + off if stated and not len(learner.samples) else None
+
+    return teach(learner, zip(*arm.exploring, strict=True), see)
 
 
 def zeroed(mae: Mae, exploring: Recording, held_out: Recording, seed: int) -> float:

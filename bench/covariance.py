@@ -20,10 +20,10 @@ import torch
 
 from bench.learned_arm import initial
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
-    SAMPLE_TIME,
     estimation_error,
     record,
 )
@@ -51,8 +51,7 @@ def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: floa
     """Return what an individual's rests tell without a joint angle."""
     learner = Learner(robot, driver, seed=seed, training=Never, joint_source=NONE)
     exploring = record(arm, driver, EXPLORATION_STREAM + seed, 60.0 * minutes)
-    for n, (tension, length) in enumerate(zip(exploring.tension, exploring.length)):
-        learner.step(n * SAMPLE_TIME, None, tension, length)
+    teach(learner, zip(*exploring, strict=True), lambda *_: None)
     nothing = Healthy(np.empty((0, 3 * robot.muscle_count), np.float32), 0.0, 0)
     job, mae = Job(learner.samples.observations(), nothing, True, STEPS), driver
     updater = make_updater(robot, driver, DEFAULT, seed)

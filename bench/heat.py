@@ -43,7 +43,7 @@ def measure(study: Study, seed: int) -> Measured:
             arm.set_payload(LOAD)
             loop.core.explore(False)
             if loop.core.posture.theta is None:
-                loop.core.target(dict(zip(arm.robot.joints, ((t, 0.0) for t in arm.theta))))
+                loop.target(arm.theta)
             loop.core.reset(n * SAMPLE_TIME)
             loop.step()
         else:

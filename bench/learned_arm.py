@@ -14,6 +14,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.control.posture import Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     SAMPLE_TIME,
@@ -63,21 +64,24 @@ def initial(robot: Robot, folder: Path) -> Mae:
 
 
 def learned_arm(
-    robot: Robot, seed: int, folder: Path, minutes: float, where: Callable[[Array], bool] = bool
+    robot: Robot,
+    seed: int,
+    folder: Path,
+    minutes: float,
+    where: Callable[[Array], bool] | None = None,
 ) -> LearnedArm:
-    """Return an individual that learned in postures θ (D,) for which `where` is true."""
+    """Return an individual that learned in postures θ (D,) for which `where`, if any, is true."""
     folder.mkdir(parents=True, exist_ok=True)
     driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
     messages = folder / f'exploring_{seed}.npz'
     if not file.exists():
         stream = EXPLORATION_STREAM + seed
-        steps = postures(robot, stream, where) if where is not bool else stream
+        steps = postures(robot, stream, where) if where else stream
         exploring = record(EmulatedArm(robot, seed), driver, steps, 60.0 * minutes)
         learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
-        for n, row in enumerate(zip(exploring.theta_sensor, exploring.tension, exploring.length)):
-            learner.step(n * SAMPLE_TIME, *row)
+        mae = teach(learner, zip(*exploring, strict=True))
         np.savez(messages, *exploring)
-        checkpoint.save(learner.mae, file)
+        checkpoint.save(mae, file)
     with np.load(messages) as arrays:
         return LearnedArm(checkpoint.load(file, robot), driver, Recording(*arrays.values()))
 

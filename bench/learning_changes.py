@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import seen_by_camera
-from musculoskeletal_ae.experiments.online_learning import See, follow
+from musculoskeletal_ae.experiments.online_learning import See, teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
@@ -57,11 +57,11 @@ def camera(robot: Robot, stream: Recording, seed: int) -> See:
     """Return what the estimator makes of a marker on the hand."""
     rng = np.random.default_rng([seed, 0xCA])
 
-    def see(n: int, mae: Mae) -> Array | None:
+    def see(learner: Learner, n: int, true: Array, _read: Array) -> Array | None:
         if n % EVERY:
             return None
-        pose = seen_by_camera(robot.kinematics.end_effector_pose(stream.theta[n]), rng)
-        estimate = mae.estimate(stream.tension[n], stream.length[n]).theta
+        pose = seen_by_camera(robot.kinematics.end_effector_pose(true), rng)
+        estimate = learner.mae.estimate(stream.tension[n], stream.length[n]).theta
         return inverse_kinematics(robot, pose, estimate).theta
 
     return see
@@ -105,9 +105,8 @@ def going_on(learner: Learner, after: Streams, read_at: tuple[float, ...]) -> li
     errors, begun = [estimation_error(learner.mae, after.held_out)], 0
     for minutes in read_at:
         end = round(6000.0 * minutes)
-        part = Recording(*(column[begun:end] for column in after.exploring))
-        follow(learner, zip(*part, strict=True), after.held_out)
-        errors.append(estimation_error(learner.mae, after.held_out))
+        part = after.exploring.part(slice(begun, end))
+        errors.append(estimation_error(teach(learner, zip(*part, strict=True)), after.held_out))
         begun = end
     return errors
 
@@ -125,16 +124,16 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     before = streams(
         EmulatedArm(robot, seed, individual), mae, EXPLORATION_STREAM + seed, minutes, held_out
     )
+
+    def taught(learner: Learner, *see: See) -> float:
+        mae = teach(learner, zip(*before.exploring, strict=True), *see)
+        return estimation_error(mae, before.held_out)
+
     learner = Learner(robot, mae, seed=seed)
-    follow(learner, zip(*before.exploring, strict=True), before.held_out)
-    by_sensor = estimation_error(learner.mae, before.held_out)
-    watcher = Learner(robot, mae, seed=seed)
-    watched = zip(*before.exploring, strict=True)
-    follow(watcher, watched, before.held_out, camera(robot, before.exploring, seed))
-    by_camera = estimation_error(watcher.mae, before.held_out)
+    by_sensor = taught(learner)
+    by_camera = taught(Learner(robot, mae, seed=seed), camera(robot, before.exploring, seed))
     slow = Learner(robot, mae, seed=seed, settings=SLOW)
-    follow(slow, zip(*before.exploring, strict=True), before.held_out)
-    in_motion = estimation_error(slow.mae, before.held_out)
+    in_motion = taught(slow)
     initial = estimation_error(mae, before.held_out)
     head = f'individual {seed}, {minutes:g} min: error before {initial:.4f} rad, after: '
     ratio = by_camera / by_sensor

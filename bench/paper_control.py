@@ -32,7 +32,7 @@ from musculoskeletal_ae.control.methods import (
 )
 from musculoskeletal_ae.control.posture import RAMP_SHARE, Ramp
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.experiments.online_learning import beginner, explore
+from musculoskeletal_ae.experiments.online_learning import beginner, explore, teach
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.mae import checkpoint
@@ -140,9 +140,7 @@ METHODS = ('geometric', 'first', 'second', *READINGS)
 def learned(study: Study, seed: int) -> Mae:
     """Return what preset paper learns of an individual that explores with it."""
     learner, loop = beginner(study, study.arm(seed), seed, 'paper')
-    for n, (_, theta, length, tension, _) in enumerate(explore(loop, learner, 60 * study.minutes)):
-        learner.step(n * SAMPLE_TIME, theta, tension, length)
-    return learner.mae
+    return teach(learner, explore(loop, learner, 60.0 * study.minutes))
 
 
 def individual(study: Study, seed: int) -> dict[str, tuple[float, float]]:

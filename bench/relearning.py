@@ -25,6 +25,7 @@ import yaml
 
 from bench.learning_changes import AFTER_STREAM, HELD_OUT_TIME, row, streams
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     SAMPLE_TIME,
@@ -56,7 +57,7 @@ def fewer(stream: Recording, muscle: int) -> Recording:
     return Recording(*stream[:2], *muscles)
 
 
-def teach(learner: Learner, stream: Recording, start: float, samples: float = np.inf) -> int:
+def teach_until(learner: Learner, stream: Recording, start: float, samples: int) -> int:
     """Feed messages until so many are accepted ever; return how many messages that took."""
     n = 0
     for n, (_, theta, length, tension, _) in enumerate(zip(*stream, strict=True)):
@@ -70,7 +71,7 @@ def learned(learner: Learner, after: Recording, held_out: Recording, start: floa
     """Return the held-out errors after NEW samples."""
     errors, before = list[float](), learner.samples.accepted
     for new in NEW:
-        n = teach(learner, after, start, before + new)
+        n = teach_until(learner, after, start, before + new)
         start += n * SAMPLE_TIME
         after = after.part(slice(n, None))
         errors.append(estimation_error(learner.mae, held_out))
@@ -85,8 +86,7 @@ def report(robot: Robot, seed: int, muscles: Sequence[int], quick: bool) -> str:
     before = streams(arm, mae, EXPLORATION_STREAM + seed, minutes, held_out)
     after = streams(arm, mae, AFTER_STREAM + seed, minutes, 10.0).exploring
     learner = Learner(robot, mae, seed=seed)
-    teach(learner, before.exploring, 0.0)
-    whole = estimation_error(learner.mae, before.held_out)
+    whole = estimation_error(teach(learner, zip(*before.exploring, strict=True)), before.held_out)
     samples = learner.samples.accepted
     head = ''.join(f'{text:>9s}' for text in ('at once', 'kept', *(f'{n} new' for n in NEW)))
     lines = [f'individual {seed}, {samples} samples: whole {whole:.4f} rad; {steps} readings']
@@ -105,8 +105,8 @@ def report(robot: Robot, seed: int, muscles: Sequence[int], quick: bool) -> str:
             small = without(robot, muscle, folder)
             state = folder / 'state'
             one = Learner(small, initial_mae(small, 'default').mae, seed=seed, directory=state)
-            teach(one, fewer(before.exploring, muscle), 0.0)
-            had = estimation_error(one.mae, fewer(before.held_out, muscle))
+            taught = teach(one, zip(*fewer(before.exploring, muscle), strict=True))
+            had = estimation_error(taught, fewer(before.held_out, muscle))
             one.close()
             two = Learner(robot, mae, seed=seed, directory=state)
             errors = [estimation_error(two.mae, before.held_out)]

@@ -21,7 +21,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, record
+from musculoskeletal_ae.experiments.online_learning import teach
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
@@ -42,8 +43,7 @@ def table(robot: Robot, mae: Mae, seed: int, minutes: float) -> str:
     """Return the lines of one individual."""
     stream = record(EmulatedArm(robot, seed), mae, EXPLORATION_STREAM + seed, 60.0 * minutes)
     learner = Learner(robot, seed=seed)
-    for n, values in enumerate(zip(stream.theta_sensor, stream.tension, stream.length)):
-        learner.step(n * SAMPLE_TIME, *values)
+    teach(learner, zip(*stream, strict=True))
     seen, body = learner.samples.observations(), CorrectedBody(robot, seed=seed)
     for _ in range(FITS):
         fit_body(body, seen)

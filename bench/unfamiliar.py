@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.learned_arm import initial, learned_arm, postures
+from bench.learned_arm import learned_arm, postures
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import DURATIONS
 from musculoskeletal_ae.control.posture import Step
@@ -154,7 +154,7 @@ def measure(
     """Return the counts of one individual."""
     known = near(robot, seed)
     learned = learned_arm(robot, seed, folder, minutes, known)
-    mae, driver = learned.mae, initial(robot, folder)
+    mae, driver = learned.mae, learned.driver
     detector = AnomalyDetector(robot)
     detector.use(mae)
     assert mae.anomaly is not None

@@ -21,7 +21,7 @@ import numpy as np
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.online_learning import beginner, explore, follow
+from musculoskeletal_ae.experiments.online_learning import beginner, explore, teach
 from musculoskeletal_ae.experiments.roles import shoulder
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.robot.robot import Robot
@@ -64,11 +64,10 @@ def measure(study: Study, seed: int) -> Measured:
             numbers[f'{name}_{when}_shape_mm'] = float(shape.mean())
     if seed == study.seeds[0]:
         learner, loop = beginner(study, arm := worn_arm(robot, seed), seed, study.preset)
-        held_out = study.stream(seed, 'held_out')
-        follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
+        mae = teach(learner, explore(loop, learner, 60.0 * study.minutes))
         changed = {
             'before': traces['tension'][2]['before'],
-            'after': learner.mae.lengths(still, stretched),
+            'after': mae.lengths(still, stretched),
             'true': arm.individual.muscle_lengths(still, stretched),
         }
         traces['worn'] = tension, held, changed

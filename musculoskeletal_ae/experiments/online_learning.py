@@ -60,8 +60,9 @@ QUICK_STEPS = 600  # of initial training: with fewer the gate refuses a network 
 NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
 COLOURS = {'paper': plots.PAPER, 'default': plots.AFTER}
 
-#: what is seen of θ [rad] (D,) at the n-th message, with the network of the moment; None if nothing
-See = Callable[[int, Mae], Array | None]
+#: told learner, number of a message, true θ and what joint sensors read [rad] (D,); returns the θ
+#: that the learner is told, or None
+See = Callable[[Learner, int, Array, Array], Array | None]
 
 
 class Curve(NamedTuple):
@@ -72,17 +73,24 @@ class Curve(NamedTuple):
     running: Array  # ‖θ_est − θ_sensor‖ of each message, by the network of the moment [rad], (N,)
 
 
-def follow(
+def teach(
     learner: Learner,
     stream: Iterable[tuple[Array, ...]],
-    held_out: Recording,
-    see: See | None = None,
-) -> tuple[Curve, Recording]:
-    """Feed messages to a learner, as the node would, and judge it on the held-out motion.
+    see: See = lambda _learner, _n, _true, read: read,
+) -> Mae:
+    """Feed messages, rows of a recording, to a learner as the node would; return what it learned.
 
-    They come one by one, rows of a recording, which is returned too; θ comes from `see`, from the
-    joint sensors by default.
+    θ is what joint sensors read, unless `see` says otherwise.
     """
+    for n, (true, read, length, tension, _) in enumerate(stream):
+        learner.step(n * SAMPLE_TIME, see(learner, n, true, read), tension, length)
+    return learner.mae
+
+
+def follow(
+    learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
+) -> tuple[Curve, Recording]:
+    """Do as `teach`, and judge the learner on the held-out motion; return the messages, too."""
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
     errors, mae, direction = list[float](), None, FrictionDirection()
     error = judge(held_out, CURVE_STRIDE)
@@ -94,8 +102,7 @@ def follow(
         _, sensor, length, tension, _ = row
         end = direction.end_tension(mae.friction, tension, length)
         running.append(float(np.linalg.norm(mae.estimate(end, length).theta - sensor)))
-        theta = sensor if see is None else see(n, mae)
-        learner.step(n * SAMPLE_TIME, theta, tension, length)
+        learner.step(n * SAMPLE_TIME, sensor, tension, length)
         rows.append(row)
     samples.append(len(learner.samples))
     errors.append(error(learner.mae))
@@ -156,8 +163,8 @@ def measure(study: Study, seed: int) -> Measured:
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
     pupil = Learner(study.robot, study.network(None, 'paper'), 'paper', seed)
-    follow(pupil, zip(*study.stream(seed, 'exploring'), strict=True), held_out)
-    numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
+    mae = teach(pupil, zip(*study.stream(seed, 'exploring'), strict=True))
+    numbers['paper_same_stream_after_rad'] = estimation_error(mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 

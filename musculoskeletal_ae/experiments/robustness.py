@@ -117,8 +117,8 @@ def _learned(study: Study, seed: int, reality: str) -> Study:
 def _numbers(study: Study, seed: int) -> dict[str, Any]:
     held_out = study.stream(seed, 'held_out')
     kept = json.loads(study.numbers_file(seed).read_text(encoding='utf-8'))
-    names = 'before_rad', 'after_rad', 'paper_before_rad', 'paper_after_rad', 'oracle_rad'
-    return {name: kept[name] for name in (*names, 'samples_to_halve') if name in kept} | {
+    learned = 'before_rad', 'after_rad', 'paper_before_rad', 'paper_after_rad'
+    return {name: kept[name] for name in (*learned, 'oracle_rad', 'samples_to_halve')} | {
         'joint_sensors_rad': mean_error(held_out.theta_sensor, held_out.theta),
         'least_squares_rad': nominal(study.robot).error(held_out),
         'informed_oracle_rad': _informed(study.arm(seed), held_out),
@@ -181,8 +181,7 @@ def _otherwise(study: Study, seed: int, **effects: float) -> float:
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     learner, loop = online_learning.beginner(study, arm(), seed, study.preset)
     stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
-    online_learning.follow(learner, stream, held_out)
-    return estimation_error(learner.mae, held_out)
+    return estimation_error(online_learning.teach(learner, stream), held_out)
 
 
 ESTIMATES = {

@@ -14,13 +14,12 @@ with all joint sensors and with none. The arm explored with the network that saw
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
 from musculoskeletal_ae.experiments import plots
+from musculoskeletal_ae.experiments.online_learning import See, teach
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
     Recording,
@@ -36,9 +35,6 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
 CAMERA = 10  # messages to one picture, or to one of the accelerometer
 SIGHTED = 10  # samples to one that the marker is seen in
-
-#: told learner, number of a message, true θ (D,) and what sensors read; returns θ (D,) or None
-See = Callable[[Learner, int, Array, Array], Array | None]
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -81,9 +77,7 @@ def measure(study: Study, seed: int) -> Measured:
 def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -> Mae:
     initial, steps = study.network(None, 'default'), STEPS // 5 if study.quick else STEPS
     learner = Learner(study.robot, initial, 'default', seed, steps=steps, joint_source=source)
-    for n, (theta, read, length, tension, _) in enumerate(zip(*stream, strict=True)):
-        learner.step(SAMPLE_TIME * n, see(learner, n, theta, read), tension, length)
-    return learner.mae
+    return teach(learner, zip(*stream, strict=True), see)
 
 
 def ellipsoid_share(mae: Mae, recording: Recording) -> float:
