@@ -41,21 +41,20 @@ from musculoskeletal_ae.emulator.wires import spooled
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.body_change import SWEEP
 from musculoskeletal_ae.experiments.least_squares import nominal
-from musculoskeletal_ae.experiments.online_learning import follow
+from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
-    SAMPLE_TIME,
     estimation_error,
     record,
 )
 from musculoskeletal_ae.experiments.roles import shoulder
+from musculoskeletal_ae.experiments.simulation import simulate
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.simulation import Simulation
 
 SEEDS = tuple(range(200, 210))
 HEAD = 'seed  least squares [rad]  l off [mm]  paper [rad]: before  after  simulator [N]  refused'
@@ -84,22 +83,18 @@ def measured(
     exploring = record(arm(), default, EXPLORATION_STREAM + seed, 600.0 * share)
     held_out = record(arm(), default, HELD_OUT_STREAM, 300.0 * share)
     learner = Learner(robot, paper, 'paper', seed)
-    follow(learner, zip(*exploring, strict=True), held_out)
+    teach(learner, zip(*exploring, strict=True))
     swept = np.zeros((len(SWEEP), robot.joint_count))
     swept[:, shoulder(robot)] = SWEEP
     off = true_lengths(arm(), swept) - robot.routes.relative_lengths(swept)
     learned = paper if learner.last_update is None else learner.last_update.mae
-    simulation, errors = Simulation(robot, learned, 'paper'), []
-    simulation.start_from(held_out.theta[:1])
-    for command, tension in zip(held_out.command, held_out.tension):
-        simulation.command = command[None]
-        errors.append(np.linalg.norm(simulation.step(SAMPLE_TIME).tension[0] - tension))
+    apart = simulate(robot, learned, 'paper', held_out).tension - held_out.tension
     return Row(
         nominal(robot).error(held_out),
         1e3 * float(np.abs(off).max()),
         estimation_error(paper, held_out),
         estimation_error(learned, held_out),
-        float(np.mean(errors)),
+        float(np.linalg.norm(apart, axis=1).mean()),
         learner.refused / max(learner.updates, 1),
     )
 

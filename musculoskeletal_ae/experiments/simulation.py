@@ -17,8 +17,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Motion, columns, times
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Motion, Recording, columns, times
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 PRINTED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
@@ -33,13 +35,7 @@ def measure(study: Study, seed: int) -> Measured:
     numbers, traces = dict[str, Any](), {'arm': arm}
     for preset in dict.fromkeys([study.preset, 'paper']):
         for when, mae in study.networks(seed, preset).items():
-            simulated, rows = Simulation(study.robot, mae, preset), []
-            simulated.start_from(arm.theta[:1])
-            for command in recording.command:
-                simulated.command = command[None]
-                state = simulated.step(SAMPLE_TIME)
-                rows.append((state.theta[0], state.tension[0]))
-            moved = Motion(*columns(rows))
+            moved = simulate(study.robot, mae, preset, recording)
             numbers |= study.keyed(preset, _errors(when, moved, arm))
             if preset == study.preset:
                 traces[when] = moved
@@ -50,6 +46,17 @@ def measure(study: Study, seed: int) -> Measured:
         rows.append((body.theta, body.tension))
     numbers |= _errors('frictionless', Motion(*columns(rows)), arm)
     return Measured(numbers, traces)
+
+
+def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motion:
+    """Let a network's simulator follow the commands of a recording, from its first posture."""
+    simulated, rows = Simulation(robot, mae, preset), []
+    simulated.start_from(recording.theta[:1])
+    for command in recording.command:
+        simulated.command = command[None]
+        state = simulated.step(SAMPLE_TIME)
+        rows.append((state.theta[0], state.tension[0]))
+    return Motion(*columns(rows))
 
 
 def _distances(moved: Motion, arm: Motion) -> dict[str, Array]:
