@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import shutil
 import sys
 import tempfile
@@ -28,7 +27,7 @@ from tqdm import tqdm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
-from musculoskeletal_ae.experiments.study import Measured, Rows, Study
+from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
 from musculoskeletal_ae.experiments.table import NOTHING, ROWS, Cells, individuals, markdown
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -39,7 +38,6 @@ Results = Mapping[str, Mapping[str, Any]]
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts', 'paper_false_alarms')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
-DIGITS = 6  # significant; more is noise
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
 BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
@@ -120,7 +118,7 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
         'quick': study.quick,
         'seeds': list(study.seeds),
     }
-    whole: dict[str, Any] = {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
+    whole = {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
     return {key: rounded(value) for key, value in whole.items()}
 
 
@@ -140,19 +138,6 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         else:
             result[key] = np.mean(values, axis=0).tolist()
     return result
-
-
-def rounded(value: Any) -> Any:
-    """Return the same with floats shortened; JSON cannot say what is not finite."""
-    if isinstance(value, Mapping):
-        return {key: rounded(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [rounded(part) for part in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            raise MusculoskeletalError('an experiment brought a number that is not finite')
-        return float(f'{value:.{DIGITS}g}')
-    return value
 
 
 def table(results: Results) -> list[Cells]:

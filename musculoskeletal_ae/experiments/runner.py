@@ -19,7 +19,7 @@ from importlib import import_module
 from typing import Any
 
 from musculoskeletal_ae.experiments import NAMES, online_learning
-from musculoskeletal_ae.experiments.study import Measured, Study
+from musculoskeletal_ae.experiments.study import Measured, Study, rounded
 from musculoskeletal_ae.presets import PRESETS
 
 EXPERIMENTS = {
@@ -89,8 +89,6 @@ def run(
 
 
 def _measure(name: str, study: Study, seed: int) -> Measured:
-    from musculoskeletal_ae.experiments.results import rounded  # which needs this module
-
     measured = EXPERIMENTS[name].measure(study, seed)
     return measured._replace(numbers=rounded(measured.numbers))
 

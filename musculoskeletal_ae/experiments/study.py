@@ -10,6 +10,7 @@ name in `NAMES`, and what table.yaml says of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,13 @@ from matplotlib.figure import Figure
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+
+DIGITS = 6  # significant, of numbers; more is noise
 
 
 class Rests(NamedTuple):
@@ -101,6 +105,19 @@ class Measured(NamedTuple):
 
     numbers: dict[str, Any]  # for result.json: nested dictionaries of finite numbers, text or lists
     traces: dict[str, Any]  # for the plots
+
+
+def rounded(value: Any) -> Any:
+    """Return the same with floats shortened; JSON cannot say what is not finite."""
+    if isinstance(value, Mapping):
+        return {key: rounded(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [rounded(part) for part in value]
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise MusculoskeletalError('an experiment brought a number that is not finite')
+        return float(f'{value:.{DIGITS}g}')
+    return value
 
 
 Rows = Mapping[int, Measured]  # what an experiment says of its individuals, by seed
