@@ -180,8 +180,8 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> Reached:
     return Reached(len(held) / max(count, 1), ended, trapped)
 
 
-def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[str]:
-    """Return what verification found on a healthy arm, whether it was isolated for it or not."""
+def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[tuple[int, ...]]:
+    """Return what was isolated of a healthy arm at each verdict: nothing, if it was acquitted."""
     loop, rng = Guarded(arm, mae, seed), np.random.default_rng([seed, 0x4EA])
     loop.run(1.0)
     every, wrench = round(PUSH_EVERY / SAMPLE_TIME), np.zeros(6)
@@ -194,7 +194,7 @@ def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[str]:
         loop.explore()
         if loop.core.watch.anomaly and not loop.isolated:
             loop.estimator.reset()  # as somebody would: acquitted twice, the arm stays stopped
-    return [f'{found} {"isolated" if isolated else ""}' for isolated, found in loop.found]
+    return [isolated for isolated, _ in loop.found]
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -223,7 +223,7 @@ def measure(study: Study, seed: int) -> Measured:
             why = loop.found[0][1] if loop.found else 'nothing'
             cuts[robot.muscles[m]][f'dead_{sensor}'] = f'{why}; {dead[-1]:.3f} rad'
     duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
-    found = healthy(study.arm(seed), mae, seed, duration)
+    verdicts = healthy(study.arm(seed), mae, seed, duration)
     arrived = [distance for distance in ended if distance is not None]
     numbers: dict[str, Any] = {
         'healthy_rad': whole,
@@ -236,8 +236,8 @@ def measure(study: Study, seed: int) -> Measured:
         'known_share': len(arrived) / max(len(ended), 1),
         'trapped': len(trapped),
         'dead_sensor_rad': float(np.mean(dead)),
-        'wrong_isolations': sum(one.endswith('isolated') for one in found),
-        'acquittals': sum(not one.endswith('isolated') for one in found),
+        'wrong_isolations': sum(map(bool, verdicts)),
+        'acquittals': verdicts.count(()),
         'healthy_s': duration,
         'muscles': cuts,
     }

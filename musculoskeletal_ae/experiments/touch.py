@@ -13,7 +13,7 @@ from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
-from musculoskeletal_ae.experiments.plots import AFTER, MARK, new_figure, tidy
+from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
 from musculoskeletal_ae.friction import FrictionDirection
@@ -51,13 +51,16 @@ class FeelingLoop(ClosedLoop):
         end = self._sliding.end_tension(friction, self._read.tension, length)
         return self._external.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
+    def feel_during(self, duration: float, exploring: bool = False) -> list[Touch]:
+        """Let time pass [s]; return what each message says."""
+        return [self.feel(exploring) for _ in range(round(duration / SAMPLE_TIME))]
+
     def rest(self, theta: Array) -> None:
         """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
         self.target(theta)
-        for _ in range(round(MOVE / SAMPLE_TIME)):
-            self.feel()
+        self.feel_during(MOVE)
 
     def push(self, force: Array) -> None:
         """Push the hand by a force [N] (3,)."""
@@ -146,8 +149,7 @@ def _pushed(loop: FeelingLoop, force: Array) -> Push:
         theta = loop.arm.theta
         free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
     loop.push(np.zeros(3))
-    for _ in range(round(MOVED / SAMPLE_TIME)):
-        loop.feel()
+    loop.feel_during(MOVED)
     return Push(force, np.mean(felt[-round(JUDGED / SAMPLE_TIME) :], axis=0), free)
 
 
@@ -157,13 +159,12 @@ def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Arra
     for _ in range(TRIED * count):
         if len(found) == count:
             break
-        for _ in range(round(rng.uniform(0.5, 1.0) * APART / SAMPLE_TIME)):
-            before = loop.feel(exploring=True)
+        *_, before = loop.feel_during(rng.uniform(0.5, 1.0) * APART, exploring=True)
         if before.contact or np.linalg.norm(loop.arm.velocity) < 0.1:
             continue
         force = _force(robot, rng, LEAST, MOST)
         loop.push(force)
-        noticed = [loop.feel(exploring=True).contact for _ in range(round(MOVED / SAMPLE_TIME))]
+        noticed = [felt.contact for felt in loop.feel_during(MOVED, exploring=True)]
         loop.push(np.zeros(3))
         delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
         found.append((float(np.linalg.norm(force)), delay))
@@ -203,12 +204,15 @@ def forces(_: Study, rows: Rows) -> Plot:
     true, felt = (np.concatenate([part[key] for part in parts]) for key in ('true', 'felt'))
     free = np.concatenate([part['free'] for part in parts])
     sizes, angle = np.linalg.norm(true, axis=1), _errors(true, felt)[1]
-    figure, (left, right) = new_figure(9.0, 3.6, columns=2)
-    for which, colour, name in ((free, AFTER, 'free'), (~free, MARK, 'a joint at its stop')):
+    figure, (left, right) = plots.new_figure(9.0, 3.6, columns=2)
+    for which, colour, name in (
+        (free, plots.AFTER, 'free'),
+        (~free, plots.MARK, 'a joint at its stop'),
+    ):
         style = {'color': colour, 's': 12, 'label': name}
         left.scatter(sizes[which], np.linalg.norm(felt[which], axis=1), **style)
         right.scatter(sizes[which], angle[which], **style)
-    left.plot([0.0, MOST], [0.0, MOST], color='#222222', linewidth=0.8)
-    tidy(left, 'push [N]', 'estimated [N]', 'size', 'above')
-    tidy(right, 'push [N]', 'error [deg]', 'direction')
+    left.plot([0.0, MOST], [0.0, MOST], color=plots.TRUE, linewidth=0.8)
+    plots.tidy(left, 'push [N]', 'estimated [N]', 'size', 'above')
+    plots.tidy(right, 'push [N]', 'error [deg]', 'direction')
     return figure, f'{len(sizes)} pushes of the hand at rest, one second after they began.'
