@@ -42,7 +42,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from bench.processes import memory
+from bench.processes import end_processes, memory
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
@@ -154,13 +154,7 @@ class Attack:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in self.processes.values():
-            process.process.send_signal(signal.SIGTERM)
-        for process in self.processes.values():
-            try:
-                process.process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
+        end_processes([process.process for process in self.processes.values()], signal.SIGTERM)
         self.node.destroy_node()
         rclpy.try_shutdown()
 

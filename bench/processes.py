@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process takes of the machine, as Linux counts it."""
+"""What a process takes of the machine, as Linux counts it, and its end."""
 
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 TICK, PAGE = os.sysconf('SC_CLK_TCK'), os.sysconf('SC_PAGE_SIZE')  # [1/s], [bytes]
+PATIENCE = 20.0  # [s]
 
 
 def cpu(pid: int) -> float:
@@ -21,3 +26,15 @@ def cpu(pid: int) -> float:
 def memory(pid: int) -> float:
     """Return what a process holds now [MB]."""
     return int(Path(f'/proc/{pid}/statm').read_text('ascii').split()[1]) * PAGE / 1e6
+
+
+def end_processes(processes: Collection[subprocess.Popen[Any]], asked: signal.Signals) -> None:
+    """Ask processes to end by a signal, and kill what goes on."""
+    for process in processes:
+        process.send_signal(asked)
+    for process in processes:
+        try:
+            process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

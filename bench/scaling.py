@@ -142,7 +142,7 @@ def draw(rows: dict[str, Row], file: Path) -> None:
         panel.set_xticks(joints, [body.replace('x', '×') for body in rows], minor=False)
         panel.minorticks_off()
         plots.tidy(panel, 'joints × muscles', label, '', legend='below')
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=plots.DPI)
 
 
 def run(bodies: list[str], minutes: float, out: Path) -> None:

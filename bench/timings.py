@@ -112,13 +112,13 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
         Row(
             'estimate: θ, T, l from ②',
             lambda: mae.estimate(tension, length),
-            _no_grad(lambda: eager(scaled, masks[Mask.TENSION_LENGTH])),
+            torch.no_grad()(lambda: eager(scaled, masks[Mask.TENSION_LENGTH])),
             products=products(mae, Mask.TENSION_LENGTH),
         ),
         Row(
             'lengths from ①',
             lambda: mae.lengths(theta, tension),
-            _no_grad(lambda: eager(scaled, masks[Mask.THETA_TENSION])),
+            torch.no_grad()(lambda: eager(scaled, masks[Mask.THETA_TENSION])),
             products=products(mae, Mask.THETA_TENSION),
         ),
         Row(
@@ -272,14 +272,6 @@ def simulation_rows(robot: Robot, preset: str) -> list[Row]:
         Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
         Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
     ]
-
-
-def _no_grad(function: Callable[[], object]) -> Callable[[], object]:
-    def call() -> object:
-        with torch.no_grad():
-            return function()
-
-    return call
 
 
 def _eager_gradient(network: Network, latent: torch.Tensor) -> object:

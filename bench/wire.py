@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.processes import cpu
+from bench.processes import cpu, end_processes
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
@@ -127,13 +127,7 @@ class System:
 
     def end(self) -> None:
         """End the nodes."""
-        for process in self.nodes.values():
-            process.send_signal(signal.SIGINT)
-        for process in self.nodes.values():
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
+        end_processes(self.nodes.values(), signal.SIGINT)
         self._rclpy.try_shutdown()
         self._listener.join()
         self._node.destroy_node()
