@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator.modules import joint_load
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
 from musculoskeletal_ae.robot.robot import Robot
@@ -80,10 +81,8 @@ class Individual:
         #: of muscles (M,) and joints [N·m], (D,) in the order of θ
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
-        pulls = np.abs(nominal.muscle_jacobian(theta)) * robot.tension.bias[:, None]
         #: what weight and muscles at T_bias put on each joint [N·m], (D,)
-        self.load: Array = np.abs(kin.holding_torque(theta)).max(axis=0)
-        self.load = self.load + pulls.sum(axis=1).max(axis=0)
+        self.load = joint_load(robot, theta, nominal.muscle_jacobian(theta))
         rubs = rng.uniform(0.5, 1.5, len(self.load))
         self.joint_friction: Array = spread.joint_friction * self.load * rubs
         #: of the sensors [m], [N], a factor; each (M,)

@@ -17,7 +17,15 @@ from collections import namedtuple
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState, heat, wind
+from musculoskeletal_ae.emulator.modules import (
+    STEP,
+    Command,
+    Modules,
+    MuscleState,
+    heat,
+    rubbed,
+    wind,
+)
 from musculoskeletal_ae.emulator.wrapping import (
     Tree,
     WrappedRoutes,
@@ -117,9 +125,7 @@ def _wires_and_modules(
         reading = muscle.length[m] + command.length_error[m] + command.zero[m]
         pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
         slid = wind(modules, muscle, kind, command, m, reading, pull)
-        direction = 1.0 if slid > 0.0 else -1.0
-        keep = math.exp(-abs(slid) / SLIDING_DISTANCE)
-        muscle.sliding[m] = direction + (muscle.sliding[m] - direction) * keep
+        muscle.sliding[m] = rubbed(muscle.sliding[m], slid, SLIDING_DISTANCE)
         if muscle.ruptured[m] > 0.0:
             muscle.end_tension[m] = 0.0
         else:
@@ -138,10 +144,8 @@ def _wires_and_modules(
 @njit(cache=True)
 def _friction_and_stops(body: Body, joint: JointState) -> None:
     for i in range(joint.q.shape[0]):
-        turned = STEP * joint.velocity[i]
-        direction = 1.0 if turned > 0.0 else -1.0
-        keep = math.exp(-abs(turned) * math.sqrt(body.gear[i]) / STICKING_ANGLE)
-        joint.sticking[i] = direction + (joint.sticking[i] - direction) * keep
+        turned = STEP * joint.velocity[i] * math.sqrt(body.gear[i])
+        joint.sticking[i] = rubbed(joint.sticking[i], turned, STICKING_ANGLE)
         joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
         joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])
         beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])

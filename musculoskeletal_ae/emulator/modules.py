@@ -10,6 +10,7 @@ l and T are those that the module's own sensors read.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -57,6 +58,17 @@ def joint_gear(kinematics: Kinematics) -> Array:
     """
     gear: Array = np.where(kinematics.prismatic, RACK**-2, 1.0)
     return gear
+
+
+def joint_load(robot: Robot, theta: Array, jacobian: Array) -> Array:
+    """Return the most that weight and muscles at T_bias put on each joint [N·m], (D,).
+
+    It is looked for in postures (N, D), in which G is (N, M, D).
+    """
+    weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
+    pulls = np.abs(jacobian) * robot.tension.bias[:, None]
+    load: Array = weight + pulls.sum(axis=1).max(axis=0)
+    return load
 
 
 class Modules(NamedTuple):
@@ -111,6 +123,13 @@ def module_reference(
         change = STEP * RELEASE_RATE
         desired = before + min(change, max(-change, modules.tension_bias[m] - before))
     return min(modules.tension_max[m], desired)
+
+
+@njit(cache=True)
+def rubbed(state: float, moved: float, distance: float) -> float:
+    """Return Dahl's state of friction in [−1, 1] after `moved`; `distance` turns it round."""
+    direction = 1.0 if moved > 0.0 else -1.0
+    return direction + (state - direction) * math.exp(-abs(moved) / distance)
 
 
 @njit(cache=True)

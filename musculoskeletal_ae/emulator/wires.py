@@ -26,6 +26,7 @@ from musculoskeletal_ae.emulator.modules import (
     Modules,
     MuscleState,
     heat,
+    rubbed,
     wind,
 )
 from musculoskeletal_ae.robot.robot import Robot
@@ -185,9 +186,7 @@ def wires_step(
     for m in range(absolute.shape[0]):
         read(wires, muscle, memory, command, m)
         slid = wind(modules, muscle, kind, command, m, memory.reading[m], memory.cell[m])
-        direction = 1.0 if slid > 0.0 else -1.0
-        keep = math.exp(-abs(slid) / SLIDING)
-        muscle.sliding[m] = direction + (muscle.sliding[m] - direction) * keep
+        muscle.sliding[m] = rubbed(muscle.sliding[m], slid, SLIDING)
         rest = memory.rest[m] + STEP / STICKING * (1.0 - memory.rest[m])
         memory.rest[m] = rest * math.exp(-abs(slid) / BREAKING)
         beyond = wires.side[m] * (absolute[m] - wires.ridge[m])
@@ -197,9 +196,7 @@ def wires_step(
         x = absolute[m] - wires.length_at_zero[m] - muscle.length[m] - slack
         grown = x - memory.elongation[m]
         memory.elongation[m] = x
-        direction = 1.0 if grown > 0.0 else -1.0
-        keep = math.exp(-abs(grown) / LOOP)
-        memory.loop[m] = direction + (memory.loop[m] - direction) * keep
+        memory.loop[m] = rubbed(memory.loop[m], grown, LOOP)
         end = law(wires, m, x / (1.0 - 0.5 * wires.hysteresis[m] * memory.loop[m]))
         if muscle.ruptured[m] > 0.0:
             end = 0.0
