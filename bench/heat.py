@@ -75,8 +75,8 @@ def main(argv: list[str]) -> None:
     robot = Robot.load(args.robot)
     mae = initial_mae(robot).mae
     with tempfile.TemporaryDirectory() as folder:
+        study = Study(robot, 'default', args.seeds, 0.0, args.quick, Path(folder))
         for seed in args.seeds:
-            study = Study(robot, 'default', args.seeds, 0.0, args.quick, Path(folder))
             checkpoint.save(mae, study.network_file('default', seed))
             said = measure(study, seed).numbers
             print(seed, ', '.join(f'{k} {v:.3g}' for k, v in said.items()), flush=True)

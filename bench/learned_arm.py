@@ -30,6 +30,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 SELDOM, STEPS = 20.0, 400  # [s] of news between updates, and their steps: as good, and cheaper
 OF_A_POSTURE = 3  # steps of the exploration
+#: whether a posture θ (D,) is meant
+Which = Callable[[Array], bool]
 
 
 class Seldom(Training):
@@ -64,19 +66,15 @@ def initial(robot: Robot, folder: Path) -> Mae:
 
 
 def learned_arm(
-    robot: Robot,
-    seed: int,
-    folder: Path,
-    minutes: float,
-    where: Callable[[Array], bool] | None = None,
+    robot: Robot, seed: int, folder: Path, minutes: float, which: Which | None = None
 ) -> LearnedArm:
-    """Return an individual that learned in postures θ (D,) for which `where`, if any, is true."""
+    """Return an individual that learned in all postures, or in some."""
     folder.mkdir(parents=True, exist_ok=True)
     driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
     messages = folder / f'exploring_{seed}.npz'
     if not file.exists():
         stream = EXPLORATION_STREAM + seed
-        steps = postures(robot, stream, where) if where else stream
+        steps = postures(robot, stream, which) if which else stream
         exploring = record(EmulatedArm(robot, seed), driver, steps, 60.0 * minutes)
         learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
         mae = teach(learner, zip(*exploring, strict=True))
@@ -86,9 +84,9 @@ def learned_arm(
         return LearnedArm(checkpoint.load(file, robot), driver, Recording(*arrays.values()))
 
 
-def postures(robot: Robot, stream: int, where: Callable[[Array], bool]) -> Iterator[Step]:
-    """Return the exploration's steps to postures θ (D,) for which `where` is true."""
+def postures(robot: Robot, stream: int, which: Which) -> Iterator[Step]:
+    """Return the exploration's steps to some postures."""
     steps = iter(Exploration(robot, stream))
     while posture := [*islice(steps, OF_A_POSTURE)]:
-        if where(posture[0].theta):
+        if which(posture[0].theta):
             yield from posture

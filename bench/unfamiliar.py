@@ -16,15 +16,14 @@ of the true body at rest anywhere, and at all joint limits at once, where motion
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from bench.learned_arm import learned_arm, postures
-from musculoskeletal_ae.arrays import Array
+from bench.learned_arm import Which, learned_arm, postures
 from musculoskeletal_ae.control.exploration import DURATIONS
 from musculoskeletal_ae.control.posture import Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -54,7 +53,7 @@ REST_COUNTS = 'postures', 'alarms', 'narrow_alarms', 'noticed', 'named'
 RESTS, MOST_TENSE = 120, 150.0  # postures at rest, [N] their highest tension
 
 
-def near(robot: Robot, seed: int) -> Callable[[Array], bool]:
+def near(robot: Robot, seed: int) -> Which:
     """Return whether a posture θ (D,) belongs to those that are learned."""
     j = seed % robot.joint_count
     limit = robot.lower[j] + LEARNED * (robot.upper[j] - robot.lower[j])

@@ -195,9 +195,7 @@ def circles(
     return found
 
 
-def circle(
-    loop: ClosedLoop, start: Array, place: Callable[[float], pin.SE3]
-) -> tuple[Array, Array]:
+def circle(loop: ClosedLoop, start: Array, place: Place) -> tuple[Array, Array]:
     """Go round once; return where the hand was to be and where it was [m], each (N, 3)."""
     loop.go(start, STARTING)
     loop.core.pose(place(0.0), False, -1.0)

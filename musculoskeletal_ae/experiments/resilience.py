@@ -99,9 +99,11 @@ class Guarded(ClosedLoop):
 
     def run(self, duration: float) -> Array:
         """Let time pass [s]; return the error of every estimate [rad]."""
-        return np.array(
-            [(self.step(), self.error)[1] for _ in range(round(duration / SAMPLE_TIME))]
-        )
+        errors = list[float]()
+        for _ in range(round(duration / SAMPLE_TIME)):
+            self.step()
+            errors.append(self.error)
+        return np.array(errors)
 
 
 def broken(arm: Arm, mae: Mae, seed: int, muscle: int, fault: str) -> tuple[Guarded, Array]:
