@@ -60,7 +60,8 @@ def taught(arm: LearnedArm, robot: Robot, seed: int, stated: bool = False) -> Ma
     def see(learner: Learner, _n: int, true: Array, _read: Array) -> Array | None:
         return true + off if stated and not len(learner.samples) else None
 
-    return teach(learner, zip(*arm.exploring, strict=True), see)
+    teach(learner, zip(*arm.exploring, strict=True), see)
+    return learner.mae
 
 
 def zeroed(mae: Mae, exploring: Recording, held_out: Recording, seed: int) -> float:

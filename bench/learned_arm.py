@@ -77,9 +77,9 @@ def learned_arm(
         steps = postures(robot, stream, which) if which else stream
         exploring = record(EmulatedArm(robot, seed), driver, steps, 60.0 * minutes)
         learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
-        mae = teach(learner, zip(*exploring, strict=True))
+        teach(learner, zip(*exploring, strict=True))
         np.savez(messages, *exploring)
-        checkpoint.save(mae, file)
+        checkpoint.save(learner.mae, file)
     with np.load(messages) as arrays:
         return LearnedArm(checkpoint.load(file, robot), driver, Recording(*arrays.values()))
 

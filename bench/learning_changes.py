@@ -106,7 +106,8 @@ def going_on(learner: Learner, after: Streams, read_at: tuple[float, ...]) -> li
     for minutes in read_at:
         end = round(6000.0 * minutes)
         part = after.exploring.part(slice(begun, end))
-        errors.append(estimation_error(teach(learner, zip(*part, strict=True)), after.held_out))
+        teach(learner, zip(*part, strict=True))
+        errors.append(estimation_error(learner.mae, after.held_out))
         begun = end
     return errors
 
@@ -126,8 +127,8 @@ def report(robot: Robot, mae: Mae, seed: int, muscle: int, quick: bool) -> str:
     )
 
     def taught(learner: Learner, *see: See) -> float:
-        mae = teach(learner, zip(*before.exploring, strict=True), *see)
-        return estimation_error(mae, before.held_out)
+        teach(learner, zip(*before.exploring, strict=True), *see)
+        return estimation_error(learner.mae, before.held_out)
 
     learner = Learner(robot, mae, seed=seed)
     by_sensor = taught(learner)

@@ -140,7 +140,8 @@ METHODS = ('geometric', 'first', 'second', *READINGS)
 def learned(study: Study, seed: int) -> Mae:
     """Return what preset paper learns of an individual that explores with it."""
     learner, loop = beginner(study, study.arm(seed), seed, 'paper')
-    return teach(learner, explore(loop, learner, 60.0 * study.minutes))
+    teach(learner, explore(loop, learner, 60.0 * study.minutes))
+    return learner.mae
 
 
 def individual(study: Study, seed: int) -> dict[str, tuple[float, float]]:

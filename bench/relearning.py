@@ -86,7 +86,8 @@ def report(robot: Robot, seed: int, muscles: Sequence[int], quick: bool) -> str:
     before = streams(arm, mae, EXPLORATION_STREAM + seed, minutes, held_out)
     after = streams(arm, mae, AFTER_STREAM + seed, minutes, 10.0).exploring
     learner = Learner(robot, mae, seed=seed)
-    whole = estimation_error(teach(learner, zip(*before.exploring, strict=True)), before.held_out)
+    teach(learner, zip(*before.exploring, strict=True))
+    whole = estimation_error(learner.mae, before.held_out)
     samples = learner.samples.accepted
     head = ''.join(f'{text:>9s}' for text in ('at once', 'kept', *(f'{n} new' for n in NEW)))
     lines = [f'individual {seed}, {samples} samples: whole {whole:.4f} rad; {steps} readings']
@@ -105,8 +106,8 @@ def report(robot: Robot, seed: int, muscles: Sequence[int], quick: bool) -> str:
             small = without(robot, muscle, folder)
             state = folder / 'state'
             one = Learner(small, initial_mae(small, 'default').mae, seed=seed, directory=state)
-            taught = teach(one, zip(*fewer(before.exploring, muscle), strict=True))
-            had = estimation_error(taught, fewer(before.held_out, muscle))
+            teach(one, zip(*fewer(before.exploring, muscle), strict=True))
+            had = estimation_error(one.mae, fewer(before.held_out, muscle))
             one.close()
             two = Learner(robot, mae, seed=seed, directory=state)
             errors = [estimation_error(two.mae, before.held_out)]

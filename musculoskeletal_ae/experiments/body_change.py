@@ -64,10 +64,10 @@ def measure(study: Study, seed: int) -> Measured:
             numbers[f'{name}_{when}_shape_mm'] = float(shape.mean())
     if seed == study.seeds[0]:
         learner, loop = beginner(study, arm := worn_arm(robot, seed), seed, study.preset)
-        mae = teach(learner, explore(loop, learner, 60.0 * study.minutes))
+        teach(learner, explore(loop, learner, 60.0 * study.minutes))
         changed = {
             'before': traces['tension'][2]['before'],
-            'after': mae.lengths(still, stretched),
+            'after': learner.mae.lengths(still, stretched),
             'true': arm.individual.muscle_lengths(still, stretched),
         }
         traces['worn'] = tension, held, changed

@@ -77,14 +77,13 @@ def teach(
     learner: Learner,
     stream: Iterable[tuple[Array, ...]],
     see: See = lambda _learner, _n, _true, read: read,
-) -> Mae:
-    """Feed messages, rows of a recording, to a learner as the node would; return what it learned.
+) -> None:
+    """Feed messages, rows of a recording, to a learner as the node would.
 
     θ is what joint sensors read, unless `see` says otherwise.
     """
     for n, (true, read, length, tension, _) in enumerate(stream):
         learner.step(n * SAMPLE_TIME, see(learner, n, true, read), tension, length)
-    return learner.mae
 
 
 def follow(
@@ -163,8 +162,8 @@ def measure(study: Study, seed: int) -> Measured:
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
     pupil = Learner(study.robot, study.network(None, 'paper'), 'paper', seed)
-    mae = teach(pupil, zip(*study.stream(seed, 'exploring'), strict=True))
-    numbers['paper_same_stream_after_rad'] = estimation_error(mae, held_out)
+    teach(pupil, zip(*study.stream(seed, 'exploring'), strict=True))
+    numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 

@@ -181,7 +181,8 @@ def _otherwise(study: Study, seed: int, **effects: float) -> float:
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     learner, loop = online_learning.beginner(study, arm(), seed, study.preset)
     stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
-    return estimation_error(online_learning.teach(learner, stream), held_out)
+    online_learning.teach(learner, stream)
+    return estimation_error(learner.mae, held_out)
 
 
 ESTIMATES = {

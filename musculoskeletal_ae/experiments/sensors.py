@@ -77,7 +77,8 @@ def measure(study: Study, seed: int) -> Measured:
 def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -> Mae:
     initial, steps = study.network(None, 'default'), STEPS // 5 if study.quick else STEPS
     learner = Learner(study.robot, initial, 'default', seed, steps=steps, joint_source=source)
-    return teach(learner, zip(*stream, strict=True), see)
+    teach(learner, zip(*stream, strict=True), see)
+    return learner.mae
 
 
 def ellipsoid_share(mae: Mae, recording: Recording) -> float:
