@@ -251,7 +251,7 @@ def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attemp
             outcome = 'refused' if str(error).isprintable() else 'escapes in the refusal'
         except Exception as error:  # noqa: BLE001 - whatever is let out is a finding
             outcome = f'{type(error).__name__}: {error}'[:200]
-        memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / 1e6
         yield Attempt(kind, outcome, time.process_time() - begun, memory)
 
 

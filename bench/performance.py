@@ -128,7 +128,7 @@ def resident(pid: int) -> tuple[float, float]:
     """Return the resident memory of a process, and how much of it is files [MB]."""
     text = Path(f'/proc/{pid}/status').read_text('ascii')
     sizes = dict(line.split(':', 1) for line in text.splitlines())
-    whole, files = (int(sizes[key].split()[0]) / 1e3 for key in ('VmRSS', 'RssFile'))
+    whole, files = (int(sizes[key].split()[0]) * 1024 / 1e6 for key in ('VmRSS', 'RssFile'))
     return whole, files
 
 

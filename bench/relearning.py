@@ -59,12 +59,11 @@ def fewer(stream: Recording, muscle: int) -> Recording:
 
 def teach_until(learner: Learner, stream: Recording, start: float, samples: int) -> int:
     """Feed messages until so many are accepted ever; return how many messages that took."""
-    n = 0
     for n, (_, theta, length, tension, _) in enumerate(zip(*stream, strict=True)):
         if learner.samples.accepted >= samples:
-            break
+            return n
         learner.step(start + n * SAMPLE_TIME, theta, tension, length)
-    return n
+    return len(stream.theta)
 
 
 def learned(learner: Learner, after: Recording, held_out: Recording, start: float) -> list[float]:

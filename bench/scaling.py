@@ -88,7 +88,7 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     row['solve'] = microseconds(lambda: _solve(robot, mae))
     row['update'] = update_time(robot, mae, exploring)
     row['checkpoint'] = (folder / f'learned_{INDIVIDUAL}.safetensors').stat().st_size / 1e6
-    row['memory'] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    row['memory'] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     return row
 
 
@@ -169,4 +169,8 @@ def main(argv: list[str]) -> None:
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_out('DIR', 'networks, rows and plot')
     args = parser.parse_args(argv)
+    if unknown := set(args.bodies) - {SMALLEST, *BODIES}:
+        parser.error(
+            f'--bodies: no {", ".join(sorted(unknown))}, only {", ".join((SMALLEST, *BODIES))}'
+        )
     run(args.bodies, args.minutes, args.out)

@@ -82,7 +82,7 @@ class Followed(NamedTuple):
     desired: Array  # θ [rad], (N, D)
     theta: Array  # true [rad], (N, D)
     tension: Array  # ‖T‖ of the true arm while it moves [N], (N',)
-    bound: Array  # least ‖T‖ of the same, and with drag and friction, see `bounds` [N], (3, N')
+    bound: Array  # least ‖T‖ of the same, and with drag and friction, see `bounds` [N], (…, N')
     slowed: float
 
     @property
@@ -149,7 +149,8 @@ def settling(loop: ClosedLoop, goal: Array) -> float:
 def bounds(arm: Arm, motion: Setpoint) -> Array:
     """Return the least ‖T‖ [N] (3, N) that moves the true body along a path, known exactly.
 
-    By inverse dynamics alone, with the winches' drag, and with friction of wires and joints too.
+    By inverse dynamics alone, with the winches' drag, and with friction of wires and joints too;
+    the last is known of the first body only, (2, N) of others.
     """
     robot, limits, true = arm.robot, arm.robot.tension, arm.individual
     jacobian, bias = true.muscle_jacobian(motion.theta), limits.bias
@@ -244,9 +245,10 @@ def measure(study: Study, seed: int) -> Measured:
         'track_2s_rad': ours['track_rad_2s'],
         'settled_rad': 0.5 * (ours['settled_rad_1s'] + ours['settled_rad_2s']),
         'tension_ratio': 0.5 * (ours['tension_ratio_1s'] + ours['tension_ratio_2s']),
-        'tension_ratio_attainable': 0.5
-        * (ours['attainable_ratio_1s'] + ours['attainable_ratio_2s']),
     }
+    if 'attainable_ratio_1s' in ours:
+        both = ours['attainable_ratio_1s'] + ours['attainable_ratio_2s']
+        numbers['tension_ratio_attainable'] = 0.5 * both
     loop = loop_at(study.arm(seed), mae, postures[0], OURS, 1.0)
     numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
     laps = [circle(loop, *each) for each in circles(robot, mae, rng, 1 if study.quick else CIRCLES)]
@@ -266,9 +268,7 @@ def _said(runs: list[Followed]) -> dict[str, float]:
     return {
         'track_rad': float(np.mean([error.mean() for error in moving])),
         'settled_rad': float(np.mean([run.error[len(run.tension) + at] for run in runs])),
-        'tension_ratio': float(ratio[0]),
-        'winches_ratio': float(ratio[1]),
-        'attainable_ratio': float(ratio[-1]),
+        **dict(zip(('tension_ratio', 'winches_ratio', 'attainable_ratio'), ratio.tolist())),
         'slowed': float(np.mean([run.slowed for run in runs])),
     }
 
