@@ -87,6 +87,13 @@ def test_round_trip_keeps_every_bit(mae, robot):
     check_same(bare, from_bytes(to_bytes(bare)))
 
 
+def test_what_one_joint_has_learned_is_read_back():
+    learned = replace(small(), covariance=np.array([[1e-4]]))
+    back = from_bytes(to_bytes(learned))
+    check_same(learned, back)
+    np.testing.assert_array_equal(back.covariance, learned.covariance)
+
+
 def test_a_file_of_the_first_release_is_read():
     read = load(Path(__file__).parent / 'format_1.safetensors')
     for ours, theirs in zip(arrays(read), arrays(small()), strict=True):
