@@ -173,6 +173,12 @@ class _Reader:
         gain, force = m.actuator_gainprm[a], np.inf
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
             force = gain[2] if gain[2] >= 0.0 else gain[3] / max(m.actuator_acc0[a], 1e-15)
+        elif (
+            m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
+            and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+            and m.actuator_ctrllimited[a]
+        ):  # a motor
+            force = np.abs(gain[0] * m.actuator_ctrlrange[a]).max()
         if m.actuator_forcelimited[a]:
             force = min(force, np.abs(m.actuator_forcerange[a]).max())
         return float(force * abs(m.actuator_gear[a][0])) if force <= STRONGEST else 0.0

@@ -67,6 +67,14 @@ def test_what_the_format_cannot_express_is_told_and_measured(
     assert max(result.errors.values()) < 1e-6
 
 
+def test_a_motor_on_a_tendon_pulls_what_its_control_range_and_gear_say(mjcf, tmp_path):
+    muscle, motor = '<muscle name="m3" tendon="out" force="150"/>', '<motor tendon="out" gear="20" '
+    motor += 'ctrllimited="true" ctrlrange="-1 0"/>'
+    mjcf.write_text(mjcf.read_text().replace(muscle, motor))
+    result = import_robot(mjcf, tmp_path / 'out')
+    assert result.robot.tension.limit[result.robot.muscles.index('out')] == pytest.approx(20.0)
+
+
 def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
     text = mjcf.read_text()
     for old, new in {
