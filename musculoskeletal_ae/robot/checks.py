@@ -49,6 +49,8 @@ LEAST_INERTIA = 1e-6  # [kg·m²]; with less a joint cannot be simulated
 SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
 MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
+LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
+WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
 
@@ -115,7 +117,8 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     """
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     result = judge(Setting.of(robot, theta))
-    return replace(result, warnings=(*result.warnings, *_jumping_muscles(robot)))
+    suspicious = *_other_units(robot, result.moment_arms), *_jumping_muscles(robot)
+    return replace(result, warnings=(*result.warnings, *suspicious))
 
 
 def judge(setting: Setting) -> RobotCheck:
@@ -284,6 +287,27 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
                 f'at joint {robot.joints[joint]!r}, in {100 * against:.0f} % of postures',
                 f'lead it {words(robot, joint).better} the axis of that joint',
             )
+
+
+def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Numbers that look like millimetres or degrees."""
+    longest = np.abs(moment_arms).max(axis=0)
+    for m, j in np.argwhere((longest > LONGEST_ARM) & ~robot.kinematics.slides).tolist():
+        yield Finding(
+            'other_units',
+            f'muscle {robot.muscles[m]!r} has a moment arm of {longest[m, j]:.3g} m at joint '
+            f'{robot.joints[j]!r}',
+            'give all points in metres, not millimetres',
+        )
+    slides = robot.kinematics.slides.astype(int)
+    for j in np.flatnonzero(robot.upper - robot.lower > np.array(WIDEST)[slides]).tolist():
+        unit, wrong = (('rad', 'radians, not degrees'), ('m', 'metres, not millimetres'))[slides[j]]
+        yield Finding(
+            'other_units',
+            f'joint {robot.joints[j]!r} has limits of {robot.lower[j]:g} to {robot.upper[j]:g} '
+            f'{unit}',
+            f'give them in {wrong}',
+        )
 
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:

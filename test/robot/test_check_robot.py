@@ -51,6 +51,34 @@ def verdict(capsys, *arguments):
     return status, printed.out, printed.err
 
 
+def in_millimetres(document):
+    for muscle in document['muscles']:
+        for point in muscle['route']:
+            point['xyz'] = [1e3 * v for v in point['xyz']]
+
+
+def test_routes_in_millimetres_are_suspected(tmp_path, capsys):
+    _, out, _ = verdict(capsys, change(write_robot(tmp_path / 'arm'), in_millimetres))
+    assert "muscle 'bender' has a moment arm of" in out
+    assert 'in metres, not millimetres' in out
+
+
+@pytest.mark.parametrize(
+    ('low', 'high', 'told'),
+    [
+        ('-1.6', '-0.2', ''),
+        ('-90', '-12', "joint 'bend' has limits of -90 to -12 rad; give them in radians"),
+    ],
+)
+def test_limits_in_degrees_are_suspected(tmp_path, capsys, low, high, told):
+    urdf = write_robot(tmp_path / 'arm') / 'robot.urdf'
+    old = 'lower="-1.6" upper="-0.2"'
+    urdf.write_text(urdf.read_text().replace(old, f'lower="{low}" upper="{high}"'))
+    _, out, _ = verdict(capsys, urdf.parent)
+    assert ('not degrees' in out) == bool(told)
+    assert told in out
+
+
 @pytest.mark.parametrize('name', SHIPPED)
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_the_shipped_arms_are_sound_with_margin(name, seed):
