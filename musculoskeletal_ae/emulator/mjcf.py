@@ -19,6 +19,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.source import distinct, safe_name
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -215,18 +216,20 @@ def from_file(robot: Robot, file: Path) -> Any:
     except (OSError, ValueError, mujoco.FatalError) as error:
         raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
     followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
+    hand = _as_imported(spec, file, [*followers, *robot.muscles], robot.description.end_effector)
     tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
     for kind, present, wanted in (
         ('joint', spec.joints, [*followers]),
         ('spatial tendon', tendons, robot.muscles),
-        ('body', spec.bodies, [robot.description.end_effector]),
+        ('body', spec.bodies, [hand]),
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
+    given_kinds = {joint.name: joint.type for joint in spec.joints}
     for name, slides in zip(followers, robot.kinematics.prismatic[1:], strict=True):
-        due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, spec.joint(name).type
+        due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, given_kinds[name]
         if given != due:
             what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))
             told = f'joint {name!r} is a {what}, of {robot.description.directory} a {legal}'
@@ -243,8 +246,38 @@ def from_file(robot: Robot, file: Path) -> Any:
             spec.delete(tie)
     for joint in held:
         spec.delete(joint)
-    _add_hand(spec.body(robot.description.end_effector), pin.SE3.Identity())
+    _add_hand(spec.body(hand), pin.SE3.Identity())
     return _pulled(spec, robot)
+
+
+def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
+    """Let joints and tendons have the names that `import_robot` gives them; return the hand's."""
+    kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
+    if {hand, *wanted} <= {thing.name for things in kinds.values() for thing in things}:
+        return hand
+    try:
+        spec.compile()  # gives each its place
+    except (ValueError, mujoco.FatalError) as error:
+        raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
+    new: dict[str, dict[str, str]] = {'joint': {}, 'tendon': {}, 'body': {}}
+    fixed = [t for t in spec.tendons if t.path[0].type == mujoco.mjtWrap.mjWRAP_JOINT]
+    bound = {wrap.target.name: tendon.name for tendon in fixed for wrap in tendon.path}
+    for kind, things in kinds.items():
+        ordered = sorted(things, key=lambda thing: thing.id)
+        safe = [safe_name(thing.name, f'{kind}_{thing.id}') for thing in ordered]
+        for thing, name in zip(ordered, distinct(safe, ['universe']), strict=True):
+            before = thing.name
+            if kind == 'joint' and before in bound and name != before and name in wanted:
+                told = f'tendon {bound[before]!r} is of joint {before!r}, which import_robot calls'
+                raise _refusal(file, f'{told} {name!r}; call it so in the file')
+            if not before or (kind != 'body' and name in wanted):
+                thing.name = name
+            new[kind][before or name] = name
+    ties = {mujoco.mjtEq.mjEQ_JOINT: 'joint', mujoco.mjtEq.mjEQ_TENDON: 'tendon'}
+    for tie in [e for e in spec.equalities if e.type in ties]:
+        again = {old: name for old, name in new[ties[tie.type]].items() if name in wanted}
+        tie.name1, tie.name2 = (again.get(name, name) for name in (tie.name1, tie.name2))
+    return next((name for name, safe in new['body'].items() if safe == hand), hand)
 
 
 def _pulled(spec: Any, robot: Robot) -> Any:

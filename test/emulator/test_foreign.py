@@ -58,6 +58,12 @@ def drive(arm, seconds=0.3, tension=80.0):
     return np.array(rows)
 
 
+def without_noise(arm):
+    """Return where an arm is after it was driven to mid-range."""
+    drive(arm)
+    return arm.theta
+
+
 def test_without_effects_it_is_the_described_body(robot, coupled, imported):
     for model in (robot, Robot.load('musashi_left_arm'), coupled, imported[1]):
         true = ForeignArm(model, 0, NONE).individual
@@ -244,6 +250,23 @@ def test_what_ties_joints_that_are_held_is_left_out(imported, tmp_path):
     text = text.replace('joint="elbow" coef="1"/>', 'joint="more" coef="1"/>')
     other.write_text(text, encoding='utf-8')
     assert make_arm(imported[1], 0, str(other))._model.neq == 1
+
+
+def test_a_file_whose_names_import_robot_had_to_change_plays_what_it_made_of_it(imported, tmp_path):
+    text, other = bodies.MJCF, tmp_path / 'other.xml'
+    for old, new in {'elbow': 'el/bow', 'front': 'front (left)', 'finger': 'a finger'}.items():
+        text = text.replace(f'"{old}"', f'"{new}"')
+    text = text.replace('<joint name="lift"', '<joint').replace('<body name="upper"', '<body')
+    other.write_text(text, encoding='utf-8')
+    robot = import_robot(other, tmp_path / 'other').robot
+    with pytest.raises(MusculoskeletalError, match="'none' is of joint 'el/bow', which import_r"):
+        make_arm(robot, 0, str(other))
+    other.write_text(text.replace('<joint joint="el/bow"', '<joint joint="swing"'))
+    assert robot.joints == ('swing', 'joint_1', 'el_bow')
+    arms = make_arm(robot, 0, str(other)), make_arm(imported[1], 0, str(imported[0]))
+    assert arms[0]._model.neq == 1
+    np.testing.assert_allclose(*(arm.theta for arm in arms), atol=1e-9)
+    np.testing.assert_allclose(*map(without_noise, arms), atol=1e-6)
 
 
 @pytest.mark.parametrize('reality', ['~nobody at all/arm.xml', 'x' * 5000])
