@@ -20,8 +20,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 ABOVE_BIAS = 40.0  # [N] that the highest tension lies above T_bias, unless said otherwise
+LEAST_ABOVE_BIAS = 20.0  # [N]; an answer to less is not told from noise
 SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s]
 SPEED = 0.01  # [m/s] at which a target goes on inwards while the arm gives way
 RELEASE_SPEED = 0.03  # [m/s] at which it goes back
@@ -57,11 +59,27 @@ class Winding:
     def __init__(
         self, verdict: Verdict, muscles: Sequence[int] = (), highest: float | None = None
     ) -> None:
-        """Try some muscles (none: all), with at most `highest` [N] asked for."""
+        """Try some muscles (none: all), with at most `highest` [N] asked for.
+
+        Raises:
+            MusculoskeletalError: If an answer to so little could not be told from noise, or a
+                muscle would be asked for more than it may pull.
+        """
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
-        self._highest: Array = np.maximum(highest or self._bias + ABOVE_BIAS, self._bias + CLIP[0])
+        self._highest: Array = self._bias + ABOVE_BIAS
+        if highest is not None:
+            self._highest = np.full(robot.muscle_count, highest)
+        for m in self._muscles:
+            least, most = self._bias[m] + LEAST_ABOVE_BIAS, robot.tension.max[m]
+            told = f'muscle {robot.muscles[m]!r} is asked for {least:g} N at least to be judged'
+            if most < least:
+                raise MusculoskeletalError(
+                    f'{told}, its tension.max is {most:g} N: it is not wound'
+                )
+            if self._highest[m] < least:
+                raise MusculoskeletalError(f'{told}, not {self._highest[m]:g} N')
         self.trying = ''  # what is going on, for people
         self.done = False
         self._now = 0.0

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from driver.scripted import Driver
+from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.winding import Winding
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -205,6 +208,25 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     verdict = driver.wind((BICEPS,))
     assert 'sign' in verdict.wrong, str(verdict)
     assert 'l rose by' in str(verdict)
+
+
+def with_tension(limit, most):
+    bias = ROBOT.tension.bias
+    full = np.ones(ROBOT.muscle_count)
+    return Robot(replace(ROBOT.description, tension=TensionRange(bias, limit * full, most * full)))
+
+
+@pytest.mark.parametrize(
+    ('robot', 'highest', 'told'),
+    [
+        (ROBOT, 35.0, 'is asked for 50 N at least to be judged, not 35 N'),
+        (with_tension(35.0, 45.0), None, 'its tension.max is 45 N: it is not wound'),
+        (with_tension(35.0, 45.0), 60.0, 'its tension.max is 45 N: it is not wound'),
+    ],
+)
+def test_no_muscle_is_asked_for_more_than_was_said_or_may_be(robot, highest, told):
+    with pytest.raises(MusculoskeletalError, match=told):
+        Winding(Verdict(robot), (1,), highest)
 
 
 @pytest.mark.parametrize('clip', [True, False])
