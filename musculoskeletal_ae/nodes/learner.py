@@ -22,6 +22,7 @@ from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.training import TrainingProcess
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
@@ -54,10 +55,13 @@ class Learner(Shell):
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.running = self.troubled = False
-        self.follow_parameter('fresh', self._start_fresh)
-        self.follow_parameter('checkpoint', self._take_checkpoint)
-        indices, core = self.robot.muscle_indices, self.core
-        self.follow_parameter('relearn_muscles', lambda names: core.relearn(indices(names)))
+        core = self.core
+        if value('fresh'):
+            core.replace(None)
+        # What was learned comes back by no setter that is called again.
+        self.follow_parameter('fresh', self._start, self._afresh)
+        self.follow_parameter('checkpoint', self._start, self._network)
+        self.follow_parameter('relearn_muscles', core.relearn, self.robot.muscle_indices)
         self.running = True
         self.needed = ['muscle_states']
         if topic := JOINT_TOPICS.get(value('joint_source')):
@@ -86,22 +90,21 @@ class Learner(Shell):
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
-    def _start_fresh(self, value: bool) -> None:
-        if not value:
-            return
-        if not self.running:
-            self.core.replace(None)
-            return
+    def _afresh(self, value: bool) -> Mae | None:
+        """Return the network to start anew from while the node runs."""
+        if not (value and self.running):
+            return None
         path = self.parameter('checkpoint')
         if not path:
             raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
-        self._take_checkpoint(path)
+        return self._network(path)
 
-    def _take_checkpoint(self, path: str) -> None:
-        if path and self.running:
-            self.core.replace(checkpoint.load(path, self.robot))
-        elif path and self.core.checkpoint is None:
-            self.core.begin(checkpoint.load(path, self.robot))
+    def _network(self, path: str) -> Mae | None:
+        wanted = path and (self.running or self.core.checkpoint is None)
+        return checkpoint.load(path, self.robot) if wanted else None
+
+    def _start(self, mae: Mae) -> None:
+        (self.core.replace if self.running else self.core.begin)(mae)
 
     # -- messages -------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -65,6 +66,8 @@ class Shell(Node):
         super().__init__(name, **options)
         self._table = PARAMETERS[name]
         self._setters: dict[str, Callable[[Any], object]] = {}
+        self._prepare: dict[str, Callable[[Any], object]] = {}
+        self._proposed: dict[str, Any] = {}  # values that are being judged
         for key, parameter in self._table.items():
             default = parameter.default
             default = list(default) if isinstance(default, tuple) else default
@@ -142,18 +145,52 @@ class Shell(Node):
 
     def parameter(self, name: str) -> Any:
         """Return a parameter's value, if it is legal; lists as tuples, without empty names."""
-        return self._checked(name, self.get_parameter(name).value, lambda value: value)
+        with _blaming(name):
+            value = self._proposed.get(name, self.get_parameter(name).value)
+            return self._table[name].checked(value)
 
-    def follow_parameter(self, name: str, setter: Callable[[Any], object]) -> None:
-        """Call `setter`, which raises to refuse, with a parameter's value now and when set."""
-        self._checked(name, self.get_parameter(name).value, setter)
+    def follow_parameter(
+        self,
+        name: str,
+        setter: Callable[[Any], object],
+        prepare: Callable[[Any], object] | None = None,
+    ) -> None:
+        """Call `setter`, which raises to refuse, with a parameter's value now and when set.
+
+        It is called again with the value before if another one of those set together is refused.
+        Where that would bring nothing back, `prepare` makes of the value what the setter takes, or
+        None for nothing to do, and raises to refuse: such setters are called last, in the order in
+        which they were given, one that several parameters share once. Only the first may raise.
+        """
         self._setters[name] = setter
+        if prepare is not None:
+            self._prepare[name] = prepare
+        self._take({name: self.get_parameter(name).value})
 
-    def _checked(self, name: str, value: Any, setter: Callable[[Any], Any]) -> Any:
+    def _take(self, values: dict[str, Any]) -> None:
+        """Call the setters of parameters, of all or, if one is refused, of none."""
+        legal, last = dict[str, Any](), dict[Callable[[Any], object], tuple[str, Any]]()
+        for name in filter(values.__contains__, self._setters):
+            with _blaming(name):
+                legal[name] = self._table[name].checked(values[name])
+                if prepare := self._prepare.get(name):
+                    prepared = prepare(legal.pop(name))
+                    if prepared is not None:
+                        last[self._setters[name]] = name, prepared
+        taken: list[str] = []
         try:
-            return setter(self._table[name].checked(value))
-        except (MusculoskeletalError, OSError) as error:
-            raise MusculoskeletalError(f'parameter {name}: {error}') from error
+            for name, value in legal.items():
+                with _blaming(name):
+                    self._setters[name](value)
+                taken.append(name)
+            for setter, (name, value) in last.items():
+                with _blaming(name):
+                    setter(value)
+        except MusculoskeletalError:
+            self._proposed = {}
+            for name in reversed(taken):
+                self._setters[name](self.parameter(name))
+            raise
 
     def _take_old_names(self) -> None:
         """Read parameters by the names that they had a version ago, and say so."""
@@ -168,17 +205,13 @@ class Shell(Node):
             self.declare_parameter(old, self.get_parameter(new).value, told)
 
     def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        taken: list[str] = []
-        for name, value in ((RENAMED.get(p.name, p.name), p.value) for p in parameters):
-            if name not in self._setters:
-                continue
-            try:
-                self._checked(name, value, self._setters[name])
-            except MusculoskeletalError as error:
-                for before in reversed(taken):  # all or nothing
-                    self.follow_parameter(before, self._setters[before])
-                return SetParametersResult(successful=False, reason=str(error))
-            taken.append(name)
+        self._proposed = {RENAMED.get(p.name, p.name): p.value for p in parameters}
+        try:
+            self._take(self._proposed)
+        except MusculoskeletalError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        finally:
+            self._proposed = {}
         return SetParametersResult(successful=True)
 
     # -- checkpoints ----------------------------------------------------------------------------
@@ -204,12 +237,14 @@ class Shell(Node):
                 raise CheckpointError(f'cannot be computed with ({error})') from error
             gate.take(mae, time.monotonic())
 
-        def from_file(path: str) -> None:
+        def load(path: str) -> Mae | None:
+            return checkpoint.load(path, self.robot) if path else None
+
+        def from_file(mae: Mae) -> None:
             nonlocal given_up
-            if path:
-                deque(take(checkpoint.load(path, self.robot)), maxlen=0)
-                given_up += 1
-                self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
+            deque(take(mae), maxlen=0)
+            given_up += 1
+            self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
         async def from_topic(message: UInt8MultiArray) -> None:
             nonlocal waiting
@@ -240,7 +275,7 @@ class Shell(Node):
 
         self.take_anomaly = anomaly
         self.needed.append('mae_checkpoint')
-        self.follow_parameter('checkpoint', from_file)
+        self.follow_parameter('checkpoint', from_file, load)
         self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
 
     # -- messages -------------------------------------------------------------------------------
@@ -396,6 +431,15 @@ class Shell(Node):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+@contextmanager
+def _blaming(name: str) -> Iterator[None]:
+    """Let errors name the parameter that they are about."""
+    try:
+        yield
+    except (MusculoskeletalError, OSError) as error:
+        raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

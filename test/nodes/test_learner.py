@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -236,6 +237,30 @@ def test_relearning_names_legal_muscles(host, graph, arm26):
     assert graph.call(Trigger, 'learner/relearn').success
     assert not any(known[1] for known in learner.node.core.samples.known)
     assert all(known[0] for known in learner.node.core.samples.known)
+
+
+def test_parameters_that_are_refused_together_make_it_forget_nothing(
+    host, arm26, trained_file, state
+):
+    learner = host(state_directory=state)
+    core, first = learner.node.core, arm26.muscles[0]
+
+    def together(**values):
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        return learner.node.set_parameters_atomically(parameters)
+
+    assert together(relearn_muscles=[arm26.muscles[1]]).successful
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    refused = together(relearn_muscles=[first], checkpoint='/nowhere')
+    assert not refused.successful and '/nowhere' in refused.reason
+    assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
+    assert not together(fresh=True, checkpoint='').successful
+    assert learner.samples >= 2 and all(known.all() for known in core.samples.known)
+    # One start, and one backup of all that was known.
+    assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
+    assert learner.samples == 0
+    assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1']
+    assert together(checkpoint='').successful
 
 
 # -- real processes -------------------------------------------------------------------------------

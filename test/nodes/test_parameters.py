@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 from graph import DEADLINE, executable
+from rclpy.parameter import Parameter as RosParameter
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.controller import Controller
@@ -102,6 +103,36 @@ def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
     )
     assert done.returncode == 1, done.stderr
     assert name in done.stderr and 'Traceback' not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ('kind', 'parameters', 'kept'),
+    [
+        (
+            HardwareEmulator,
+            {'command_timeout': 1.0, 'faults': ['melt']},
+            lambda node: node.arm.command_timeout,
+        ),
+        # The network in use may have been learned since the file was read.
+        (
+            Estimator,
+            {'checkpoint': '', 'isolate_muscles': ['tail']},
+            lambda node: id(node.core.mae),
+        ),
+    ],
+)
+def test_of_parameters_set_together_none_is_taken_if_one_is_refused(
+    graph, trained_file, kind, parameters, kept
+):
+    given = {'checkpoint': trained_file} if 'checkpoint' in parameters else {}
+    node = graph.host(kind, robot='arm26', **given)
+    before = kept(node)
+    one, other = (RosParameter(name, value=value) for name, value in (parameters | given).items())
+    result = node.set_parameters_atomically([one, other])
+    assert not result.successful and result.reason.startswith(f'parameter {other.name}: ')
+    assert kept(node) == before
+    assert node.set_parameters_atomically([one]).successful
+    assert kept(node) != before
 
 
 def test_a_word_that_is_not_legal_is_refused_with_those_that_are():
