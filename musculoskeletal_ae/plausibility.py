@@ -99,7 +99,7 @@ class Plausibility:
         wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
         used = self._robot.used
         known = None if length is None else length * used
-        error = self.levels(tension * used, known, temperature, wound)
+        error = self.levels(tension * used, known, np.where(used, temperature, np.nan), wound)
         if error is None and length is not None:
             error = self._step(length, now)
         self.muscles.note(error, now)

@@ -35,7 +35,8 @@ def read_array(message: Any, rows: int, columns: int, ignored: Sequence[int] = (
     """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
 
     Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
-    Of ignored columns nothing counts: what is not finite there is returned as 0.
+    Of ignored columns nothing counts: what is not finite there is returned as 0, a temperature as
+    NaN.
     """
     if len(message.data) > MOST_ENTRIES:
         raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
@@ -59,6 +60,7 @@ def read_array(message: Any, rows: int, columns: int, ignored: Sequence[int] = (
     unknown = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
     values[unknown], finite[unknown] = 0.0, True
     if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
+        values[2 * columns :][unknown[2 * columns :]] = np.nan
         finite[2 * columns :] |= np.isnan(values[2 * columns :])
     if not finite.all():
         raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from robots import write_robot
@@ -34,6 +36,19 @@ def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
     row[0] = 1.01 * -longest_lengths(ROBOT)[0]
     with pytest.raises(MessageError, match='length beyond what the joints allow'):
         Plausibility(ROBOT).check_muscles(tension, row, WARM, 0.0)
+
+
+@pytest.mark.parametrize('temperature', [500.0, np.inf, np.nan])
+def test_an_isolated_muscle_may_say_anything(temperature):
+    robot = copy.copy(ROBOT)
+    plausibility, hot = Plausibility(robot), WARM.copy()
+    hot[1] = temperature
+    values = robot.tension.bias, np.zeros(robot.muscle_count), hot
+    if not np.isnan(temperature):  # else it is unknown anyway
+        with pytest.raises(MessageError, match='temperature of no module'):
+            plausibility.check_muscles(*values, 0.0)
+    robot.isolate([1])
+    plausibility.check_muscles(*values, 0.01)
 
 
 def test_what_slides_is_told_in_metres(tmp_path):

@@ -84,6 +84,8 @@ def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
     np.testing.assert_array_equal(read_array(muscle_array(values), 3, 2).ravel(), values)
     with pytest.raises(MessageError, match='not finite'):
         read_array(muscle_array([float('nan'), 2.0]), 1, 2)
+    ignored = read_array(muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0]), 3, 2, [0])
+    np.testing.assert_array_equal(ignored, [[0.0, 2.0], [3.0, 4.0], [math.nan, 25.0]])
 
 
 def test_joints_are_matched_by_name_and_foreign_ones_ignored():

@@ -22,7 +22,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.heat import Heat
-from musculoskeletal_ae.plausibility import Plausibility
+from musculoskeletal_ae.plausibility import TEMPERATURES, Plausibility
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
@@ -65,9 +65,14 @@ class Watch:
         awake = now - self._asleep
         before, self._came_at['muscle_states'] = self._came_at['muscle_states'], awake
         since = awake - before if before > -math.inf else 0.0
-        # NaN is not known, and no reason for anything.
-        self._temperatures.append(np.nan_to_num(temperature, nan=-np.inf))
-        self.heat.step(tension, np.median(np.array(self._temperatures), axis=0), since)
+        # NaN is not known, and no reason for anything; so is what an isolated module cannot be.
+        # One that can be hot burns whoever uses it, but its tension may be anything: it is told to
+        # pull T_bias at most.
+        low, high = TEMPERATURES
+        possible = (temperature >= low) & (temperature <= high)
+        self._temperatures.append(np.where(possible, temperature, -np.inf))
+        pull = np.where(self._robot.used, tension, self._robot.description.tension.bias)
+        self.heat.step(pull, np.median(np.array(self._temperatures), axis=0), since)
 
     def pulled(self, tension: Array, now: float) -> None:
         """Take T [N] (M,) of the same muscle_states, without glitches."""
@@ -154,10 +159,11 @@ class Watch:
         return ''
 
     def _overheat(self) -> str:
-        now, bias = np.nan_to_num(self.heat.core, nan=-np.inf), self._robot.tension.bias
+        now, robot = np.nan_to_num(self.heat.core, nan=-np.inf), self._robot
         highest = self.settings.temperature_limit
         hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
-        self._overheated = bool(hot or (self.limit <= bias).all())
-        name = self._robot.muscles[int(now.argmax())]
+        exhausted = (self.limit <= robot.tension.bias)[robot.used]
+        self._overheated = bool(hot or (exhausted.all() and exhausted.any()))
+        name = robot.muscles[int(now.argmax())]
         told = f'overheated: {name} {now.max():.0f} °C, limit {highest:g} °C'
         return told if self._overheated else ''

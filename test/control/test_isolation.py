@@ -93,6 +93,41 @@ def test_what_its_sensors_read_moves_nothing():
     np.testing.assert_array_equal(sent[0][USED], sent[1][USED])
 
 
+@pytest.mark.parametrize(
+    ('temperature', 'tension', 'cause'),
+    [
+        (150.0, 60.0, f'overheated: {ROBOT.muscles[LOST]}'),  # its motor burns all the same
+        (500.0, 60.0, ''),
+        (np.nan, 60.0, ''),
+        (90.0, 450.0, ''),  # a tension that it cannot have warms it no further
+    ],
+)
+def test_an_isolated_motor_that_is_hot_stops_the_arm_and_one_that_cannot_be_does_not(
+    temperature, tension, cause
+):
+    bench = Bench()
+    bench.core.isolate([LOST])
+    bench.step()
+    bench.target(REST)
+    bench.step(10)
+    bench.tension = np.where(USED, 60.0, tension)
+    bench.temperature = np.where(USED, 30.0, temperature)
+    bench.dt = 0.1
+    bench.step(300)
+    assert bench.core.safety.cause[: len(cause) or None] == cause
+
+
+def test_others_that_are_all_too_hot_to_pull_stop_the_arm():
+    bench = Bench()
+    bench.core.isolate([LOST])
+    bench.step()
+    bench.target(REST)
+    bench.step(10)
+    bench.temperature = np.where(USED, bench.core.settings.temperature_limit + 10.0, 30.0)
+    bench.step(300)
+    assert bench.core.safety.cause.startswith('overheated')
+
+
 def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench = Bench(target_duration=1.0)
     bench.core.isolate([LOST])
