@@ -151,14 +151,22 @@ class Parser(argparse.ArgumentParser):
 
 
 def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
-    """Save the figure that `draw` returns, if one is wanted, and say where, or why it cannot be."""
-    if file is None:
-        return
+    """Save the figure that `draw` returns, if one is wanted, and say where."""
+    if file is not None:
+        save_figure(draw(), file)
+        print(f'plot: {file}')
+
+
+def save_figure(figure: Any, file: Path) -> None:
+    """Save a figure of matplotlib.
+
+    Raises:
+        MusculoskeletalError: If it cannot be written, or the file's ending is none of a picture.
+    """
     try:
-        draw().savefig(file, dpi=110)
+        figure.savefig(file, dpi=110)
     except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
-        raise MusculoskeletalError(f'plot {file} cannot be written: {error}') from error
-    print(f'plot: {file}')
+        raise MusculoskeletalError(f'picture {file} cannot be written: {error}') from error
 
 
 def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:

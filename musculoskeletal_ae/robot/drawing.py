@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.options import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
 # Shorter bones are two joints in one place.
@@ -69,12 +70,13 @@ def _within(line: Line, middle: Array, reach: float) -> Line:
     return line._replace(points=points[inside[[0, -1]] if len(inside) else inside])
 
 
-def save_picture(
-    lines: Sequence[Line], path: str | Path, title: str = '', whole: bool = True
-) -> None:
-    """Draw lines from the front and from the side, in true proportions, and save a PNG.
+def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool = True) -> None:
+    """Draw lines from the front and from the side, in true proportions, and save a picture.
 
     Or what of them is where the muscles are.
+
+    Raises:
+        MusculoskeletalError: If it cannot be written, or the path's ending is none of a picture.
     """
     from matplotlib.figure import Figure
 
@@ -96,4 +98,4 @@ def save_picture(
         axes.locator_params(nbins=5)
         axes.view_init(elev=10.0, azim=azimuth)
     figure.suptitle(title or 'muscles: green at bias tension, red at the limit')
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import TransformStamped
+from graph import Process, executable
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
@@ -54,6 +55,18 @@ def test_estimate_and_hardware_are_drawn_apart_with_names_in_prefixed_frames(
     )
     assert tuple(mine.name) == arm26.muscles
     assert mine.header.stamp.sec > 0
+
+
+@pytest.mark.parametrize(('file', 'status'), [('arm.png', 0), ('arm.foo', 1)])
+def test_a_picture_is_written_or_its_ending_refused(graph, tmp_path, file, status):
+    graph.host(HardwareEmulator, robot='arm26')
+    out = tmp_path / file
+    arguments = ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}']
+    tool = Process('render', [*executable('render'), *arguments])
+    graph.wait(lambda: not tool.alive(), 'its end')
+    ended, output = tool.ended()
+    assert ended == status and out.exists() is (status == 0)
+    assert status == 0 or (file in output and 'supported' in output and 'Traceback' not in output)
 
 
 def test_poses_of_all_links_go_to_tf_where_tf2_msgs_is(graph, monkeypatch):

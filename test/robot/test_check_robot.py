@@ -343,8 +343,9 @@ finally:
         assert name in done.stdout
 
 
-def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, capsys):
-    assert main(['arm26', '--plot', str(tmp_path / 'no' / 'such' / 'plot.png')]) == 1
+@pytest.mark.parametrize('file', ['no/such/plot.png', 'plot.foo'])
+def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(file, tmp_path, capsys):
+    assert main(['arm26', '--plot', str(tmp_path / file)]) == 1
     assert 'cannot be written' in capsys.readouterr().err
 
 
