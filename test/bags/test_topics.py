@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import random
+import re
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +23,7 @@ from musculoskeletal_ae.exceptions import BagError
 DEFAULT = {
     'joint_states',
     'muscle_states',
+    'imu',
     'marker_pose',
     'robot_description',
     'target_joint_states',
@@ -32,6 +35,7 @@ DEFAULT = {
     'sim/external_wrench',
     'sim/fixed_joint_states',
 }
+LEFT_OUT = {'estimated/markers', 'muscle_joint_states'}  # the same
 STRING = 'std_msgs/msg/String'
 
 
@@ -47,6 +51,15 @@ def make(path, *topics):
 
 def ours(*names):
     return [(name, TOPICS[relative].type) for name, relative in names]
+
+
+def test_the_topics_are_those_of_the_interface():
+    text = (Path(__file__).parents[2] / 'doc' / 'interface.md').read_text('utf-8')
+    table = text.partition('| topic | type |')[2].partition('\n\n')[0]
+    told = {
+        name for row in table.splitlines()[2:] for name in re.findall('`(.*?)`', row.split('|')[1])
+    }
+    assert told - LEFT_OUT == {*TOPICS}
 
 
 @pytest.mark.parametrize(
