@@ -66,6 +66,7 @@ def test_no_code_is_made_of_a_definition(tmp_path, monkeypatch):
     for library in ('codegen.gen_code', 'store.Typestore.register'):
         name = f'rosbags.typesys.{library}'
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail('compiled'), raising=False)
+    monkeypatch.delitem(sys.modules, 'rosbags.usertypes', raising=False)  # another test's
     bag = Bag.open(write(tmp_path / 'a.mcap', text=text))
     assert [bag.decode(message).data for message in bag.messages()] == [1.0]
     assert 'rosbags.usertypes' not in sys.modules
