@@ -79,7 +79,7 @@ class Controller(Shell):
                 self, kind, self.core, self._trajectory, refuse
             )
         self.follow_anomaly(self._anomaly)
-        self.follow_isolated(self.core.isolate)
+        self.follow_isolated(self._isolate)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
@@ -103,6 +103,10 @@ class Controller(Shell):
     def _shift(self, known: bool, less: Array) -> None:
         self.core.zeros(known, less)
         self.gate.forget()
+
+    def _isolate(self, muscles: tuple[int, ...]) -> None:
+        self.gate.isolated = muscles
+        self.core.isolate(muscles)
 
     def _muscles(self, states: Array) -> None:
         muscles, now = Muscles(*states), time.monotonic()

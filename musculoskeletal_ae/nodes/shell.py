@@ -369,9 +369,8 @@ class Shell(Node):
         """Tell which muscles the estimator has isolated, places in T and l, when that changes."""
 
         def take(message: String) -> None:
-            muscles = tuple(sorted({*self.robot.muscle_indices(read_names(message))}))
-            self.gate.isolated = self.left_out = muscles
-            isolate(muscles)
+            self.left_out = tuple(sorted({*self.robot.muscle_indices(read_names(message))}))
+            isolate(self.left_out)
 
         self.listen(String, 'isolated_muscles', take, LATCHED)
 

@@ -64,6 +64,7 @@ class Sim(Arm):
             self.arm.use(mae)
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
+        self.gate.isolated = muscles
         if self.arm is not None:
             self.arm.isolate(muscles)
 

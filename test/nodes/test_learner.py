@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Bool, Float64MultiArray, UInt8MultiArray
+from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.learning.rest import MARGIN
@@ -261,6 +261,25 @@ def test_parameters_that_are_refused_together_make_it_forget_nothing(
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1']
     assert together(checkpoint='').successful
+
+
+def test_it_takes_from_the_estimator_who_is_isolated_but_not_from_one_that_knows_nobody_yet(
+    host, graph, arm26, trained, tmp_path
+):
+    file, names = str(tmp_path / 'without.safetensors'), arm26.muscles
+    checkpoint.save(trained['default'].without((4,)), file)
+    learner = host(checkpoint=file)
+    isolated = graph.publisher(String, 'isolated_muscles', LATCHED)
+
+    def known():
+        return learner.node.core.mae.isolated
+
+    isolated.publish(String(data=''))  # of an estimator that has just started
+    graph.wait(lambda: learner.node.told, 'what it says')
+    assert known() == (4,)
+    for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
+        isolated.publish(String(data=text))
+        graph.wait(lambda wanted=muscles: known() == wanted, text or 'nobody')
 
 
 # -- real processes -------------------------------------------------------------------------------
