@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 Level = Literal['ok', 'warn', 'error']
@@ -14,3 +15,8 @@ class Report(NamedTuple):
     level: Level
     message: str
     values: dict[str, str]
+
+
+def whole(value: float, unit: str = '') -> str:
+    """Return a whole number and its unit for people to read, or that it is not known: NaN."""
+    return '–' if math.isnan(value) else f'{value:.0f} {unit}'.rstrip()

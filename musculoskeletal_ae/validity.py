@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 
@@ -31,12 +31,18 @@ UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
-def read_array(message: Any, rows: int, columns: int, ignored: Sequence[int] = ()) -> Array:
+def read_array(
+    message: Any,
+    rows: int,
+    columns: int,
+    ignored: Sequence[int] | Ints = (),
+    unknown: float = 0.0,
+) -> Array:
     """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
 
     Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
-    Of ignored columns nothing counts: what is not finite there is returned as 0, a temperature as
-    NaN.
+    Of ignored columns nothing counts: what is not finite there is returned as `unknown`, a
+    temperature as NaN.
     """
     if len(message.data) > MOST_ENTRIES:
         raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
@@ -57,10 +63,10 @@ def read_array(message: Any, rows: int, columns: int, ignored: Sequence[int] = (
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.array(message.data, dtype=float)
     finite = np.isfinite(values)
-    unknown = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
-    values[unknown], finite[unknown] = 0.0, True
+    left_out = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
+    values[left_out], finite[left_out] = unknown, True
     if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
-        values[2 * columns :][unknown[2 * columns :]] = np.nan
+        values[2 * columns :][left_out[2 * columns :]] = np.nan
         finite[2 * columns :] |= np.isnan(values[2 * columns :])
     if not finite.all():
         raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')

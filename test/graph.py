@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -20,11 +21,12 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from std_msgs.msg import UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
-from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.nodes.running import LeanExecutor
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.robot import Robot
 
 DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
@@ -217,6 +219,20 @@ class Graph:
         for node in (*self.hosted, self.node):
             node.destroy_node()
         rclpy.shutdown(context=self.context)
+
+
+def no_number_of(graph: Graph, robot: Robot, muscle: str) -> Callable[[], None]:
+    """Isolate a muscle; return what publishes states in which its tension is NaN."""
+    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=muscle))
+    publisher = graph.publisher(Float64MultiArray, 'muscle_states')
+    rows = np.tile([[0.0], [61.0], [25.0]], robot.muscle_count)
+    rows[1, robot.muscles.index(muscle)] = np.nan
+
+    def publish() -> None:
+        publisher.publish(array_message(rows, 'quantity', 'muscle'))
+        graph.spin(0.05)
+
+    return publish
 
 
 def _yaml(value: Any) -> str:

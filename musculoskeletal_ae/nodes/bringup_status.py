@@ -3,8 +3,8 @@
 
 On a terminal, where rich is installed (`--view` brings it), one screen instead, with muscles.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, muscle_states, /diagnostics →
-stdout.
+joint_states, estimated_joint_states, anomaly, anomaly_detected, muscle_states, isolated_muscles,
+/diagnostics → stdout.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -52,7 +53,8 @@ class BringupStatus(Shell):
         self.states: Array | None = None
         self.screen = open_screen()
         if self.screen is not None:
-            self.follow_muscle_states(partial(setattr, self, 'states'))
+            self.follow_isolated(lambda _: None)  # of whom anything may be read
+            self.follow_muscle_states(partial(setattr, self, 'states'), unknown=math.nan)
         self.create_timer(1.0, self._print, clock=STEADY)
 
     def destroy_node(self) -> None:
@@ -98,7 +100,10 @@ def open_screen() -> Any:
 
 
 def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> Any:
-    """Return lines, and l [m], T [N] and °C (3, M) as a table with bars, for a terminal."""
+    """Return lines, and l [m], T [N] and °C (3, M) as a table with bars, for a terminal.
+
+    What is NaN is not known.
+    """
     from rich.bar import Bar
     from rich.console import Group
     from rich.table import Table
@@ -110,7 +115,7 @@ def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> An
     rows = () if states is None else zip(robot.muscles, robot.tension.limit, states.T)
     for name, limit, (length, tension, temperature) in rows:
         colour = 'blue' if tension < limit else 'dark_orange'
-        bar = Bar(limit, 0.0, max(tension, 0.0), width=30, color=colour)
-        table.add_row(name, f'{1e3 * length:.0f}', f'{tension:.0f}', bar, f'{temperature:.0f}')
+        bar = Bar(limit, 0.0, max(0.0, tension), width=30, color=colour)
+        table.add_row(name, whole(1e3 * length), whole(tension), bar, whole(temperature))
     texts = [Text(printable(lines[0])), Text(printable(lines[1]), style='bold red')]
     return Group(*filter(None, texts), table)

@@ -310,12 +310,14 @@ class Shell(Node):
         warn: Callable[[str], object] | None = None,
         as_read: bool = False,
         unread: Callable[[Array], object] | None = None,
+        unknown: float = 0.0,
     ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
         If several nodes publish them, `warn` is told who, '' once it is one; without it their
         messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`. What
-        is rejected though it has the right shape is given to `unread`.
+        is rejected though it has the right shape is given to `unread`. What is not finite of
+        isolated muscles is `unknown`, a temperature NaN.
         """
         intruders, shape = '', (len(QUANTITIES), self.robot.muscle_count)
 
@@ -327,7 +329,7 @@ class Shell(Node):
 
         def from_one(message: Float64MultiArray) -> None:
             try:
-                states = read_array(message, *shape, self.left_out)
+                states = read_array(message, *shape, self.left_out, unknown)
             except MessageError:
                 if unread and not intruders and len(message.data) == math.prod(shape):
                     unread(np.reshape(message.data, shape))

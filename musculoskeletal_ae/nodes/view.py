@@ -95,14 +95,16 @@ class View(Node):
     # -- what comes -----------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
-        muscles, joints = self.robot.muscle_count, self.robot.joints
+        robot, joints = self.robot, self.robot.joints
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
             for arm, topic in ARM_TOPICS.items()
         ]
         table += [
             ('muscles', Float64MultiArray, 'muscle_states', NEWEST,
-             lambda m: read_array(m, len(QUANTITIES), muscles)),
+             lambda m: read_array(
+                 m, len(QUANTITIES), robot.muscle_count, self._isolated(), math.nan
+             )),
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
@@ -169,11 +171,17 @@ class View(Node):
 
     def _kinds(self) -> Ints:
         suspects = [self.situation.suspect] * self.situation.detected
-        isolated = self._newest('isolated', math.inf) or []
+        groups = self._places(suspects), self._isolated(), self._places(self.ruptured)
         kinds = np.zeros(self.robot.muscle_count, dtype=int)
-        for kind, names in enumerate((suspects, isolated, self.ruptured), 1):  # as in body.Kind
-            kinds[np.isin(self.robot.muscles, names)] = kind
+        for kind, muscles in enumerate(groups, 1):  # as in body.Kind
+            kinds[muscles] = kind
         return kinds
+
+    def _places(self, names: list[str]) -> Ints:
+        return np.flatnonzero(np.isin(self.robot.muscles, names))
+
+    def _isolated(self) -> Ints:
+        return self._places(self._newest('isolated', math.inf) or [])
 
     def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
         told, error, anomaly = self.situation, math.nan, self._newest('anomaly')

@@ -33,9 +33,10 @@ class Line(NamedTuple):
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
-    """Return how far T [N] (M,) is on the way from T_bias to T_limit, within [0, 1]."""
+    """Return how far T [N] (M,) is on the way from T_bias to T_limit, within [0, 1]; NaN: 0."""
     limits = robot.tension
-    return np.clip((tension - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
+    known = np.nan_to_num(tension)
+    return np.clip((known - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
 
 
 def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = None) -> list[Line]:

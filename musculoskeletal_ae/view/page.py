@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, Kind
@@ -217,7 +218,7 @@ class Page:
     ) -> None:
         """Show what is going on: T [N] and temperatures [°C], (2, M), as bars, values as curves.
 
-        Those are error [rad], A, d and its limit at a time [s], NaN where it is not known.
+        Those are error [rad], A, d and its limit at a time [s]. NaN is not known.
         """
         self._status.content = str(HTML.status(alarm, lines))
         self._bars.content = str(HTML.bars(self._muscles(*states)))
@@ -236,13 +237,13 @@ class Page:
         """Return what the bars show of each muscle."""
         columns = {
             'rgb': map(tuple, body.colours(self._robot, tension, self._kinds).tolist()),
-            'share': 100.0 * np.clip(tension / self._robot.tension.limit, 0.0, 1.0),
+            'share': 100.0 * np.clip(np.nan_to_num(tension) / self._robot.tension.limit, 0.0, 1.0),
             'heat': 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0),
             'name': self._robot.muscles,
             'mark': [MARKS[kind] for kind in self._kinds],
             'kind': [Kind(kind).name.lower() for kind in self._kinds],
-            'pull': [f'{each:.0f} N' for each in tension],
-            'warm': [f'{each:.0f} °C' if np.isfinite(each) else '–' for each in temperature],
+            'pull': [whole(each, 'N') for each in tension],
+            'warm': [whole(each, '°C') for each in temperature],
         }
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
 

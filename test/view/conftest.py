@@ -3,6 +3,6 @@
 
 from __future__ import annotations
 
-from nodes.conftest import graph
+from nodes.conftest import arm26, graph
 
-__all__ = ['graph']
+__all__ = ['arm26', 'graph']

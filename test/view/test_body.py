@@ -52,6 +52,14 @@ def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot
     assert radius[1][0] > 2.0 * radius[0][0]
 
 
+def test_a_muscle_of_unknown_tension_is_drawn_as_one_that_does_not_pull(robot, theta):
+    tension = np.full((2, robot.muscle_count), robot.tension.bias)
+    tension[0, 2], kinds = np.nan, np.zeros(robot.muscle_count, dtype=int)
+    unknown, known = (muscle_tubes(robot, theta, each, kinds) for each in tension)
+    for name in known:
+        np.testing.assert_array_equal(unknown[name], known[name])
+
+
 def test_a_wire_that_wraps_is_drawn_round_and_has_as_many_tubes_where_it_lifts_off(tmp_path):
     directory = write_robot(tmp_path)
     document = read_muscles(directory)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph import Process, executable
+from graph import Process, executable, no_number_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
@@ -111,6 +111,22 @@ def test_a_visitor_sees_the_arm_move_cuts_a_muscle_and_sees_the_alarm(
     finally:
         page.close()
     graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'nobody to look any more')
+
+
+@chromium
+def test_muscles_are_shown_where_an_isolated_one_says_no_number(graph, view, arm26, tmp_path):
+    page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{view("--read-only")}')
+    try:
+        publish = no_number_of(graph, arm26, 'brachialis')
+
+        def shown():
+            publish()
+            return '61 N' in page.text
+
+        graph.wait(shown, 'the tension of the others')
+        assert 'brachialis' in page.text and 'nan' not in page.text
+    finally:
+        page.close()
 
 
 def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
