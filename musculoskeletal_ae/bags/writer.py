@@ -137,7 +137,9 @@ class BagWriter:
             raise BagError(self.directory, problem, 'name another place') from error
 
 
-def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None]:
+def recover(
+    path: Path, out: Path | None = None, compression: str = 'zstd'
+) -> tuple[Path, int, Path | None]:
     """Write all complete messages of an unfinished bag, directory or .mcap, into a finished one.
 
     Without a new directory `out`, a directory is replaced, and the original kept beside it as
@@ -149,12 +151,12 @@ def recover(path: Path, out: Path | None = None) -> tuple[Path, int, Path | None
         raise BagError(path, 'the recording is finished', 'there is nothing to recover')
     if out is not None or not path.is_dir():
         target = out or path.with_name(f'{path.stem}_recovered')
-        return target, _copy(bag, target), None
+        return target, _copy(bag, target, compression), None
     # The new bag is complete before the old one is touched; its file carries the final name.
     path = path.resolve()
     backup, scratch = _free(path, '.unfinished'), _free(path, '.recovering')
     try:
-        messages = _copy(bag, scratch / path.name)
+        messages = _copy(bag, scratch / path.name, compression)
     except BaseException:
         shutil.rmtree(scratch, ignore_errors=True)
         raise
@@ -177,9 +179,9 @@ def _open(path: Path) -> tuple[Bag, bool]:
     return bag, not bag.unfinished
 
 
-def _copy(bag: Bag, target: Path) -> int:
+def _copy(bag: Bag, target: Path, compression: str) -> int:
     """Write a bag anew and read it again; return its number of messages."""
-    with BagWriter(target) as writer:
+    with BagWriter(target, compression) as writer:
         for name, topic in bag.topics.items():
             writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
         for message in bag.messages():

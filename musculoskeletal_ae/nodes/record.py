@@ -121,7 +121,7 @@ def _topics(text: str) -> list[str]:
 
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
-        bag, count, backup = recover(options.recover, options.out)
+        bag, count, backup = recover(options.recover, options.out, options.compression)
         kept = f'; the original is kept as {backup}' if backup else ''
         print(f'{count} messages recovered to {bag}{kept}')
     else:

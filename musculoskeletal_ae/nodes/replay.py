@@ -264,6 +264,9 @@ def parse(arguments: list[str]) -> Namespace:
         parser.error('--robot is for --check')
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
+    if options.as_trajectory and options.topics != [DEFAULT]:
+        told = ','.join(options.topics)
+        parser.error(f'--as-trajectory sends the motion of {SHOWN}: without --topics {told}')
     return options
 
 

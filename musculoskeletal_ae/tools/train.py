@@ -36,6 +36,9 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint):
         parser.error('--hold-out and --checkpoint go with --from-bag')
+    learned = {path.resolve() for path in args.from_bag}
+    if both := [str(path) for path in args.hold_out if path.resolve() in learned]:
+        parser.error(f'{both[0]} is to be learned from and held out: name it after one option only')
     if args.from_bag and args.plot:
         parser.error('--plot shows the initial training: not with --from-bag')
     return exit_status(lambda: load('musculoskeletal_ae.tools.initial_training').train(args))

@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.writer import recover
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
+from musculoskeletal_ae.nodes import record
 
 
 @pytest.fixture
@@ -49,6 +51,20 @@ def test_recovery_into_a_new_directory_leaves_the_original_alone(killed, content
     assert read(tmp_path / 'new') == expected(content[:60])
     with pytest.raises(UnfinishedBagError):
         Bag.open(killed)
+
+
+@pytest.mark.parametrize('where', [[], ['-o', 'new']])
+@pytest.mark.parametrize(('compression', 'written'), [('none', ''), ('zstd', 'zstd')])
+def test_recovery_compresses_as_it_is_told(
+    killed, tmp_path, monkeypatch, where, compression, written
+):
+    monkeypatch.chdir(tmp_path)
+    arguments = ['--recover', str(killed), '--compression', compression, *where]
+    assert record._work(record.parse(arguments), []) == 0
+    (file,) = (tmp_path / 'new' if where else killed).glob('*.mcap')
+    with file.open('rb') as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    assert {chunk.compression for chunk in chunks} == {written}
 
 
 def test_a_bare_file_is_recovered_beside_it(killed):

@@ -54,6 +54,16 @@ def test_the_faults_of_a_recording_are_left_out_and_said(robot, capsys):
         (['--from-bag', str(BAGS / 'README.md')], 1, 'README.md'),
         (['--from-bag', str(BAGS / 'rupture'), '--robot', 'arm26'], 1, 'missing joint'),
         (['--hold-out', str(BAGS / 'rupture')], 2, '--from-bag'),
+        (
+            [
+                '--from-bag',
+                str(BAGS / 'rupture'),
+                '--hold-out',
+                str(BAGS / '.' / 'faults' / '..' / 'rupture'),
+            ],
+            2,
+            'after one option only',
+        ),
     ],
 )
 def test_a_bag_that_cannot_be_learned_from_is_one_clear_error(
