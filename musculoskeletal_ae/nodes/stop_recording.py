@@ -26,7 +26,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # that are kept
 MOST = 50_000  # messages, however fast they come
-FILE = 'cause.txt'  # why the node stopped, in the bag's directory
+FILE = 'cause.txt'  # why the node stopped, in the bag's directory; written last
+#: of the bags' directories, also of those that a kill cut off
+NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 
 #: When a message came [ns], its topic, and its bytes: ten thousands of message objects would be
@@ -75,6 +77,18 @@ class StopRecording:
     def _save(self, cause: str, most: int, messages: list[Heard]) -> None:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
+            self._write(bag, cause, messages)
+            for old in sorted(self._directory.glob(NAMES))[:-most]:
+                shutil.rmtree(old)
+        except (MusculoskeletalError, OSError) as error:
+            self.problem = f'the seconds before the stop could not be kept: {error}'
+            return
+        self.saved, self.problem = bag, ''
+
+    def _write(self, bag: Path, cause: str, messages: list[Heard]) -> None:
+        """Write a bag and its cause; what cannot be written whole takes no room on the disk."""
+        bag.mkdir(parents=True)
+        try:
             with BagWriter(bag) as writer:
                 names = {t: self._resolve(t) for t in {topic for _, topic, _ in messages}}
                 for topic, name in names.items():
@@ -83,9 +97,6 @@ class StopRecording:
                 for when, topic, message in messages:
                     writer.write(names[topic], when, when, message)
             (bag / FILE).write_text(f'{cause}\n', encoding='utf-8')
-            for old in sorted(self._directory.glob(f'stop_*/{FILE}'))[:-most]:
-                shutil.rmtree(old.parent)
-        except (MusculoskeletalError, OSError) as error:
-            self.problem = f'the seconds before the stop could not be kept: {error}'
-            return
-        self.saved, self.problem = bag, ''
+        except BaseException:
+            shutil.rmtree(bag, ignore_errors=True)
+            raise

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import pytest
 from std_msgs.msg import Bool, Float64MultiArray
 
@@ -46,6 +49,7 @@ def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
 
 def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
+    (tmp_path / 'stop_20200101-000000-000000').mkdir()  # cut off by a kill
     for n in range(5):
         now[0] += 1_000_000
         recording.heard('muscle_states', states(float(n)))
@@ -54,6 +58,7 @@ def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path
     causes = sorted(file.read_text() for file in tmp_path.glob(f'*/{FILE}'))
     assert causes == ['cause 3\n', 'cause 4\n']
     assert (tmp_path / 'stop_of_mine').is_dir()
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_none_are_kept_where_none_are_wanted(recording, tmp_path):
@@ -71,3 +76,15 @@ def test_a_disk_that_takes_nothing_is_said_and_ends_nothing(tmp_path):
     recording.close()
     assert recording.saved is None
     assert 'could not be kept' in recording.problem
+
+
+def test_what_a_full_disk_cuts_off_is_deleted(recording, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(stop_recording.BagWriter, 'write', full)
+    recording.heard('muscle_states', states(1.0))
+    recording.save('a cause', 1)
+    recording.close()
+    assert not list(tmp_path.iterdir())
+    assert recording.saved is None and 'No space left' in recording.problem
