@@ -3,18 +3,21 @@
 
 A joint that reaches its limit is stopped there, in whatever posture the others are and whatever
 pulls: readings of different rests pile up at one value, and hardly any is beyond. Muscles and
-gravity hardly tell a sensor's zero z; such a pile tells it to a fraction of a degree:
+gravity hardly tell a sensor's zero z; such a pile tells it to a fraction of a degree. For the rests
+y_n of a joint and each of its two limits
 
-    p(z | y) ∝ p(z) Π_n p(y_n | z),    p(y | z) = (1 − π) / range + π N(y − z − limit; σ)
+    p(y | z, π, σ) = (1 − π) / range + π N(y − z − limit; σ),    next to nothing but the pile beyond
+    p(z | y) ∝ p(z) Π_limits Σ_π,σ p(π, σ) Π_n p(y_n | z, π, σ)
 
-over the rests near a limit, y_n; beyond it there is next to nothing but the pile. Sensors are as
-often zeroed well as roughly (p(z) is a sharp and a wide normal distribution), and limits may be no
-stops: then no reading says anything.
+with the share π of rests at that stop, often none, and piles as sharp as σ, wider beyond the limit,
+where a stop gives way. Sensors are as often zeroed well as roughly (p(z) is a sharp and a wide
+normal distribution), and limits may be no stops: then no reading says anything.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import logsumexp
 
 from musculoskeletal_ae.arrays import Array
 
@@ -22,11 +25,11 @@ from musculoskeletal_ae.arrays import Array
 ZERO, ZEROED = np.deg2rad(2.0), 0.003  # spread of zeros that are set roughly, or well [rad]
 STOP = 0.01  # how far stops are from the limits [rad]
 ZEROS = np.linspace(-4.0 * ZERO, 4.0 * ZERO, 281)  # that are tried [rad]
-PILED = 0.06  # π, the share of rests at a stop
-WIDTH, GIVE = 0.004, 0.008  # σ of readings there, and beyond the limit, as stops give way [rad]
-BEYOND = 0.01  # density of readings beyond a limit, as a share of what it is within
-NO_STOPS = 0.1  # probability that limits are no stops
-NEAR = 0.3  # within so much of a limit a reading has to do with it [rad]
+NO_STOPS, NOT_REACHED = 0.1, 0.5  # how often limits are no stops, and a stop is never reached
+SHARES, WIDTHS = (0.03, 0.1, 0.3), (0.001, 0.002, 0.004)  # π and σ [rad] that are tried else
+GIVE = 2.0  # σ beyond the limit, in units of that within
+BEYOND = 0.01  # density of readings beyond a limit, as a share of that within
+NEAR = 0.3  # a limit, so that a reading has to do with it [rad]
 #: rests are different if another joint is so much elsewhere, or the reading itself [rad]
 ELSEWHERE, SAME = 0.1, 0.01
 
@@ -44,49 +47,55 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
 
 
 def _zero(theta: Array, j: int, lower: float, upper: float) -> tuple[float, float]:
-    own = _different(theta, j, lower, upper)
-    log = np.zeros_like(ZEROS)
-    for limit, inwards in ((lower, 1.0), (upper, -1.0)):
-        near = own[inwards * (own - limit) < NEAR]
-        distance = inwards * (near[:, None] - ZEROS - limit)
-        within = distance > 0.0
-        even = np.where(within, 1.0, BEYOND) / (upper - lower)
-        log += np.log((1.0 - PILED) * even + PILED * _pile(distance)).sum(axis=0)
-        log += np.log(upper - lower) * len(near)  # beside a density that is even everywhere
-    stops = np.logaddexp(np.log(1.0 - NO_STOPS) + log, np.log(NO_STOPS))
-    weight = np.exp(stops - stops.max())
-    weight *= _normal(ZEROS, ZERO) + _normal(ZEROS, ZEROED)
+    own = _different(theta, j)
+    stops = _at_stop(own - lower, upper - lower) + _at_stop(upper - own, upper - lower)[::-1]
+    log = np.logaddexp(np.log(1.0 - NO_STOPS) + stops, np.log(NO_STOPS))
+    weight = np.exp(log - log.max()) * (_normal(ZEROS, ZERO) + _normal(ZEROS, ZEROED))
     weight /= weight.sum()
     # The median, since what is half known is better left where most sensors are.
     zero = float(np.interp(0.5, np.cumsum(weight) - 0.5 * weight, ZEROS))
     return zero, float(np.sqrt(weight @ (ZEROS - zero) ** 2))
 
 
-def _different(theta: Array, j: int, lower: float, upper: float) -> Array:
-    """Return readings of joint j near its limits, of rests that it moved to.
+def _at_stop(within: Array, span: float) -> Array:
+    """Return log p(y | z) of ZEROS, by how far within a limit readings are [rad], (N,).
 
-    Of many in one posture there is one: an arm that is commanded there again is no joint stopped.
+    Beside a density that is even everywhere, as where limits stop nothing; `span` is the joint's
+    range [rad].
+    """
+    distance = within[within < NEAR, None] - ZEROS
+    inside = distance > 0.0
+    even = np.where(inside, 1.0, BEYOND)
+    ways = [np.log(NOT_REACHED) + np.log(even).sum(axis=0)]
+    for width in WIDTHS:
+        mean = 0.5 * (1.0 + GIVE) * width
+        pile = span * _normal(distance / np.where(inside, width, GIVE * width), 1.0) / mean
+        for share in SHARES:
+            log = np.log((1.0 - share) * even + share * pile).sum(axis=0)
+            log += (len(within) - len(distance)) * np.log(1.0 - share)
+            ways.append(log + np.log((1.0 - NOT_REACHED) / (len(WIDTHS) * len(SHARES))))
+    total: Array = logsumexp(ways, axis=0)
+    return total
+
+
+def _different(theta: Array, j: int) -> Array:
+    """Return readings of joint j, of rests that it moved to, one of many in one posture.
+
+    A parked joint, or an arm that is commanded to one posture again, is none that is stopped.
     """
     theta = theta[np.isfinite(theta[:, j])]
     theta = theta[np.abs(np.diff(theta[:, j], prepend=np.inf)) > SAME]
     own, others = theta[:, j], np.delete(theta, j, axis=1)
-    within, kept = np.minimum(own - lower, upper - own), list[int]()
-    for n in np.argsort(within)[: np.count_nonzero(within < NEAR)]:
+    kept: list[int] = []
+    for n in range(len(own)):
         alike = np.abs(own[kept] - own[n]) < SAME
         alike &= ~(np.abs(others[kept] - others[n]) > ELSEWHERE).any(axis=1)
         if not alike.any():
-            kept.append(int(n))
+            kept.append(n)
     readings: Array = own[kept]
     return readings
 
 
-def _pile(distance: Array) -> Array:
-    """Return the density of readings at a stop, by how far within the limit they are [rad]."""
-    score = distance / np.where(distance > 0.0, WIDTH, GIVE)
-    density: Array = np.exp(-0.5 * score**2) / (np.sqrt(2.0 * np.pi) * 0.5 * (WIDTH + GIVE))
-    return density
-
-
 def _normal(x: Array, sigma: float) -> Array:
-    density: Array = np.exp(-0.5 * (x / sigma) ** 2) / sigma
+    density: Array = np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     return density

@@ -12,7 +12,7 @@ LOWER, UPPER = np.array([-0.4, -1.5, -0.8]), np.array([1.2, 0.1, 0.8])
 TRUE = np.array([0.05, -0.04, 0.0])  # zeros of the sensors [rad]
 
 
-def rests(count: int = 150, beyond: float = 0.1, seed: int = 0) -> np.ndarray:
+def rests(count: int = 150, beyond: float = 0.3, seed: int = 0) -> np.ndarray:
     """Return true θ [rad] (N, D) of an arm that is stopped at its limits."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(LOWER - beyond, UPPER + beyond, (count, len(LOWER)))
@@ -47,6 +47,14 @@ def test_joints_that_never_reach_a_limit_say_nothing():
     zero, spread = found(within(0.1) + TRUE)
     assert zero == pytest.approx(np.zeros(3), abs=0.003)
     assert (spread > 0.5 * ZERO).all()
+
+
+@pytest.mark.parametrize('count', [20, 60, 200])
+def test_few_readings_that_happen_to_be_near_each_other_are_no_pile(count):
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        zero, _ = found(rng.uniform(LOWER, UPPER, (count, 3)))
+        assert np.linalg.norm(zero) < 2.0 * STOP
 
 
 def test_one_posture_near_a_limit_is_no_stop_however_often_it_is_held():
