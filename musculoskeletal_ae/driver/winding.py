@@ -8,6 +8,9 @@ target steps inwards until the MSC law
 
 at the l that is read asks for a low tension; back; and beyond l, where T must stay at T_bias. The
 law is judged by what l and T were read, so that it does not matter how far the arm gives way.
+
+K makes tension of what l is off by. Where that is more than TENSION_TOLERANCE, from 50 kN/m on, it
+is what is tolerated, and all tensions that are asked for or noticed grow by the same factor.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
@@ -32,7 +35,8 @@ SLACK = 0.01  # [m] that l_target then lies beyond l
 RUN_AWAY_TENSION, RUN_AWAY = 60.0, 0.05  # [N] above what is asked for, [m]: it is let go
 MOMENT = 0.1  # [s] for which a falling arm may pull harder
 LATEST = 0.1  # [s] from a command to the first change
-TENSION_TOLERANCE = 10.0  # [N]
+TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1  # [N] that T may be off; of what is asked for
+LENGTH_ERROR = 2.0e-4  # [m] noise and resolution of l, two standard deviations
 SLOPES = 0.7, 1.4  # of what the law asks for
 RESPONSE = 4.0, 0.0006  # [N], [m] above noise
 CLIP = 20.0, 0.05  # asked for beyond tension.max [N], tolerated beyond it (share)
@@ -68,11 +72,16 @@ class Winding:
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
-        self._highest: Array = self._bias + ABOVE_BIAS
+        #: what T may be off [N] (M,), and by how much K makes it more than it is of a human arm
+        self._tolerance = np.maximum(TENSION_TOLERANCE, LENGTH_ERROR * robot.stiffness)
+        self._scale: Array = self._tolerance / TENSION_TOLERANCE
+        self._response: Array = RESPONSE[0] * self._scale
+        self._highest: Array = self._bias + ABOVE_BIAS * self._scale
         if highest is not None:
             self._highest = np.full(robot.muscle_count, highest)
         for m in self._muscles:
-            least, most = self._bias[m] + LEAST_ABOVE_BIAS, robot.tension.max[m]
+            least = self._bias[m] + (LEAST_ABOVE_BIAS * self._scale)[m]
+            most = robot.tension.max[m]
             told = f'muscle {robot.muscles[m]!r} is asked for {least:g} N at least to be judged'
             if most < least:
                 raise MusculoskeletalError(
@@ -106,9 +115,10 @@ class Winding:
             for pause in (SETTLE, HOLD):
                 self._target[:] = self._mean().length
                 yield from self._wait(pause)
-            held = self._mean()
-            off = np.abs(held.tension - held.demand) > TENSION_TOLERANCE
-            for m in np.flatnonzero(off).tolist():
+            held, swing = self._mean(), self._noise()
+            for m in np.flatnonzero(swing > self._tolerance).tolist():
+                self.verdict.failed('hums', m, swing=swing[m])
+            for m in np.flatnonzero(self._off(held)).tolist():
                 self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
             for m in self._muscles:
                 self.trying = self._robot.muscles[m]
@@ -128,7 +138,7 @@ class Winding:
             yield
             (length, tension, _), limit = self._recent[-1][1], self._robot.tension.limit
             asked = np.minimum(self._robot.demanded(length, self._target), limit)
-            self._tame_at[~(tension > asked + RUN_AWAY_TENSION)] = self._now
+            self._tame_at[~(tension > asked + RUN_AWAY_TENSION * self._scale)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
                 told = f'T rose to {tension[m]:.0f} N, {asked[m]:.0f} N were asked for'
@@ -137,9 +147,22 @@ class Winding:
                 raise RunAwayError(int(fell.argmax()), f'l fell by {1e3 * fell.max():.0f} mm')
 
     def _mean(self) -> _Reading:
-        length, tension, third = np.mean([states for _, states in self._recent], axis=0)
-        demand = np.minimum(self._robot.demanded(length, self._target), self._robot.tension.max)
-        return _Reading(length, tension, third, demand)
+        readings = np.array([states for _, states in self._recent])
+        # Of each l that was read: noise of l pulls wherever it is beyond l_target.
+        demand = self._robot.demanded(readings[:, 0], self._target)
+        clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
+        length, tension, third = readings.mean(axis=0)
+        return _Reading(length, tension, third, clipped)
+
+    def _noise(self) -> Array:
+        """Return the standard deviation of T over a moment [N] (M,)."""
+        return np.std([states[1] for _, states in self._recent], axis=0)
+
+    def _off(self, reading: _Reading) -> Bools:
+        """Return which muscles pull with another tension than the law asks for, (M,)."""
+        tolerated = np.maximum(self._tolerance, TENSION_SHARE * reading.demand)
+        wrong: Bools = np.abs(reading.tension - reading.demand) > tolerated
+        return wrong
 
     def _go(self, m: int, goal: float) -> Wait:
         """Bring a target to where it is to rest, not faster than the arm may follow."""
@@ -154,9 +177,13 @@ class Winding:
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Ask for a level [N], follow the arm as it gives way, and return what is then read."""
+        """Ask for a level [N], follow the arm as it gives way, and return what is then read.
+
+        It adds to `latency` [s] when it answered, unless it swings too much to tell.
+        """
         before = self._mean()
-        noise = np.std([states[1, m] for _, states in self._recent])
+        noise = self._noise()[m]
+        answer, hidden = self._response[m] + 2.0 * noise, noise > 0.5 * self._tolerance[m]
         further = (level - self._bias[m]) / self._robot.stiffness[m]
         self._target[m] = before.length[m] - further
         start = last = self._now
@@ -171,8 +198,9 @@ class Winding:
             last = self._now
             yield from self._wait(1e-9)
             length, tension, _ = self._recent[-1][1][:, m]
-            pulled = abs(tension - before.tension[m]) > RESPONSE[0] + 2.0 * noise
-            if not latency and (pulled or before.length[m] - length > 2.0 * RESPONSE[1]):
+            pulled = abs(tension - before.tension[m]) > answer
+            answered = pulled or before.length[m] - length > 2.0 * RESPONSE[1]
+            if answered and not latency and not hidden:
                 latency.append(self._now - start)
         yield from self._wait(HOLD)
         return self._mean()
@@ -187,7 +215,7 @@ class Winding:
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)
         last = yield from self._wind(m, home.demand[m] + rise, home.length[m], whole)
         pulled, wound = last.tension - home.tension, home.length - last.length
-        if not (abs(pulled[m]) > RESPONSE[0] or wound[m] > RESPONSE[1]):
+        if not (abs(pulled[m]) > self._response[m] or wound[m] > RESPONSE[1]):
             yield from self._ask_outwards(m, home, pulled, wound)
             return
         verdict.passed('order', m)
@@ -197,7 +225,8 @@ class Winding:
         verdict.passed('sign', m)
         clip = robot.tension.max[m]
         if clip <= self._highest[m]:
-            past = yield from self._wind(m, clip + CLIP[0], home.length[m], [])
+            beyond = max((CLIP[0] * self._scale)[m], 2.0 * CLIP[1] * clip)
+            past = yield from self._wind(m, clip + beyond, home.length[m], [])
             if past.tension[m] > (1.0 + CLIP[1]) * clip:
                 verdict.failed('clip', m, got=past.tension[m], most=clip)
             verdict.passed('clip', m)
@@ -222,7 +251,7 @@ class Winding:
             failed('third row', m)
         elif not SLOPES[0] < got / asked < SLOPES[1]:
             failed('gain', m, got=got, asked=asked)
-        elif abs(out.tension[m] - out.demand[m]) > TENSION_TOLERANCE:
+        elif self._off(out)[m]:
             failed('beyond l', m, got=out.tension[m], asked=out.demand[m])
         else:
             self.verdict.passed('law', m)
@@ -231,11 +260,11 @@ class Winding:
         """Find out why a muscle did not respond, where all pulled [N] and wound in [m] (M,)."""
         other = int(np.where(wound > RESPONSE[1], pulled, -np.inf).argmax())
         yield from self._go(m, home.length[m])
-        if other != m and pulled[other] > RESPONSE[0]:
+        if other != m and pulled[other] > self._response[other]:
             self.verdict.failed('other one', m, other=self._robot.muscles[other])
             return
         self._target[m] = home.length[m] + ((self._highest - self._bias) / self._robot.stiffness)[m]
         yield from self._wait(HOLD)
-        answered = self._mean().tension[m] - home.tension[m] > RESPONSE[0]
+        answered = self._mean().tension[m] - home.tension[m] > self._response[m]
         yield from self._go(m, home.length[m])
         self.verdict.failed('outwards' if answered else 'no answer', m)

@@ -170,7 +170,10 @@ def _parse(arguments: list[str]) -> Namespace:
     add('--unzeroed', action='store_true', help=text)
     add('--move', action='store_true', help='then wind each muscle in a little, one at a time')
     add('--muscles', type=names, metavar='NAME,…', help='with --move: only these')
-    text = 'with --move: the highest tension asked for [N] (default: 40 above T_bias)'
+    text = (
+        'with --move: the highest tension asked for [N] (default: 40 above T_bias, where K is '
+        'beyond 50 kN/m 0.8 mm times K)'
+    )
     add('--tension', type=positive, metavar='N', help=text)
     add('--wait', action='store_true', help='wait for a driver, and until it has no fault')
     options = parser.parse_args(arguments)

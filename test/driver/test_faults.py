@@ -15,6 +15,7 @@ from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 ROBOT = Robot.load('arm26')
 LOW = replace(ROBOT.description, tension=TensionRange(*np.outer([30.0, 55.0, 60.0], np.ones(6))))
@@ -208,6 +209,43 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     verdict = driver.wind((BICEPS,))
     assert 'sign' in verdict.wrong, str(verdict)
     assert 'l rose by' in str(verdict)
+
+
+def stiff_and_strong(stiffness):
+    """Return the arm with K [N/m] and muscles of some kilonewtons."""
+    tension = TensionRange(*np.outer([100.0, 2000.0, 3000.0], np.ones(M)))
+    units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))  # stiffer than K, or it hums
+    elastic = SeriesElastic(*units)
+    parts = {'tension': tension, 'stiffness': np.full(M, stiffness), 'series_elastic': elastic}
+    return Robot(replace(ROBOT.description, **parts))
+
+
+def wound_in_stiff(stiffness, seed=0, of_law=None):
+    """Return the verdict on the driver that evaluates the law with the l that it reads."""
+    robot = stiff_and_strong(stiffness)
+    driver = Driver(robot, seed)
+    driver.in_tension = law(
+        **{'bias': 100.0, 'stiffness': stiffness, 'most': 3000.0, **(of_law or {})}
+    )
+    driver.listen(2.0)
+    return driver.wind()
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_noise_of_length_is_no_fault_of_a_stiff_robot(seed):
+    verdict = wound_in_stiff(1.0e5, seed)
+    assert not verdict.faults, str(verdict)
+
+
+@pytest.mark.parametrize('wrong', [{'stiffness': 5.0e4}, {'bias': 0.0}, {'gain': 1.0 / 9.81}])
+def test_what_is_wrong_shows_on_a_stiff_robot_too(wrong):
+    assert 'law' in wound_in_stiff(1.0e5, of_law=wrong).wrong
+
+
+def test_a_stiff_robot_that_hums_is_told_so():
+    verdict = wound_in_stiff(1.0e6)
+    assert 'N (standard deviation) while it is held' in str(verdict)
+    assert 'latency' not in verdict.wrong, str(verdict)
 
 
 def with_tension(limit, most):
