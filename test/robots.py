@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from musculoskeletal_ae.robot.directories import find_robot
+from musculoskeletal_ae.robot.robot import Robot
 
 # Written from the hand inwards, and with a fixed link and a turned frame on the way, so that
 # nothing works by the accident of order or of identity rotations.
@@ -134,6 +135,22 @@ def write_robot(
         **top,
     }
     return write_muscles(directory, document)
+
+
+DRUM = {
+    'wrap': 'cylinder', 'link': 'upper', 'axis': [0.1, 2.0, 0.0], 'xyz': [0.0, 0.0, -0.3],
+    'radius': 0.03, 'side': [-0.2, 0.0, -0.3],
+}  # fmt: skip
+#: where the wire stays on its side of the drum, and where it comes to the end of that
+DRUM_ENDS = {'stays': (0.035, 0.0, -0.008), 'jumps': (0.035, 0.0, 0.0)}
+
+
+def behind_a_drum(directory: Path, end: Sequence[float]) -> Robot:
+    """Return the sound arm with a straightener that ends behind a drum that it wraps round."""
+    document = read_muscles(write_robot(directory))
+    route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
+    route[1:] = [DRUM, {'link': 'lower', 'xyz': list(end)}]
+    return Robot.load(write_muscles(directory, document))
 
 
 def copy_robot(name: str, directory: Path) -> Path:

@@ -38,6 +38,7 @@ from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 64
@@ -101,6 +102,12 @@ class Gate:
         left: Array = _size((given @ affine - theta)[AFFINE:]) / theta.std(axis=0)
         return UNTOLD * left
 
+    @cached_property
+    def _likely(self) -> str:
+        """What speaks for the robot's description, not the network, as the reason."""
+        told = told_of_jumps(self._robot)
+        return f' ({told})' if told else ''
+
     @property
     def mae(self) -> Mae | None:
         """The network in use."""
@@ -124,8 +131,11 @@ class Gate:
         self._direction.reset()
 
     def check(self, mae: Mae) -> None:
-        """Try a network; a GateError says that it does not explain the arm."""
-        deque(self.trial(mae), maxlen=0)
+        """Try a network; a GateError says that it does not explain the arm, and why none may."""
+        try:
+            deque(self.trial(mae), maxlen=0)
+        except GateError as error:
+            raise GateError(f'{error}{self._likely}') from error
 
     def trial(self, mae: Mae) -> Iterator[None]:
         """Try a network in pieces of some milliseconds, between which a node may go on."""

@@ -229,8 +229,7 @@ class Shell(Node):
         given_up = 0  # how often trials were
         waiting: tuple[UInt8MultiArray, int] | None = None  # to be tried next, and given_up before
 
-        def take(mae: Mae) -> Iterator[None]:
-            yield from gate.trial(mae)
+        def take(mae: Mae) -> None:
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
@@ -242,7 +241,8 @@ class Shell(Node):
 
         def from_file(mae: Mae) -> None:
             nonlocal given_up
-            deque(take(mae), maxlen=0)
+            gate.check(mae)
+            take(mae)
             given_up += 1
             self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
@@ -255,10 +255,12 @@ class Shell(Node):
             (message, before), waiting = waiting, None
             try:
                 if before == given_up:
-                    for _ in take(checkpoint.from_bytes(bytes(message.data), self.robot)):
+                    mae = checkpoint.from_bytes(bytes(message.data), self.robot)
+                    for _ in gate.trial(mae):
                         await give_way()
                         if before != given_up:
                             return
+                    take(mae)
             except GateError:  # the one in use goes on
                 raise
             except CheckpointError as error:

@@ -36,7 +36,7 @@ from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
 from musculoskeletal_ae.robot.description import RobotDescription, shown
 from musculoskeletal_ae.robot.entries import refusal
-from musculoskeletal_ae.robot.jumps import JUMP, jumps
+from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
@@ -312,15 +312,12 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
     """Muscles whose wire slips to the other side of what it wraps round."""
-    if robot.routes.objects is None:
-        return
-    largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
-    for m in np.flatnonzero(largest > JUMP):
+    for m, size, theta in jumping_muscles(robot):
         turns = np.flatnonzero(robot.routes.crossed[m])
-        place = ', '.join(f'{robot.joints[j]} {where[m, j]:.2f}' for j in turns)
+        place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in turns)
         yield Finding(
             'jumping_muscle',
-            f'the length of muscle {robot.muscles[m]!r} jumps by {1e3 * largest[m]:.1f} mm where '
+            f'the length of muscle {robot.muscles[m]!r} jumps by {1e3 * size:.1f} mm where '
             f'its wire slips to the other side of what it wraps round, at {place}',
             'move its side, or a point beside it, until the wire stays on one side everywhere',
         )

@@ -8,14 +8,24 @@ side of it, as MuJoCo's do: at once, and by centimetres. No network restores suc
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
 
 LINES, STEPS = 60, 400  # between postures, that lengths are followed along
 JUMP = 0.001  # [m] within such a step: lengths that change smoothly bend by a hundredth of that
 REDRAWN = 50  # times that a jumping wire's points are drawn again for an individual, at most
+
+
+class Jump(NamedTuple):
+    """A muscle whose wire slips to the other side of what it wraps round."""
+
+    muscle: int
+    size: float  # [m]
+    theta: Array  # [rad] or [m], (D,), where it does
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -30,3 +40,18 @@ def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tupl
     bends = np.abs(np.diff(along, 2, axis=1)).reshape(LINES * (STEPS - 2), -1)
     where = bends.argmax(axis=0)
     return bends.max(axis=0), theta[:, 1:-1].reshape(-1, joints)[where]
+
+
+def jumping_muscles(robot: Robot) -> list[Jump]:
+    """Return the muscles of a robot whose lengths jump, with the largest jump of each."""
+    if robot.routes.objects is None:
+        return []
+    largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
+    return [Jump(m, largest[m], where[m]) for m in np.flatnonzero(largest > JUMP).tolist()]
+
+
+def told_of_jumps(robot: Robot) -> str:
+    """Say which muscles no network restores, and by how much they jump; '' if there are none."""
+    each = [f'{robot.muscles[m]} ({1e3 * size:.0f} mm)' for m, size, _ in jumping_muscles(robot)]
+    told = 'no network restores lengths that jump where a wire slips to the other side of what it '
+    return f'{told}wraps round: {", ".join(each)}; see check_robot' if each else ''

@@ -34,6 +34,7 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
 
 UNSEEN = 5000  # states
@@ -52,6 +53,8 @@ def train(args: Namespace) -> None:
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
     train_on(args.device)
     robot = Robot.load(args.robot)
+    if told := told_of_jumps(robot):
+        print(f'warning: {told}. Nodes may refuse this network', file=sys.stderr)
     preset = PRESETS[args.preset]
     steps = preset.steps(robot.groups) // (10 if args.quick else 1)
     if args.from_bag:

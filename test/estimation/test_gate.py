@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from robots import copy_robot
+from robots import DRUM_ENDS, behind_a_drum, copy_robot
 
 from bench.gate import ATTACKS, ON_MESSAGES
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
@@ -19,6 +19,7 @@ from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.training import Update
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -64,6 +65,16 @@ def test_an_attack_is_refused_without_any_message_and_the_figures_are_said(train
     with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
         Gate(ROBOT).check(ATTACKS[attack](trained[preset]))
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
+
+
+def test_where_lengths_jump_a_refusal_says_that_no_network_restores_them(tmp_path):
+    arms = {name: behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items()}
+    for name, robot in arms.items():
+        with pytest.raises(GateError) as refusal:
+            Gate(robot).check(initial_mae(robot, steps=1).mae)
+        told = 'no network restores lengths that jump'
+        assert (told in str(refusal.value)) == (name == 'jumps')
+    assert re.search(r': straightener \(\d+ mm\); see check_robot', str(refusal.value))
 
 
 def test_a_network_is_tried_in_many_pieces_and_refused_by_the_last(trained):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.robot.robot import Robot
@@ -41,6 +42,16 @@ def test_unknown_robot_exits_with_1_in_one_line(tmp_path, capsys):
     assert main(['--robot', 'nobody', '--out', str(tmp_path / 'x')]) == 1
     error = capsys.readouterr().err
     assert 'nobody' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('name', DRUM_ENDS)
+def test_it_warns_of_lengths_that_jump_before_it_trains(tmp_path, capsys, name):
+    behind_a_drum(tmp_path / 'arm', DRUM_ENDS[name])
+    arguments = ['--robot', str(tmp_path / 'arm'), '--out', str(tmp_path / 'x')]
+    assert main([*arguments, '--from-bag', str(tmp_path / 'none')]) == 1  # nothing is trained
+    error = capsys.readouterr().err
+    assert ('warning: no network restores lengths that jump' in error) == (name == 'jumps')
+    assert ('straightener (' in error and 'check_robot' in error) == (name == 'jumps')
 
 
 def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):

@@ -5,28 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import read_muscles, write_muscles, write_robot
+from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.emulator import foreign, individual
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.jumps import JUMP, jumps
-from musculoskeletal_ae.robot.robot import Robot
-
-DRUM = {
-    'wrap': 'cylinder', 'link': 'upper', 'axis': [0.1, 2.0, 0.0], 'xyz': [0.0, 0.0, -0.3],
-    'radius': 0.03, 'side': [-0.2, 0.0, -0.3],
-}  # fmt: skip
-BEYOND, BESIDE = [0.035, 0.0, 0.0], [0.035, 0.0, -0.008]  # the end of the drum's far side
-
-
-def arm(directory, end):
-    """An arm whose straightener ends behind the drum that it wraps round."""
-    document = read_muscles(write_robot(directory))
-    route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
-    route[1:] = [DRUM, {'link': 'lower', 'xyz': end}]
-    return Robot.load(write_muscles(directory, document))
 
 
 def jumping(lengths, robot):
@@ -44,7 +29,7 @@ def test_a_jump_is_found_where_it_is():
 
 
 def test_a_jump_of_the_model_is_a_warning_that_names_the_muscle(tmp_path):
-    (warning,) = check_robot(arm(tmp_path, BEYOND)).warnings
+    (warning,) = check_robot(behind_a_drum(tmp_path, DRUM_ENDS['jumps'])).warnings
     assert warning.kind == 'jumping_muscle'
     assert "'straightener' jumps by 17" in warning.message
     assert warning.message.endswith('wraps round, at bend -1.57')
@@ -61,7 +46,7 @@ def test_a_jump_of_the_model_is_a_warning_that_names_the_muscle(tmp_path):
 def test_wires_of_individuals_jump_only_where_the_models_do(
     tmp_path, monkeypatch, module, body, seed
 ):
-    robot, odd = arm(tmp_path / 'beside', BESIDE), arm(tmp_path / 'beyond', BEYOND)
+    robot, odd = (behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items())
     m, laid = robot.muscles.index('straightener'), body(robot, seed)
     monkeypatch.setattr(module, 'REDRAWN', 0)
     assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # the premise
