@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether an arm can be held by its muscles: what `check_robot` measures and judges.
 
-In postures drawn uniformly in the joint limits, the tension nearest to 60 N within [bias, limit]
-that holds the arm's own weight; the joint stiffness under muscle stiffness control at that tension;
-and the moment arms
+In postures drawn uniformly in the joint limits, the tension nearest to 0.3 T_limit within [bias,
+limit] that holds the arm's own weight; the joint stiffness under muscle stiffness control at that
+tension; and the moment arms
 
     r(θ) = −G(θ)    [m],
 
@@ -15,6 +15,10 @@ An arm is sound when at least 95 % of the postures are held, at least 95 % have 
 eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff; where it is
 negative, the arm is unstable), every joint moves some mass, and no moment arm is at fault. Beside
 it, not judged: the one-sided stiffness, in which muscles at the bias tension count as slack.
+
+Of an arm whose joints carry less than 2.5 N·m, by weight and muscles at the bias tension, less
+stiffness is required in proportion: a tenth more or less of that load is to turn no joint by more
+than 0.05 rad. And a moment arm matters from 3 mm on, or from a tenth of its joint's longest.
 
 An optional third file of a robot directory, `moment_arms.csv`, declares the action the designer
 meant (columns muscle, joint, sign), so that a route on the wrong side of a joint is found even
@@ -42,12 +46,15 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
-DESIRED_TENSION = 60.0  # [N]
+DESIRED_SHARE = 0.3  # of T_limit: 60 N where that is 200 N
 REQUIRED_SHARE = 0.95
-REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
-LEAST_INERTIA = 1e-6  # [kg·m²]; with less a joint cannot be simulated
+REQUIRED_STIFFNESS = 5.0  # [N·m/rad], and …
+REQUIRED_BY_LOAD = 2.0  # [1/rad] times the largest load of a joint, where that is less
+LEAST_INERTIA = 1e-12  # [kg·m²]; less is rounding. Emulated modules add inertia of their own.
 SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
-MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N
+MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N; or …
+MATTERS_SHARE, MATTERS_LEAST = 0.1, 1e-4  # … of the longest at its joint, if that is less; [m]
+SHORT = 0.015  # [m]; shorter moment arms are off by half of it or more in emulated individuals
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
 LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
 WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
@@ -95,6 +102,8 @@ class RobotCheck:
     missing_torque: Array  # torque lacking where a posture is not held [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
     one_sided: Array  # the same with muscles at the bias tension slack, (N,)
+    required: float  # what that has to be [N·m/rad]
+    matters: Array  # from where on moment arms at each joint matter [m], (D,)
     faults: tuple[Finding, ...]  # why the arm is not sound; empty if it is
     warnings: tuple[Finding, ...]  # what deserves a look but is not judged
 
@@ -106,7 +115,7 @@ class RobotCheck:
     @property
     def stiff(self) -> Bools:
         """Whether each posture is held and stiff enough, shape (N,)."""
-        return self.stiffness >= REQUIRED_STIFFNESS
+        return self.stiffness >= self.required
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
@@ -117,7 +126,8 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     """
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     result = judge(Setting.of(robot, theta))
-    suspicious = *_other_units(robot, result.moment_arms), *_jumping_muscles(robot)
+    arms = result.moment_arms
+    suspicious = *_other_units(robot, arms), *_small_joints(robot, arms), *_jumping_muscles(robot)
     return replace(result, warnings=(*result.warnings, *suspicious))
 
 
@@ -126,10 +136,15 @@ def judge(setting: Setting) -> RobotCheck:
     robot, theta, jacobian, hessian, torque = setting
     bias, arms = robot.tension.bias, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
+    pull = np.abs(arms * bias[:, None]).sum(axis=1)
+    load = np.abs(torque).max(axis=0) + pull.max(axis=0)
+    required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * float(load.max()))
+    longest = np.abs(arms).max(axis=(0, 1))
+    matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
     for n, (at, load) in enumerate(zip(jacobian, torque, strict=True)):
         programme = TensionProgramme(at, load, bias, robot.tension.limit)
         try:
-            tension[n] = programme.nearest(DESIRED_TENSION)
+            tension[n] = programme.nearest(DESIRED_SHARE * robot.tension.limit)
         except InfeasibleError:
             missing[n] = programme.compromise().missing_torque
     held = np.isfinite(tension[:, 0])
@@ -141,16 +156,17 @@ def judge(setting: Setting) -> RobotCheck:
     )
     values, vectors = np.linalg.eigh(full)
     stiffness[held], one_sided[held] = values[:, 0], np.linalg.eigvalsh(sided)[:, 0]
-    softest = np.abs(vectors[:, :, 0]).argmax(axis=1)[values[:, 0] < REQUIRED_STIFFNESS]
+    softest = np.abs(vectors[:, :, 0]).argmax(axis=1)[values[:, 0] < required]
     faults = (
         *_wrong_signs(robot, arms),
-        *_one_way_joints(robot, arms),
-        *_useless_muscles(robot, arms),
+        *_one_way_joints(robot, arms, matters),
+        *_useless_muscles(robot, arms, matters),
         *_inertia_faults(robot, theta),
-        *_holding_faults(robot, stiffness, softest, missing),
+        *_holding_faults(robot, stiffness, required, softest, missing),
     )
     warnings = tuple(_flipping_muscles(robot, arms))
-    return RobotCheck(setting, arms, tension, missing, stiffness, one_sided, faults, warnings)
+    measured = tension, missing, stiffness, one_sided, required, matters
+    return RobotCheck(setting, arms, *measured, faults, warnings)
 
 
 class Words(NamedTuple):
@@ -163,6 +179,10 @@ class Words(NamedTuple):
     other: str  # where a wire pulls the other way
     better: str  # where it pulls more surely
 
+    def decimals(self, longest: float) -> int:
+        """Return how many decimals tell moment arms beside the longest of them [m]."""
+        return int(self.scale * longest < 10.0)
+
 
 def words(robot: Robot, joint: int) -> Words:
     """Return how moment arms at a joint are told."""
@@ -171,10 +191,20 @@ def words(robot: Robot, joint: int) -> Words:
     return Words(1e3, 'mm', 'moment arm', 'long', 'along the other side of', 'further from')
 
 
-def required_stiffness(robot: Robot) -> str:
-    """Say the least eigenvalue, and what that is where a joint slides."""
-    sliding = f' (where it slides, {REQUIRED_STIFFNESS / RACK**2:.0f} N/m)'
-    return f'{REQUIRED_STIFFNESS:g} N·m/rad' + sliding * bool(robot.kinematics.slides.any())
+def required_stiffness(robot: Robot, required: float) -> str:
+    """Say the least eigenvalue [N·m/rad], and what that is where a joint slides."""
+    sliding = f' (where it slides, {required / RACK**2:.0f} N/m)'
+    return f'{required:.2g} N·m/rad' + sliding * bool(robot.kinematics.slides.any())
+
+
+def figure(value: float, least: int = 1, largest: float | None = None) -> str:
+    """Return a value with two digits of the largest told beside it (default: of itself).
+
+    It has `least` decimals or more, and no sign where it is told as zero.
+    """
+    size = abs(value if largest is None else largest)
+    decimals = max(least, 1 - int(np.floor(np.log10(size)))) if size else least
+    return f'{round(value, decimals) + 0.0:.{decimals}f}'
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
@@ -225,11 +255,11 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             )
 
 
-def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
     """Joints that too often have muscles on one side only."""
     lacks = {
-        '+': np.max(moment_arms, axis=1) <= MATTERS,
-        '-': np.min(moment_arms, axis=1) >= -MATTERS,
+        '+': np.max(moment_arms, axis=1) <= matters,
+        '-': np.min(moment_arms, axis=1) >= -matters,
     }
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
     one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
@@ -240,9 +270,10 @@ def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             if lacking[:, joint].any()
         )
         told = words(robot, joint)
+        decimals = told.decimals(longest[:, joint].max())
         acting = ', '.join(
-            f'{robot.muscles[m]} ({told.scale * median[m, joint]:+.0f} {told.unit})'
-            for m in np.flatnonzero(longest[:, joint] > MATTERS)
+            f'{robot.muscles[m]} ({told.scale * median[m, joint]:+.{decimals}f} {told.unit})'
+            for m in np.flatnonzero(longest[:, joint] > matters[joint])
         )
         yield Finding(
             'one_way_joint',
@@ -252,16 +283,16 @@ def _one_way_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         )
 
 
-def _useless_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
     along = ', along one that slides' * bool(robot.kinematics.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
-        if (arm := arms.max()) < MATTERS:
-            told = words(robot, int(arms.argmax()))
+        if (arms < matters).all():
+            arm, told = arms.max(), words(robot, int(arms.argmax()))
             yield Finding(
                 'useless_muscle',
                 f'muscle {muscle!r} never matters: '
                 f'its {told.long}est {told.name} is {told.scale * arm:.1f} {told.unit}',
-                f'lead it at least {1e3 * MATTERS:g} mm past the axis of a joint{along}, '
+                f'lead it at least {1e3 * matters.max():.2g} mm past the axis of a joint{along}, '
                 'or remove it',
             )
 
@@ -310,6 +341,24 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         )
 
 
+def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Joints beside whose moment arms the errors that are emulated and learned are no small ones.
+
+    A joint on which no muscle acts is a fault of its own.
+    """
+    longest = np.abs(moment_arms).max(axis=(0, 1))
+    small = np.flatnonzero((longest > MATTERS_LEAST) & (longest < SHORT)).tolist()
+    if small:
+        each = ', '.join(f'{robot.joints[j]} ({1e3 * longest[j]:.1f} mm)' for j in small)
+        yield Finding(
+            'small_joints',
+            f'the longest moment arms are short, at {each}, and the emulator and the learner suit '
+            'arms of human size: route points of emulated individuals are 8.5 mm off, and their '
+            'modules are heavier than such joints',
+            'what is emulated and learned of these joints says little of the real ones',
+        )
+
+
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
     """Muscles whose wire slips to the other side of what it wraps round."""
     for m, size, theta in jumping_muscles(robot):
@@ -336,10 +385,13 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
 
 
 def _holding_faults(
-    robot: Robot, stiffness: Array, softest: Ints, missing: Array
+    robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
-    """Shares that are too low; `softest` is of the postures that are held but not stiff."""
-    held, stiff = np.isfinite(stiffness), stiffness >= REQUIRED_STIFFNESS
+    """Shares that are too low, with the least stiffness eigenvalue [N·m/rad] that is enough.
+
+    `softest` is of the postures that are held but not stiff.
+    """
+    held, stiff = np.isfinite(stiffness), stiffness >= least
     required, worst = f'required {100 * REQUIRED_SHARE:.0f} %', -1
     if held.mean() < REQUIRED_SHARE:
         lack = np.abs(missing[~held])
@@ -347,8 +399,9 @@ def _holding_faults(
         counts = Counter(sorted(most.tolist())).most_common()
         own, units = lack / robot.kinematics.radian, robot.units
         force = 'torque' + ' or force' * bool(robot.kinematics.slides.any())
+        each = {k: figure(own[most == k, k].max(), 2) for k, _ in counts}
         where = ', '.join(
-            f'{robot.joints[k]} in {count} (up to {own[most == k, k].max():.2f} {units[k].torque})'
+            f'{robot.joints[k]} in {count} (up to {each[k]} {units[k].torque})'
             for k, count in counts
         )
         worst = counts[0][0]
@@ -365,11 +418,13 @@ def _holding_faults(
         told = 'not stiff'
         if (unstable := stiffness < 0.0).any():
             told = f'unstable in {100 * unstable.mean():.1f} % of postures, with an eigenvalue of '
-            told += f'its stiffness down to {stiffness[unstable].min():.1f} N·m/rad, and not stiff'
+            told += (
+                f'its stiffness down to {figure(stiffness[unstable].min())} N·m/rad, and not stiff'
+            )
         yield Finding(
             'not_stiff',
             f'the arm is {told}: {100 * stiff.mean():.1f} % of postures have a smallest '
-            f'stiffness eigenvalue >= {required_stiffness(robot)}, {required} '
+            f'stiffness eigenvalue >= {required_stiffness(robot, least)}, {required} '
             '(a posture that is not held counts as not stiff); softest joint of the held ones, '
             f'in postures: {where or "none"}',
             joint=counts[0][0] if counts else worst,

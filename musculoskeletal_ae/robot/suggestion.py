@@ -93,15 +93,17 @@ def moved(robot: Robot, change: Array) -> Robot:
 
 def lacking(check: checks.RobotCheck) -> float:
     """Return what an arm lacks that via points could give it; 0: nothing, and with a margin."""
-    arms, least = check.moment_arms, checks.MATTERS
+    arms, least = check.moment_arms, check.matters
     torque = np.linalg.norm(check.missing_torque, axis=1)
-    soft = np.maximum(1.0 - check.stiffness / checks.REQUIRED_STIFFNESS, 0.0)
+    soft = np.maximum(1.0 - check.stiffness / check.required, 0.0)
     weak = np.where(check.held, soft / (1.0 + soft), 1.0 + torque / (1.0 + torque))
-    short = [least - arms.max(axis=1), least + arms.min(axis=1)]  # of either direction
+    # Of either direction, as shares of what matters.
+    short = [1.0 - arms.max(axis=1) / least, 1.0 + arms.min(axis=1) / least]
     actions = checks.read_declared_actions(check.setting.robot.description).items()
-    short += [RESOLUTION - sign * arms[:, [m], j] for (m, j), sign in actions]
-    rows = np.sort(np.column_stack([weak, np.maximum(np.hstack(short), 0.0) / least]), axis=0)
-    useless = np.maximum(least + RESOLUTION - np.abs(arms).max(axis=(0, 2)), 0.0) / least
+    short += [(RESOLUTION - sign * arms[:, [m], j]) / least[j] for (m, j), sign in actions]
+    rows = np.sort(np.column_stack([weak, np.maximum(np.hstack(short), 0.0)]), axis=0)
+    missing = (least + RESOLUTION - np.abs(arms).max(axis=0)) / least
+    useless = np.maximum(missing.min(axis=1), 0.0)
     return float(rows[: len(rows) - int(FORGIVEN * len(rows))].mean(axis=0).sum() + useless.sum())
 
 

@@ -5,7 +5,7 @@
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
 
 (Kawamura 2016). T_desired = 0 gives the least tension that holds τ, also the QP bound of the
-control experiment; T_desired = 60 N the well-tensed arm by which `check_robot` judges.
+control experiment; T_desired = 0.3 T_limit the well-tensed arm by which `check_robot` judges.
 """
 
 from __future__ import annotations

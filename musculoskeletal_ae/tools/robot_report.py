@@ -10,12 +10,12 @@ import numpy as np
 
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.robot.checks import (
-    DESIRED_TENSION,
+    DESIRED_SHARE,
     MATTERS,
     REQUIRED_SHARE,
-    REQUIRED_STIFFNESS,
     RobotCheck,
     check_robot,
+    figure,
     required_stiffness,
     words,
 )
@@ -70,6 +70,8 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     """Return the holding and stiffness part of the report."""
     count, held = len(result.setting.theta), result.held
     need = f'required of both: {100 * REQUIRED_SHARE:.0f} % of postures'
+    required = required_stiffness(robot, result.required)
+    desired = DESIRED_SHARE * robot.tension.limit
     tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'
     lines = [
         f'{robot.description.directory}',
@@ -77,11 +79,11 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
         *robot.description.joint_notes,
         '',
         f'{need}; a posture that is not held counts as not stiff',
-        f'held with {tension}, nearest to {DESIRED_TENSION:g} N:  {100 * held.mean():.1f} %',
-        f'stiffness >= {required_stiffness(robot)}:  {100 * result.stiff.mean():.1f} %',
+        f'held with {tension}, nearest to {shown(desired)} N:  {100 * held.mean():.1f} %',
+        f'stiffness >= {required}:  {100 * result.stiff.mean():.1f} %',
     ]
     if held.any():
-        one_sided = (np.nan_to_num(result.one_sided) >= REQUIRED_STIFFNESS) & held
+        one_sided = (np.nan_to_num(result.one_sided) >= result.required) & held
         singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1]
         lines += [
             f'  one-sided, muscles at bias slack (not judged):  {100 * one_sided.mean():.1f} %',
@@ -95,7 +97,8 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             'highest holding tension [N]': result.tension[held].max(axis=1),
         }.items():
             spread = np.percentile(values, [0, 5, 50, 100])
-            lines.append(f'{title:<44}' + ''.join(f'{value:9.1f}' for value in spread))
+            told = [figure(value, 1, np.abs(spread).max()) for value in spread]
+            lines.append(f'{title:<44}' + ''.join(f'{value:>9}' for value in told))
     return '\n'.join(lines)
 
 
@@ -104,22 +107,25 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     width = max(18, *(len(name) + 2 for name in robot.joints))
     first = max(len(name) for name in robot.muscles) + 2
     scale = np.array([words(robot, j).scale for j in range(robot.joint_count)])
-    arms = scale * result.moment_arms
+    arms, matters = scale * result.moment_arms, result.matters
+    longest = np.abs(result.moment_arms).max(axis=(0, 1))
+    decimals = [words(robot, j).decimals(arm) for j, arm in enumerate(longest.tolist())]
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
     sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
     moves = 'moves' if sliders else 'turns'
+    tenth = ', and below a tenth of the longest at that joint,' * bool((matters < MATTERS).any())
     sliding = f'of what slides ({sliders}): the share of the tension along it [%], "." = below '
     lines = [
         '',
         f'moment arms [mm]: min, median, max; + {moves} the joint in its positive direction',
-        f'"." = below {1e3 * MATTERS:g} mm in every posture',
+        f'"." = below {1e3 * MATTERS:g} mm{tenth} in every posture',
         *[f'{sliding}{100 * MATTERS / RACK:g} %'] * bool(sliders),
         ' ' * first + ''.join(name.rjust(width) for name in robot.joints),
     ]
     for name, row in zip(robot.muscles, spread):
         cells = [
-            '.' if np.abs(cell).max() < least else ''.join(f'{v:+5.0f}' for v in cell)
-            for cell, least in zip(row, scale * MATTERS)
+            '.' if np.abs(cell).max() < least else ''.join(f'{v:+5.{digits}f}' for v in cell)
+            for cell, least, digits in zip(row, scale * matters, decimals)
         ]
         lines.append(name.ljust(first) + ''.join(cell.rjust(width) for cell in cells))
     return '\n'.join([*lines, ''])
@@ -139,7 +145,7 @@ def plot(robot: Robot, result: RobotCheck) -> Any:
         label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
             arm = result.moment_arms[:, m, j]
-            if np.abs(arm).max() >= MATTERS:
+            if np.abs(arm).max() >= result.matters[j]:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}
                 panel.scatter(shown_as * result.setting.theta[:, j], told.scale * arm, **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
@@ -150,7 +156,7 @@ def plot(robot: Robot, result: RobotCheck) -> Any:
     if held.any():
         last.hist(result.stiffness[held], bins=30, label='all muscles', color='C0')
         last.hist(result.one_sided[held], bins=30, label='one-sided', histtype='step', color='C1')
-    last.axvline(REQUIRED_STIFFNESS, color='black', linestyle='--', label='required')
+    last.axvline(result.required, color='black', linestyle='--', label='required')
     last.set(
         title=f'held {100 * held.mean():.1f} %, stiff {100 * result.stiff.mean():.1f} %',
         xlabel='smallest stiffness eigenvalue [N·m/rad]',

@@ -280,6 +280,67 @@ def test_a_joint_that_moves_no_mass_is_a_fault(tmp_path):
     assert "'bend'" in fault.message
 
 
+FINGER = """<robot name="finger"><link name="palm"/>
+  <link name="phalanx"><inertial><origin xyz="0 0 -0.012"/><mass value="0.004"/>
+    <inertia ixx="3e-7" ixy="0" ixz="0" iyy="3e-7" iyz="0" izz="3e-7"/></inertial></link>
+  <joint name="knuckle" type="revolute"><parent link="palm"/><child link="phalanx"/>
+    <axis xyz="0 1 0"/><limit lower="-0.5" upper="0.5" effort="1" velocity="5"/></joint></robot>
+"""
+
+
+def finger(directory, **top):
+    """A finger whose muscles pull 5 N at most, with moment arms of 3 to 5 mm."""
+    directory.mkdir()
+    (directory / 'robot.urdf').write_text(FINGER)
+    muscles = [
+        {
+            'name': name,
+            'route': [
+                {'link': 'palm', 'xyz': [x, 0.0, 0.015]},
+                {'link': 'phalanx', 'xyz': [x, 0.0, -0.015]},
+            ],
+        }
+        for name, x in (('flexor', 0.005), ('extensor', -0.005))
+    ]
+    document = {
+        'joints': ['knuckle'],
+        'muscles': muscles,
+        'end_effector': 'phalanx',
+        'tension': {'bias': 0.5, 'limit': 5.0, 'max': 8.0},
+        'series_elastic': {'force': 3.0, 'rate': 800.0, 'wire_stretch': 1.0e-4},
+        'stiffness': 2000.0,
+        **top,
+    }
+    return write_muscles(directory, document)
+
+
+def test_a_finger_is_judged_by_its_own_size_and_told_that_it_is_small(tmp_path, capsys):
+    status, printed, _ = verdict(capsys, finger(tmp_path / 'arm'))
+    assert status == 0, printed
+    assert 'nearest to 1.5 N' in printed and 'stiffness >= 0.0' in printed
+    (warning,) = (line for line in printed.splitlines() if line.startswith('warning: '))
+    assert 'moment arms are short, at knuckle (' in warning and 'human size' in warning
+    (row,) = (line for line in printed.splitlines() if line.startswith('flexor '))
+    assert re.fullmatch(r'flexor( +-\d\.\d){3}', row)
+
+
+def test_a_finger_that_is_soft_or_weak_is_told_by_how_much(tmp_path, capsys):
+    _, printed, _ = verdict(capsys, finger(tmp_path / 'soft', stiffness=20.0))
+    assert 'fault: the arm is' in printed and 'not stiff' in printed
+    assert '-0.0 N·m' not in printed
+    tension = {'bias': 0.01, 'limit': 0.02, 'max': 0.02}
+    _, printed, _ = verdict(capsys, finger(tmp_path / 'weak', tension=tension))
+    (most,) = re.findall(r'knuckle in \d+ \(up to (\S+) N·m\)', printed)
+    assert 0.0 < float(most) < 0.001
+
+
+@pytest.mark.parametrize('name', SHIPPED)
+def test_arms_of_human_size_are_judged_by_the_round_figures(name):
+    result = check_robot(Robot.load(name), 20)
+    assert result.required == 5.0
+    np.testing.assert_array_equal(result.matters, 0.003)
+
+
 BROKEN = {
     'unknown link': (lambda d: d['muscles'][0]['route'][0].update(link='knee'), ['knee', 'torso']),
     'nan': (lambda d: d['muscles'][0]['route'][0]['xyz'].__setitem__(1, float('nan')), ['finite']),
