@@ -43,6 +43,7 @@ HOUR = 3600.0  # [s]
 BEDDING_TIME = 2.0 * HOUR  # [s]
 NUDGE = 1e-7  # [rad]
 SLIP_TIME = 5.0 * HOUR  # [s] between two slips of a wire on its spool
+OTHER_ROUTE = 0.02  # [m] by which a file's lengths are not off if its routes are the robot's
 
 
 class ForeignBody:
@@ -114,6 +115,17 @@ def _directory(robot: Robot, draw: Draw) -> Any:
     return model
 
 
+def _other_routes(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
+    """Say which muscles of a file have other lengths than the robot's, by `off` [m] (N, M)."""
+    most = np.abs(off).max(axis=0)
+    return tuple(
+        f'reality {file}: muscle {robot.muscles[m]!r} is up to {1e3 * most[m]:.0f} mm longer or '
+        f'shorter there than in {robot.description.directory}; is it the same robot, and the same '
+        'way of the wire (import_robot keeps one branch of a pulley)?'
+        for m in np.flatnonzero(most > OTHER_ROUTE)
+    )
+
+
 class ForeignArm(Arm):
     """An arm of MuJoCo."""
 
@@ -150,10 +162,14 @@ class ForeignArm(Arm):
         muscles = robot.muscle_count
         self._memory = Memory(*(np.zeros(muscles) for _ in Memory._fields))
         self._memory = self._memory._replace(slow=np.zeros((muscles, len(TIMES))))
+        still = np.zeros(muscles)
         body.look(data, 0.5 * (robot.lower + robot.upper))
-        guides_step(self._guides, np.zeros(muscles), self._memory.bend, 0.0)
+        guides_step(self._guides, still, self._memory.bend, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
-        span = body.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - at_zero
+        theta = robot.random_postures(500, np.random.default_rng(0))
+        span = body.absolute_lengths(theta) - at_zero
+        if file:
+            self.warnings = _other_routes(robot, file, span - robot.muscle_lengths(theta, still))
         self.wires = make_wires(robot, body.elastic, at_zero, span, bend, draw)
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
         self._draw_sensors()

@@ -189,6 +189,7 @@ class Arm(ABC):
     """An arm that plays reality behind the topics."""
 
     individual: Any  # the true body that a seed picked
+    warnings: tuple[str, ...] = ()  # what a person who starts it should know
     #: angles and velocities of all joints, and where those of θ stand in either
     _angles: Array
     _rates: Array

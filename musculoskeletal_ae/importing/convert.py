@@ -58,7 +58,7 @@ def read_source(file: Path) -> Source:
         told = str(e) if isinstance(e, ValueError) else repr(e)
         raise refuse(file, f'it cannot be imported: {told}') from e
     if not source.routes:
-        raise refuse(file, '; '.join(['it has no muscle with a route', *source.notes[-3:]]))
+        raise refuse(file, '; '.join(['it has no muscle with a route', *source.lost()[-3:]]))
     return source
 
 
@@ -70,7 +70,7 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     source = read_source(file)
     cut(source, **chain)
     if not source.routes:
-        raise refuse(file, f'no muscle is left; {"; ".join(source.notes[-3:])}')
+        raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
     write(source, out)
     robot = Robot.load(out)
     return Imported(robot, tuple(source.notes), compare(source, robot))

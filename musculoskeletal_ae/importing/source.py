@@ -68,6 +68,10 @@ class Source:
         """Remember, in a line, what was 'chosen', 'dropped', 'held fixed', 'renamed' and so on."""
         self.notes.append(f'{kind}: {printable(told)}')
 
+    def lost(self) -> list[str]:
+        """Return the notes that say why something did not become a muscle, or is none any more."""
+        return [note for note in self.notes if re.match(r'dropped: .*(muscle|tendon)', note)]
+
     def rename(self, kind: str, given: str | None, fallback: str, taken: Iterable[str]) -> str:
         """Return a safe name that is not taken, and say so where it is not the given one."""
         (name,) = distinct([safe_name(given, fallback)], taken)

@@ -33,6 +33,8 @@ class HardwareEmulator(Arm):
         super().__init__('hardware_emulator', **options)
         Markers(self, 'hardware_emulator', self._lines)
         self.arm = make_arm(self.robot, self.parameter('seed'), self.parameter('reality'))
+        for warning in self.arm.warnings:
+            self.get_logger().warning(warning)
         # Compiled code is loaded before the first message promises a living arm.
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0

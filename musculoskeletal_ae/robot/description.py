@@ -27,6 +27,8 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
 
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
+#: what URDF calls joints that are neither revolute nor prismatic, by their degrees of freedom
+OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 
@@ -145,9 +147,12 @@ def load_description(robot: str | Path) -> RobotDescription:
     for item in top['muscles'].items(1, 'muscles'):
         entry = item.mapping('name', 'route', 'series_elastic', 'stiffness', 'tension')
         names.append(entry['name'].name())
-        if names[-1] != names[-1].strip() or ',' in names[-1]:
-            told = f'without a comma or spaces around it, got {names[-1]!r}'
-            raise entry['name'].fail(f'expected a name {told}: lists of muscles have commas')
+        for wrong, legal in (
+            (',' in names[-1], 'a comma, which lists of muscles have between names'),
+            (names[-1] != names[-1].strip(), 'spaces around it, which lists of muscles may have'),
+        ):
+            if wrong:
+                raise entry['name'].fail(f'expected a name without {legal}, got {names[-1]!r}')
         muscle = entry.called(f'muscle {names[-1]!r}')
         routes.append(_read_route(muscle['route'], links, warnings))
         elastic.append(_read_elastic(muscle.get('series_elastic'), default))
@@ -193,8 +198,9 @@ def _one_axis_joint(entry: Entry, name: str, model: pin.Model) -> pin.JointModel
         raise entry.fail(f'unknown joint {name!r}; movable joints of robot.urdf: {legal}')
     joint = model.joints[model.getJointId(name)]
     if joint.shortname() not in kinematics.REVOLUTE + kinematics.PRISMATIC:
+        kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
         raise entry.fail(
-            f'joint {name!r} is a {joint.shortname()}; legal: revolute or prismatic joints '
+            f'joint {name!r} is {kind}; legal: revolute or prismatic joints '
             'with one degree of freedom and limits (continuous has none)'
         )
     return joint

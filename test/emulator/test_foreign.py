@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 
 import bodies
@@ -218,6 +219,19 @@ def test_a_users_model_plays_the_robot(imported):
     hand = robot.kinematics.end_effector_pose(arm.theta).translation
     np.testing.assert_allclose(arm.hand.translation, hand, atol=1e-3)  # a step earlier
     assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
+
+
+def test_a_model_whose_lengths_are_others_is_told_by_muscle_and_millimetres(imported, tmp_path):
+    file, robot = imported
+    assert make_arm(robot, 0, str(file)).warnings == ()
+    other, path = tmp_path / 'other.xml', '<site site="u1"/><site site="l1"/>'
+    divided = f'<pulley divisor="4"/>{path}'
+    other.write_text(bodies.MJCF.replace(path, divided), encoding='utf-8')
+    (warning,) = make_arm(robot, 0, str(other)).warnings
+    (off,) = re.findall(r"muscle 'bend' is up to (\d+) mm longer or shorter", warning)
+    theta = robot.random_postures(500, np.random.default_rng(0))
+    bend = robot.muscle_lengths(theta, np.zeros(robot.muscle_count))[:, robot.muscles.index('bend')]
+    assert float(off) == pytest.approx(750.0 * np.abs(bend).max(), abs=1.0)
 
 
 @pytest.mark.parametrize(

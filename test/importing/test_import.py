@@ -187,6 +187,20 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         read_source(cardsflow)
 
 
+def test_of_a_model_without_routes_it_is_said_what_was_dropped_of_muscles(tmp_path):
+    text = bodies.MJCF
+    for name in ('front', 'back', 'out', 'in', 'bend', 'stretch', 'curler'):
+        text = re.sub(f'<spatial name="{name}">.*?</spatial>', '', text, flags=re.S)
+    text = re.sub('<muscle [^>]*>', '', text).replace('polycoef="0.1 0.5', 'polycoef="0.1 0.5 0.1')
+    text = text.replace('<equality>', '<equality><connect body1="upper" anchor="0 0 0"/>')
+    with pytest.raises(SourceError) as refusal:
+        read_source(put(tmp_path, 'own.xml', text.replace('0.1 0 0 0"', '0.1 0 0"')))
+    told = str(refusal.value)
+    assert 'it has no muscle with a route; ' in told
+    assert 'tendon none: a fixed one, which has no route' in told
+    assert 'equality' not in told and 'follows' not in told
+
+
 TWICE = '<joint name="other" type="fixed"><child>arm</child></joint></model>'
 
 

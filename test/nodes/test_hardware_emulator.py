@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import bodies
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,6 +14,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.validity import read_array
@@ -201,6 +203,14 @@ def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
     assert graph.next('hardware_emulator/markers').markers
     for wrong in (['front'], [arm26.muscles[0], 'front']):
         assert not graph.set_parameter('hardware_emulator', 'ruptured_muscles', wrong)[0]
+
+
+def test_a_model_whose_lengths_are_others_is_told_at_the_start(graph, tmp_path, capfd):
+    file, path = tmp_path / 'own.xml', '<site site="u1"/><site site="l1"/>'
+    file.write_text(bodies.MJCF.replace(path, f'<pulley divisor="4"/>{path}'), encoding='utf-8')
+    import_robot(file, tmp_path / 'own')
+    graph.host(HardwareEmulator, robot=str(tmp_path / 'own'), reality=str(file))
+    assert "muscle 'bend' is up to" in capfd.readouterr().err
 
 
 def test_no_such_reality_ends_it_with_a_reason(graph):

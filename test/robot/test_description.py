@@ -77,7 +77,14 @@ BAD = {
     'elastic key': (put(['series_elastic', 'k'], 1.0), ["'k'", 'force, rate, wire_stretch']),
     'elastic zero': (put(['series_elastic', 'force'], 0.0), ['series_elastic.force', '> 0']),
     'negative stretch': (put(['series_elastic', 'wire_stretch'], -1e-5), ['wire_stretch', '>= 0']),
-    'name with a comma': (put(['muscles', 0, 'name'], 'a, b'), ['muscles[0].name', "'a, b'"]),
+    'name with a comma': (
+        put(['muscles', 0, 'name'], 'a, b'),
+        ['muscles[0].name', "'a, b'", 'without a comma'],
+    ),
+    'name with a space': (
+        put(['muscles', 0, 'name'], 'a '),
+        ['muscles[0].name', "'a '", 'without spaces around it'],
+    ),
     'stiffness zero': (put(['stiffness'], 0.0), ['stiffness', '> 0']),
     'stiffness empty': (put(['stiffness'], None), ['stiffness', 'None']),
     'tension key': (put(['tension', 'min'], 1.0), ["'min'", 'bias, limit, max']),
@@ -125,7 +132,11 @@ BAD_URDF = {
     'two numbers': ('xyz="0 0 -0.28"', 'xyz="0 -0.28"', ["joint 'elbow'", '3 finite numbers']),
     'limit nan': ('lower="-1.9199"', 'lower="nan"', ["joint 'elbow'", 'limit lower']),
     'limits crossed': ('lower="-1.9199"', 'lower="1.0"', ["'elbow'", 'lower < upper']),
-    'continuous': ('type="revolute"', 'type="continuous"', ['revolute or prismatic', 'limits']),
+    'continuous': (
+        'type="revolute"',
+        'type="continuous"',
+        ['is continuous; legal: revolute or prismatic', 'limits'],
+    ),
     'no such parent': (
         'parent link="upper_arm"',
         'parent link="x"',
