@@ -2,10 +2,11 @@
 """The body and the postures of its samples, found together from whatever sensors there are.
 
     min  Σ ω (l_nm − l_m(θ_n, T_n; w))²/σ_m² + Σ ω (g(θ_n) + Gᵀ T_end)_j²/σ_τ²
-         + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)² + Σ (z/s_z)²
+         + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)²
+         + Σ ((z − z̄)/s_z)²
 
 over the parameters w of the corrected body, the postures θ_n and the zeros z of the joint sensors,
-by Gauss–Newton. y are joint angles that a sensor read (with its zero z), a camera saw or somebody
+by Gauss–Newton. z̄ and s_z are what the joints' stops tell (`stops`). y are joint angles that a sensor read (with its zero z), a camera saw or somebody
 stated, u directions of gravity in links that carry an IMU; any of them may be missing anywhere.
 M > D makes that possible: N rests give N (M − D) equations of length more than there are angles,
 and N D of torque. A joint that muscles push against its stop harder than friction holds is taken to
