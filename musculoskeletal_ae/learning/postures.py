@@ -6,8 +6,9 @@
          + Σ ((z − z̄)/s_z)²
 
 over the parameters w of the corrected body, the postures θ_n and the zeros z of the joint sensors,
-by Gauss–Newton. z̄ and s_z are what the joints' stops tell (`stops`). y are joint angles that a sensor read (with its zero z), a camera saw or somebody
-stated, u directions of gravity in links that carry an IMU; any of them may be missing anywhere.
+by Gauss–Newton. z̄ and s_z are what the joints' stops tell (`stops`). y are joint angles that a
+sensor read (with its zero z), a camera saw or somebody stated, u directions of gravity in links
+that carry an IMU; any of them may be missing anywhere.
 M > D makes that possible: N rests give N (M − D) equations of length more than there are angles,
 and N D of torque. A joint that muscles push against its stop harder than friction holds is taken to
 be there; one that is beyond it is drawn back. Postures enter few rows each, so that they are
