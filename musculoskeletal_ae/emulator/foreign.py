@@ -21,7 +21,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator import mjcf
 from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
-from musculoskeletal_ae.emulator.modules import STEP, Arm, joint_load
+from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.emulator.wires import (
     TIMES,
     Guides,
@@ -183,7 +183,8 @@ class ForeignArm(Arm):
         """Let joints rub, each by its own load."""
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
-        load = joint_load(robot, theta, body.muscle_jacobian(theta))
+        torque = robot.kinematics.holding_torque(theta)
+        load = robot.joint_load(torque, body.muscle_jacobian(theta))
         joints = [self._model.joint(name).dofadr[0] for name in robot.joints]
         self._model.dof_frictionloss[joints] = load * draw.about('joint_friction', len(joints))
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.modules import joint_load
 from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
 from musculoskeletal_ae.robot.robot import Robot
@@ -82,7 +81,7 @@ class Individual:
         self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
         #: what weight and muscles at T_bias put on each joint [N·m], (D,)
-        self.load = joint_load(robot, theta, nominal.muscle_jacobian(theta))
+        self.load = robot.joint_load(kin.holding_torque(theta), nominal.muscle_jacobian(theta))
         rubs = rng.uniform(0.5, 1.5, len(self.load))
         self.joint_friction: Array = spread.joint_friction * self.load * rubs
         #: of the sensors [m], [N], a factor; each (M,)

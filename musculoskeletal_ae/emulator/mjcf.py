@@ -7,6 +7,8 @@ tendons; the actuators of a file are left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -204,6 +206,15 @@ def _add_hand(body: Any, at: pin.SE3) -> None:
     hand.explicitinertial, hand.ipos = True, np.zeros(3)
 
 
+@contextmanager
+def _loading(file: Path) -> Iterator[None]:
+    """Say of a file that MuJoCo refuses it, and why."""
+    try:
+        yield
+    except (OSError, ValueError, mujoco.FatalError) as error:
+        raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
+
+
 def from_file(robot: Robot, file: Path) -> Any:
     """Return a user's own MJCF arm as an MjSpec; other joints than the robot's are held.
 
@@ -211,10 +222,8 @@ def from_file(robot: Robot, file: Path) -> Any:
         MusculoskeletalError: If MuJoCo does not load it, or what the robot's directory names is not
             in it.
     """
-    try:
+    with _loading(file):
         spec = mujoco.MjSpec.from_file(str(file))
-    except (OSError, ValueError, mujoco.FatalError) as error:
-        raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
     followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
     hand = _as_imported(spec, file, [*followers, *robot.muscles], robot.description.end_effector)
     tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
@@ -255,10 +264,8 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
     kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
     if {hand, *wanted} <= {thing.name for things in kinds.values() for thing in things}:
         return hand
-    try:
+    with _loading(file):
         spec.compile()  # gives each its place
-    except (ValueError, mujoco.FatalError) as error:
-        raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
     new: dict[str, dict[str, str]] = {'joint': {}, 'tendon': {}, 'body': {}}
     fixed = [t for t in spec.tendons if t.path[0].type == mujoco.mjtWrap.mjWRAP_JOINT]
     bound = {wrap.target.name: tendon.name for tendon in fixed for wrap in tendon.path}

@@ -60,17 +60,6 @@ def joint_gear(kinematics: Kinematics) -> Array:
     return gear
 
 
-def joint_load(robot: Robot, theta: Array, jacobian: Array) -> Array:
-    """Return the most that weight and muscles at T_bias put on each joint [N·m], (D,).
-
-    It is looked for in postures (N, D), in which G is (N, M, D).
-    """
-    weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
-    pulls = np.abs(jacobian) * robot.tension.bias[:, None]
-    load: Array = weight + pulls.sum(axis=1).max(axis=0)
-    return load
-
-
 class Modules(NamedTuple):
     """Constants of the modules, each of shape (M,)."""
 

@@ -136,13 +136,12 @@ def judge(setting: Setting) -> RobotCheck:
     robot, theta, jacobian, hessian, torque = setting
     bias, arms = robot.tension.bias, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
-    pull = np.abs(arms * bias[:, None]).sum(axis=1)
-    load = np.abs(torque).max(axis=0) + pull.max(axis=0)
-    required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * float(load.max()))
+    load = float(robot.joint_load(torque, jacobian).max())
+    required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * load)
     longest = np.abs(arms).max(axis=(0, 1))
     matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
-    for n, (at, load) in enumerate(zip(jacobian, torque, strict=True)):
-        programme = TensionProgramme(at, load, bias, robot.tension.limit)
+    for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
+        programme = TensionProgramme(at, weight, bias, robot.tension.limit)
         try:
             tension[n] = programme.nearest(DESIRED_SHARE * robot.tension.limit)
         except InfeasibleError:

@@ -101,6 +101,15 @@ class Robot:
         relative = absolute - self.routes.length_at_zero
         return relative - self.series_elastic.elongation(absolute, tension)
 
+    def joint_load(self, torque: Array, jacobian: Array) -> Array:
+        """Return the most that weight and muscles at T_bias put on each joint [N·m], (D,).
+
+        In N postures, of the torque that holds the weight [N·m] (N, D) and G (N, M, D).
+        """
+        pulls = np.abs(jacobian) * self.tension.bias[:, None]
+        load: Array = np.abs(torque).max(axis=0) + pulls.sum(axis=1).max(axis=0)
+        return load
+
     def muscle_stiffness(self, theta: Array, tension: Array) -> Array:
         """Return k(θ, T) [N/m] of MSC and the elastic unit in series, θ (..., D), T (..., M)."""
         absolute = self.routes.absolute_lengths(theta)
