@@ -21,7 +21,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.source import distinct, safe_name
+from musculoskeletal_ae.importing.source import names_of_all
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -271,8 +271,8 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
     bound = {wrap.target.name: tendon.name for tendon in fixed for wrap in tendon.path}
     for kind, things in kinds.items():
         ordered = sorted(things, key=lambda thing: thing.id)
-        safe = [safe_name(thing.name, f'{kind}_{thing.id}') for thing in ordered]
-        for thing, name in zip(ordered, distinct(safe, ['universe']), strict=True):
+        names = names_of_all(kind, (thing.name for thing in ordered))
+        for thing, name in zip(ordered, names, strict=True):
             before = thing.name
             if kind == 'joint' and before in bound and name != before and name in wanted:
                 told = f'tendon {bound[before]!r} is of joint {before!r}, which import_robot calls'

@@ -19,7 +19,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import Source, distinct, refuse, safe_name
+from musculoskeletal_ae.importing.source import Source, distinct, names_of_all, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 
 #: where a model says how many it has of each kind that has names here
@@ -66,11 +66,11 @@ class _Reader:
     def _names(self, kind: str) -> list[str]:
         """Return the name of each thing of a kind, or its kind and number."""
         get, count = getattr(self.model, kind), getattr(self.model, COUNTS[kind])
-        # Those that differ in MuJoCo may do so only in what is not safe; pinocchio's own is taken.
-        names = ['universe']
-        for i in range(count):
-            names.append(self.source.rename(kind, get(i).name, f'{kind}_{i}', names))
-        return names[1:]
+        given = [get(i).name for i in range(count)]
+        names = names_of_all(kind, given)
+        for each, name in zip(given, names, strict=True):
+            self.source.renamed(kind, each, name)
+        return names
 
     def name(self, kind: str, i: int) -> str:
         """Return the name of a thing."""

@@ -75,9 +75,13 @@ class Source:
     def rename(self, kind: str, given: str | None, fallback: str, taken: Iterable[str]) -> str:
         """Return a safe name that is not taken, and say so where it is not the given one."""
         (name,) = distinct([safe_name(given, fallback)], taken)
+        self.renamed(kind, given, name)
+        return name
+
+    def renamed(self, kind: str, given: str | None, name: str) -> None:
+        """Say so where a name is not the given one."""
         if given and name != given:
             self.note('renamed', f'{kind} {given} is {name} here')
-        return name
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
         """Return limits of a joint, chosen ones where there are none."""
@@ -172,6 +176,12 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
         seen.add(name)
         result.append(name)
     return result
+
+
+def names_of_all(kind: str, given: Iterable[str]) -> list[str]:
+    """Return safe and distinct names of all things of a kind; those that have none are numbered."""
+    safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(given))
+    return distinct(safe, ['universe'])  # which is pinocchio's own
 
 
 def unique(

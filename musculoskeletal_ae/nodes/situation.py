@@ -6,7 +6,9 @@ from __future__ import annotations
 import contextlib
 import math
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+TOLD = 'stopped', 'anomaly detected'  # errors that are told with what to do
 
 
 def figures(measured: bool, error: float, anomaly: float) -> str:
@@ -22,6 +24,7 @@ class Situation:
     def __init__(self, namespace: str) -> None:
         self._here = namespace.rstrip('/')
         self.detected = self.explored = False
+        self._failing: dict[str, str] = {}  # what nodes report as any other error
         self.samples = self.checkpoints = self.suspect = self.doing = self.stopped = ''
         self.distance = self.limit = math.nan  # d of the detector, and what is an anomaly
 
@@ -30,6 +33,10 @@ class Situation:
         for status in message.status:
             node, _, _ = status.name.partition(':')
             values = {value.key: value.value for value in status.values}
+            if node.startswith(f'{self._here}/'):
+                failing = status.level == DiagnosticStatus.ERROR
+                failing &= not status.message.startswith(TOLD)
+                self._failing[node] = status.message if failing else ''
             if node == f'{self._here}/learner':
                 self.samples = values.get('samples', '')
                 self.checkpoints = values.get('checkpoints', '')
@@ -54,7 +61,10 @@ class Situation:
         if self.stopped:
             told.append(self.stopped.replace('stopped', 'STOPPED', 1))
             steps += ['controller/reset', *['controller/explore'] * self.explored]
-        return f'{", ".join(told)} (to go on: {", ".join(steps)})' if told else ''
+        if steps:
+            told[-1] += f' (to go on: {", ".join(steps)})'
+        told += [f'{node}: {message}' for node, message in self._failing.items() if message]
+        return ', '.join(told)
 
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""

@@ -17,11 +17,12 @@ from musculoskeletal_ae.nodes.bringup_status import muscle_table, open_screen
 from musculoskeletal_ae.nodes.situation import Situation, figures
 
 
-def said(node: str, message: str = '', **values: str) -> DiagnosticArray:
+def said(
+    node: str, message: str = '', level: bytes = DiagnosticStatus.OK, **values: str
+) -> DiagnosticArray:
     pairs = [KeyValue(key=key.replace('_', ' '), value=value) for key, value in values.items()]
-    return DiagnosticArray(
-        status=[DiagnosticStatus(name=f'{node}: state', message=message, values=pairs)]
-    )
+    status = DiagnosticStatus(name=f'{node}: state', message=message, level=level, values=pairs)
+    return DiagnosticArray(status=[status])
 
 
 def test_before_the_first_sample_it_says_why_the_error_may_rise():
@@ -59,6 +60,21 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
     assert told.trouble() == ''
     told.diagnosed(said('/left/controller', 'stopped: a cause'))
     assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
+
+
+def test_an_error_of_any_node_is_told_until_it_is_over():
+    told, error = Situation('/left'), DiagnosticStatus.ERROR
+    told.diagnosed(said('/right/learner', 'the disk is full', error))
+    told.diagnosed(said('/left/controller', 'stopped: a cause', error))
+    assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
+    told.diagnosed(said('/left/learner', 'the disk is full', error))
+    assert told.trouble() == (
+        'STOPPED: a cause (to go on: controller/reset), /left/learner: the disk is full'
+    )
+    told.diagnosed(said('/left/controller', 'holding'))
+    assert told.trouble() == '/left/learner: the disk is full'
+    told.diagnosed(said('/left/learner', 'learning'))
+    assert told.trouble() == ''
 
 
 def test_a_terminal_shows_every_muscle_and_the_trouble_where_rich_is_there(arm26):
