@@ -68,6 +68,7 @@ class Preset:
     least_samples: int  # from how many samples on it learns online
     gated: bool  # the learner tries what it learned by `estimation.gate`; as printed it does not
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
+    to_limits: float  # share of a joint's targets that exploration takes at its limits
     whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 
     def grown(self, number: int, groups: Iterable[Group], power: float = 1.0) -> int:

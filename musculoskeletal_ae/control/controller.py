@@ -305,6 +305,7 @@ class Controller:
             return 'method float: a hand moves the arm; set another method first'
         if wanted != self.posture.exploring:
             self.short = ''
+            self._exploration.to_limits = PRESETS[self.settings.preset].to_limits
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts, self.follows = True, False

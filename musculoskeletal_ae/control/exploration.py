@@ -8,6 +8,10 @@
 (paper, section "Online Learning of Musculoskeletal AutoEncoder"). Each step ramps the command and
 then rests, since the body is learned at rest. Targets are drawn among the postures that the arm can
 hold with tensions in [T_bias, T_limit].
+
+Our preset draws some joints' targets at one of their limits, since only their stops tell the zeros
+of their sensors (`learning.stops`), and of several random T_const takes the one that presses them
+there most.
 """
 
 from __future__ import annotations
@@ -28,6 +32,8 @@ from musculoskeletal_ae.robot.tension import TensionProgramme, holding_tension
 
 DURATIONS = (5.0, 2.0, 3.0)  # [s]
 TRIES = 1000
+SMALL = 1e-9  # [N·m]
+PRESSES = 10  # T_const, of which the one is taken that presses most towards limits
 
 # of gentle motion
 SPEED = 0.05  # [m/s] of a command, at most
@@ -41,19 +47,40 @@ SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
 class Exploration:
     """A reproducible stream of steps; iterating again goes on with it at a new posture."""
 
-    def __init__(self, robot: Robot, seed: int) -> None:
+    def __init__(self, robot: Robot, seed: int, to_limits: float = 0.0) -> None:
+        """Explore with `robot`; `to_limits` is the share of targets at a limit, of each joint."""
         self._robot, self._rng = robot, np.random.default_rng([seed, 0xE8])
+        self.to_limits = to_limits
 
     def __iter__(self) -> Iterator[Step]:
-        robot, rng, limits = self._robot, self._rng, self._robot.tension
-        bias = np.full(robot.muscle_count, limits.bias)
+        robot = self._robot
+        bias = np.full(robot.muscle_count, robot.tension.bias)
         while True:
-            postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
+            postures = (self._posture() for _ in range(TRIES))
             ((theta, holding),) = holdable_postures(robot, postures, 1)
-            constant = rng.uniform(limits.bias, limits.limit, robot.muscle_count)
+            constant = self._constant_tension(theta)
             yield Step('first', theta, bias, DURATIONS[0])
             yield Step('second', theta, holding, DURATIONS[1])
             yield Step('first', theta, constant, DURATIONS[2])
+
+    def _posture(self) -> Array:
+        robot, rng = self._robot, self._rng
+        theta = robot.random_postures(1, rng)[0]
+        if self.to_limits:
+            chosen, upper = rng.uniform(size=(2, robot.joint_count))
+            limit = np.where(upper < 0.5, robot.upper, robot.lower)
+            theta = np.where(chosen < self.to_limits, limit, theta)
+        return theta
+
+    def _constant_tension(self, theta: Array) -> Array:
+        robot, limits = self._robot, self._robot.tension
+        way = (theta == robot.upper).astype(float) - (theta == robot.lower)
+        count = PRESSES if way.any() else 1
+        tension = self._rng.uniform(limits.bias, limits.limit, (count, robot.muscle_count))
+        torque = -tension @ robot.routes.muscle_jacobian(theta)
+        pressed = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ way
+        most: Array = tension[np.argmax(pressed)]
+        return most
 
 
 def holdable_postures(

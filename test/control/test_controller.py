@@ -234,6 +234,18 @@ def test_exploration_goes_on_with_its_stream_instead_of_repeating_it():
     assert len({tuple(theta) for theta in seen}) == 3
 
 
+@pytest.mark.parametrize(('preset', 'sends'), [('default', True), ('paper', False)])
+def test_the_preset_decides_whether_exploration_takes_joints_to_their_limits(preset, sends):
+    bench, at_limit = Bench(preset=preset), False
+    for _ in range(30):
+        bench.core.explore(True)
+        bench.step(2)
+        theta = bench.core.posture.theta
+        at_limit |= bool(((theta == ROBOT.lower) | (theta == ROBOT.upper)).any())
+        bench.core.explore(False)
+    assert at_limit == sends
+
+
 def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
     bench = Bench()
     with pytest.raises(MessageError, match='no posture yet'):

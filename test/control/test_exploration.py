@@ -19,8 +19,8 @@ ROBOT = Robot.load('arm26')
 BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
 
 
-def steps(seed, count):
-    return list(islice(Exploration(ROBOT, seed), count))
+def steps(seed, count, to_limits=0.0):
+    return list(islice(Exploration(ROBOT, seed, to_limits), count))
 
 
 def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
@@ -38,12 +38,29 @@ def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
     assert np.ptp(three.tension) > 0.0
 
 
-def test_every_posture_can_be_held_and_lies_within_the_joint_limits():
-    for step in steps(1, 90)[1::3]:
+@pytest.mark.parametrize('to_limits', [0.0, 0.5])
+def test_every_posture_can_be_held_and_lies_within_the_joint_limits(to_limits):
+    for step in steps(1, 90, to_limits)[1::3]:
         assert ((step.theta >= ROBOT.lower) & (step.theta <= ROBOT.upper)).all()
         assert ((step.tension >= BIAS - 1e-6) & (step.tension <= LIMIT + 1e-6)).all()
         held = -ROBOT.routes.muscle_jacobian(step.theta).T @ step.tension
         np.testing.assert_allclose(held, ROBOT.kinematics.holding_torque(step.theta), atol=1e-6)
+
+
+def test_joints_are_sent_to_their_limits_as_often_as_asked_and_pressed_there():
+    asked = steps(2, 300, 0.25)[2::3]
+    way = np.array([(s.theta == ROBOT.upper) * 1.0 - (s.theta == ROBOT.lower) for s in asked])
+    # Fewer of those at limits can be held; there are 200 targets of single joints.
+    assert 0.12 < np.abs(way).mean() < 0.38
+    assert {*np.unique(way)} == {-1.0, 0.0, 1.0}
+    mean = 0.5 * (BIAS + LIMIT)
+    for step, side in zip(asked, way):
+        if np.abs(side).sum() == 1.0:
+            jacobian = ROBOT.routes.muscle_jacobian(step.theta)
+            assert ((step.tension >= BIAS) & (step.tension <= LIMIT)).all()
+            assert side @ (jacobian.T @ (mean - step.tension)) > 0.0  # more than evenly pulled
+    never = steps(2, 300)
+    assert not any(((s.theta == ROBOT.upper) | (s.theta == ROBOT.lower)).any() for s in never)
 
 
 def test_holdable_postures_are_held_by_their_tensions_on_another_body_too():
