@@ -7,12 +7,13 @@ T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error wen
 
 Here. The initial network knows the geometric model only. Each preset explores by itself, as the
 nodes do: in closed loop through estimate and controller, with the network that is being learned.
-Both go to the same random postures; "same stream" is preset paper taught by the messages of the
-default one’s exploration. All are judged on one held-out motion, which follows a fixed list of
-commands from a random stream that is never used for learning; its error is the mean over all
-messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all joints, with the true angles of
-the emulator. Oracle: weighted least squares on one message with the true routes, elastic constants
-and noise, friction taken as zero.
+Preset paper goes to random postures; the default one takes a quarter of the joints’ targets at
+their limits, where stops tell zeros of joint sensors. "Same stream" is preset paper taught by the
+messages of the default one’s exploration. All are judged on one held-out motion, which follows a
+fixed list of commands, to random postures, from a stream that is never used for learning; its
+error is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all
+joints, with the true angles of the emulator. Oracle: weighted least squares on one message with the
+true routes, elastic constants and noise, friction taken as zero.
 """
 
 from __future__ import annotations

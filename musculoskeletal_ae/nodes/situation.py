@@ -33,7 +33,7 @@ class Situation:
         for status in message.status:
             node, _, _ = status.name.partition(':')
             values = {value.key: value.value for value in status.values}
-            if node.startswith(f'{self._here}/'):
+            if node.rpartition('/')[0] == self._here:
                 failing = status.level == DiagnosticStatus.ERROR
                 failing &= not status.message.startswith(TOLD)
                 self._failing[node] = status.message if failing else ''

@@ -63,7 +63,13 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
 
 
 def test_an_error_of_any_node_is_told_until_it_is_over():
-    told, error = Situation('/left'), DiagnosticStatus.ERROR
+    error = DiagnosticStatus.ERROR
+    alone = Situation('/')
+    alone.diagnosed(said('/right/learner', 'the disk is full', error))
+    assert alone.trouble() == ''
+    alone.diagnosed(said('/learner', 'the disk is full', error))
+    assert alone.trouble() == '/learner: the disk is full'
+    told = Situation('/left')
     told.diagnosed(said('/right/learner', 'the disk is full', error))
     told.diagnosed(said('/left/controller', 'stopped: a cause', error))
     assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
