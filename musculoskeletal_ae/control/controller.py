@@ -83,8 +83,8 @@ class Controller:
         self._pull = Pull(robot.tension.bias, robot.tension.bias)
         self.sent_at = 0.0  # when the last command went out; its user says so
         self._fresh = 0.0  # [s] of data since it was late
-        # whether it explored at an anomaly; whether a suspect is verified; whether the arm is to go
-        # on by itself, and may
+        # whether it explored when it was stopped; whether a suspect is verified; whether the arm is
+        # to go on by itself, and may
         self._explored = self._verifies = self._resumes = self._may_resume = False
         self._isolated_at, self._anomaly_at = (-1, -math.inf), math.inf
         # Whether the next command starts a method anew, from how the muscles pull then.
@@ -93,7 +93,7 @@ class Controller:
     # -- what comes in --------------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; another method starts from how the muscles pull at that moment.
+        """Take new settings; another method or preset starts from how the muscles pull then.
 
         A MusculoskeletalError says that the joint stiffness does not fit the robot.
         """
@@ -104,7 +104,8 @@ class Controller:
         self.motion.settings = self.floating.settings = self.watch.settings = settings
         if settings.method == 'float':
             self.explore(False)
-        if settings.method != before.method and not self.posture.exploring:
+        another = (settings.method, settings.preset) != (before.method, before.preset)
+        if another and not self.posture.exploring:
             self._starts, self.follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
             (self.motion.plan_anew if self.follows else self.posture.start)()
@@ -143,7 +144,7 @@ class Controller:
     def anomaly(self, detected: bool) -> None:
         """Take anomaly_detected; once a suspect was verified, the arm goes on when it is over."""
         if detected and not self.watch.anomaly:
-            self._anomaly_at, self._explored = self.watch.stepped_at, self.posture.exploring
+            self._anomaly_at = self.watch.stepped_at
         self._resumes |= self._verifies and not detected
         self._verifies, self.watch.anomaly = self._verifies and detected, detected
         if detected:
@@ -176,7 +177,8 @@ class Controller:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
-        inside, self.short = self._within_reach(np.clip(theta, robot.lower, robot.upper))
+        inside = np.clip(theta, robot.lower, robot.upper)
+        inside, self.short = self._within_reach(inside, self._nearest)
         self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
         chosen = self.settings
         solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
@@ -185,7 +187,7 @@ class Controller:
                 self._approach(inside, effort, APPROACHES)
                 return
         self._starts |= self.posture.exploring or self.follows
-        self.follows = False
+        self.follows = self._explored = False
         self.posture.set_target(inside, effort)
 
     def _approach(self, theta: Array, effort: Array, left: int) -> None:
@@ -216,9 +218,8 @@ class Controller:
             planned = Trajectory.through(start, points, max(-delay, 0.0))
             # One that is slowed and starts in motion takes another way.
             planned.scaled(slowness(robot, mae, planned, self.settings)).check(robot)
-            _, short = self._within_reach(planned.end)
+            self._within_reach(planned.end, nearest=False)
             self._follow(planned, max(delay, 0.0))
-            self.short = short
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Bring the end effector to a pose in the root link's frame, or to its position only.
@@ -226,9 +227,8 @@ class Controller:
         A MessageError says why not: nothing changes then.
         """
         (start, mae), chosen = self._ready(), self.settings
-        nearest = chosen.unreachable == 'nearest'
-        theta, short = self._hand.posture(mae, pose, whole, start.theta, nearest)
-        self._follow(self._hand.towards(start, pose, theta, chosen.hand_speed, now))
+        theta, short = self._hand.posture(mae, pose, whole, start.theta, self._nearest)
+        self._follow(self._hand.towards(start, theta, chosen.hand_speed, now))
         self.short = short and f'{short}; nearest approached'
 
     def twist(self, twist: Array) -> None:
@@ -239,21 +239,24 @@ class Controller:
         start, mae = self._ready()
         self._follow(self._hand.moved(mae, start, twist))
 
-    def _within_reach(self, theta: Array) -> tuple[Array, str]:
+    def _within_reach(self, theta: Array, nearest: bool) -> tuple[Array, str]:
         """Return where to go for θ [rad] (D,) without the isolated muscles, and what θ lacks.
 
-        A MessageError says that they are needed, unless the nearest posture is wished.
+        A MessageError says that they are needed, unless the `nearest` posture is wished.
         """
         if self.robot.used.all() or self.mae is None or self.estimate is None:
             return theta, ''
-        nearest, short = reach.nearest_held(self.robot, self.mae, self.estimate, theta)
+        held, short = reach.nearest_held(self.robot, self.mae, self.estimate, theta)
         if not short:
             return theta, ''
-        short = f'{short} without {self._left_out}; nearest posture held: '
-        short += self.robot.told(nearest)
-        if self.settings.unreachable == 'refuse':
+        short = f'{short} without {self._left_out}; nearest posture held: {self.robot.told(held)}'
+        if not nearest:
             raise MessageError('out of reach', short)
-        return nearest, f'{short}; nearest approached'
+        return held, f'{short}; nearest approached'
+
+    @property
+    def _nearest(self) -> bool:
+        return self.settings.unreachable == 'nearest'
 
     @property
     def _left_out(self) -> str:
@@ -282,7 +285,7 @@ class Controller:
 
     def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
         if not self.follows or self._starts:
-            self.explore(False)
+            self._explore(False)
             self.motion.start()
             if delay > 0.0:
                 self.motion.follow(Trajectory.stopping(self._ready()[0], self.robot))
@@ -303,20 +306,25 @@ class Controller:
             return f'stopped: {self.safety.cause}'
         if wanted and self.settings.method == 'float':
             return 'method float: a hand moves the arm; set another method first'
+        self._explored = False
+        self._explore(wanted)
+        return ''
+
+    def _explore(self, wanted: bool) -> None:
         if wanted != self.posture.exploring:
             self.short = ''
             self._exploration.to_limits = PRESETS[self.settings.preset].to_limits
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts, self.follows = True, False
-        return ''
 
     def stop(self, cause: str) -> None:
         """Latch a safe stop."""
         if not self.safety.cause or self.safety.passing:
-            self._may_resume = True
+            self._may_resume, self._explored = True, False
         self._may_resume &= cause.startswith(BY_MUSCLE)
-        self.explore(False)
+        self._explored |= self.posture.exploring
+        self._explore(False)
         self.safety.stop(cause)
 
     def clock_jumped_back(self) -> None:
@@ -356,6 +364,7 @@ class Controller:
         self.follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:
             if cause == late:
+                self._may_resume &= bool(self.safety.cause)
                 self.safety.stop(cause, passing=True)
             else:
                 self.stop(cause)
@@ -373,7 +382,7 @@ class Controller:
             try:
                 desired = self._slack(self._command(dt))
             except RobotDescriptionError as error:  # too little is left to explore with
-                self.explore(False)
+                self._explore(False)
                 self.short = f'{error}, without {self._left_out or "none"}'
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
@@ -385,7 +394,7 @@ class Controller:
         passed = 0.0 if waits else max(dt - computing, 0.0)
         command = self.safety.step(desired, limit, passed, fresh)
         if self.safety.cause and not self.safety.passing:
-            self.explore(False)
+            self._explore(False)
         return command
 
     def _slack(self, command: Command | None) -> Command | None:

@@ -9,7 +9,7 @@ way as the muscles can hold.
 
 A single pose is gone to at `hand_speed`. Poses that come one soon after the other are a path,
 passed at the speed at which they come: each is reached when the next is due, and if no other comes
-the arm comes to rest. A twist moves the hand for TWIST_TIMEOUT.
+the arm comes to rest at the last. A twist moves the hand for TWIST_TIMEOUT.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ PEAK = 1.875  # fastest over mean speed of a motion of least jerk
 #: [s] and [m/s] within which poses are a path, and how soon a new interval counts
 FOLLOWING, FASTEST, MEMORY = 0.25, 1.0, 0.2
 JOINING = 0.1  # [s] in which a path is joined, at least
+RETURNING = 2.0 * STOPPING  # [s] to the last pose of a path
 TWIST_TIMEOUT, STARTING = 0.3, 0.1  # [s]
 DAMPING = 0.02  # [m] of a joint's leverage below which it turns less
 
@@ -66,31 +67,30 @@ class Hand:
             raise MessageError('out of reach', short)
         return theta, short
 
-    def towards(
-        self, start: Setpoint, pose: pin.SE3, theta: Array, speed: float, now: float
-    ) -> Trajectory:
+    def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
         """Return the trajectory to θ [rad] (D,), the posture of a pose that came at `now` [s].
 
         A single one is gone to at `speed` [m/s].
         """
         robot, last = self._robot, self._last
-        self._last = now, pose.translation, theta
+        where = robot.kinematics.end_effector_pose(theta).translation  # as near as it comes
+        self._last = now, where, theta
         if last is not None and 0.0 < now - last[0] < FOLLOWING:
-            interval, moved = now - last[0], float(np.linalg.norm(pose.translation - last[1]))
+            interval, moved = now - last[0], float(np.linalg.norm(where - last[1]))
             if moved < FASTEST * interval:
                 before = self._interval or interval
                 self._interval = before + MEMORY * (interval - before)
                 velocity = (theta - last[2]) / self._interval
-                # As far ahead as joining the path takes, as if it went on like this.
+                # As far ahead as joining the path takes, as if it went on like this; and back.
                 ahead = max(self._interval, JOINING)
-                ways = np.array([ahead - self._interval, ahead - self._interval + 0.5 * STOPPING])
-                path = np.clip(theta + ways[:, None] * velocity, robot.lower, robot.upper)
+                further = theta + (ahead - self._interval) * velocity
+                path = np.array([np.clip(further, robot.lower, robot.upper), theta])
                 rates = np.array([velocity, np.zeros_like(velocity)])
-                time, every = np.array([ahead, ahead + STOPPING]), np.arange(len(theta))
+                time, every = np.array([ahead, ahead + RETURNING]), np.arange(len(theta))
                 return Trajectory.through(start, Points(every, time, path, rates, 0.0 * rates))
         self._interval = 0.0
         here = robot.kinematics.end_effector_pose(start.theta).translation
-        way = float(np.linalg.norm(pose.translation - here))
+        way = float(np.linalg.norm(where - here))
         return Trajectory.to(start, theta, max(SHORTEST, PEAK * way / speed))
 
     def moved(self, mae: Mae, start: Setpoint, twist: Array) -> Trajectory:

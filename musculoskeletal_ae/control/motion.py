@@ -79,7 +79,7 @@ class Winches:
             return
         speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
-        telling = (np.abs(speed) > WINDING) & (length > command)
+        telling = (np.abs(speed) > WINDING) & (length > command) & self._robot.used
         self._products -= float(lacking[telling] @ speed[telling])
         self._squares += float(speed[telling] @ speed[telling])
 
@@ -291,7 +291,8 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they change
     suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
-    theta = trajectory.postures
+    time = trajectory.moments
+    theta = trajectory.sample(time).theta
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
-    speed = np.diff(length, axis=0) * robot.used * (len(theta) - 1) / trajectory.duration
+    speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
     return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))

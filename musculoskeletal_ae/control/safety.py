@@ -172,6 +172,8 @@ class SafetyFilter:
         # At the measured length MSC pulls with T_bias only; where that is not known, out to the
         # longest the muscle can be.
         end = muscles.length if fresh else np.maximum(muscles.length, self._longest)
+        # What is read of an isolated one may be anything.
+        end = np.where(self._robot.used, end, np.minimum(end, self._longest))
         after = np.minimum(value + change, np.maximum(end, value))
         if winding and self.suspect is not None:
             after[self.suspect] = self._wound(self.suspect, float(value[self.suspect]), dt)

@@ -28,7 +28,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
 STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
-SAMPLES = 200  # of a trajectory that are looked at
+SAMPLES, WITHIN = 200, 6  # of a trajectory that are looked at, and of each piece at least
 #: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
 CUBIC = np.array(
@@ -136,8 +136,10 @@ class Trajectory:
 
     def check(self, robot: Robot) -> None:
         """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
-        theta = self.postures
+        theta = self.sample(self.moments).theta
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
+        if not np.isfinite(out).all():
+            raise MessageError('leaves the joint limits', 'its curve is too steep for a number')
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
@@ -145,9 +147,11 @@ class Trajectory:
             raise MessageError('leaves the joint limits', told)
 
     @property
-    def postures(self) -> Array:
-        """θ [rad] in moments evenly spread over it, (SAMPLES, D)."""
-        return self.sample(np.linspace(0.0, self.duration, SAMPLES)).theta
+    def moments(self) -> Array:
+        """Moments [s] that show each piece, and so many of all, however long it takes, (N,)."""
+        share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
+        inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
+        return np.append(inner.ravel(), self.time[-1])
 
     @property
     def duration(self) -> float:

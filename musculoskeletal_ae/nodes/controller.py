@@ -52,7 +52,8 @@ class Controller(Shell):
         self.recording = StopRecording(self.resolve_topic_name)
         self.latched = False  # the stop, as of the last step
         for name in parameters_of(Settings):
-            self.follow_parameter(name, partial(self._configure, name))
+            check = self._check_stiffness if name == 'joint_stiffness' else None
+            self.follow_parameter(name, partial(self._configure, name), check)
         self.logged: list[str] = []
         self.publishers_of = {
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
@@ -100,6 +101,12 @@ class Controller(Shell):
     def _configure(self, name: str, value: Any) -> None:
         self.core.configure(replace(self.core.settings, **{name: value}))
 
+    def _check_stiffness(self, value: Any) -> Any:
+        # Before any other that is set with it: what those end would not come back.
+        checked = replace(self.core.settings, joint_stiffness=value)
+        checked.desired_stiffness(self.robot.joint_count)
+        return value
+
     def _shift(self, known: bool, less: Array) -> None:
         self.core.zeros(known, less)
         self.gate.forget()
@@ -143,7 +150,7 @@ class Controller(Shell):
         only = without_orientation(message)
         pose = read_pose(message, self.root_frame, only)
         before = self.core.short
-        self.core.pose(pose, not only, time.monotonic())
+        self.core.pose(pose, not only, self.now())
         if self.core.short not in ('', before):
             self.get_logger().warning(f'out of reach: {self.core.short}')
         self._tell_slowed()

@@ -51,6 +51,7 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+MOST_ZERO = 10.0  # [m] of a length sensor
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
 LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
 
@@ -364,6 +365,9 @@ class Shell(Node):
         """Take the estimator's zeros; tell whether they are known now, and how much less l is."""
 
         def take(rows: Array) -> None:
+            if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
+                told = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
+                raise MessageError('impossible zeros', told)
             less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
             changed(self.zeros.known, less)
 

@@ -146,7 +146,10 @@ class View(Node):
         """Show what comes until the process is asked to end."""
         tell = look = 0.0
         while rclpy.ok():
-            if not self.page.looked_at.wait(timeout=1.0):
+            looked_at = self.page.looked_at.wait(timeout=1.0)
+            while not self.asked.empty():  # also what the last visitor asked for
+                self._do(*self.asked.get())
+            if not looked_at:
                 for subscription in self.taken:
                     self.destroy_subscription(subscription)
                 self.taken, self.came = [], {}
@@ -155,8 +158,6 @@ class View(Node):
                 self._subscribe()
             begun = time.monotonic()
             self._take()
-            while not self.asked.empty():
-                self._do(*self.asked.get())
             self.situation.detected = bool(self._newest('detected', math.inf))
             posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
             states = self._newest('muscles')

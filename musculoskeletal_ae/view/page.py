@@ -98,6 +98,9 @@ class Page:
 
     def _count(self, visitor: int, here: bool) -> None:
         (self._visitors.add if here else self._visitors.discard)(visitor)
+        if not here and self._pushing:  # whoever left: a drag that goes on pushes again
+            self._pushing = self._force.visible = False
+            self._act('push', np.zeros(3))
         (self.looked_at.set if self._visitors else self.looked_at.clear)()
 
     def close(self) -> None:
@@ -284,10 +287,13 @@ class Page:
             button('Reset after a stop', 'reset')
             gizmo = gui.add_checkbox('move the hand with the mouse', False)
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
-            limits = np.ceil(100.0 * robot.lower) / 100.0, np.floor(100.0 * robot.upper) / 100.0
+            # A hundredth of the range, or less, so that ends are near the limits.
+            places = np.ceil(2.0 - np.log10(robot.upper - robot.lower)).astype(int).tolist()
+            steps = np.array([float(f'1e-{n}') for n in places])
+            limits = np.ceil(robot.lower / steps) * steps, np.floor(robot.upper / steps) * steps
             self._sliders = [
-                slider(joint, low, high, 0.01, 'targets', lambda e, j=joint: {j: chosen(e)})
-                for joint, low, high in zip(robot.joints, *limits)
+                slider(joint, low, high, step, 'targets', lambda e, j=joint: {j: chosen(e)})
+                for joint, low, high, step in zip(robot.joints, *limits, steps)
             ]
         with gui.add_folder('Faults of the emulated arm') as faults:
             self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on one')
@@ -326,7 +332,9 @@ class Page:
         theta = self._posture.get('estimated')
         if theta is not None and not self._targeted:
             for angle, slider in zip(theta, self._sliders):
-                slider.value = float(np.clip(np.round(angle, 2), slider.min, slider.max))
+                slider.value = float(
+                    np.clip(round(angle / slider.step) * slider.step, slider.min, slider.max)
+                )
             self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
         self._payload.value = round(min(max(payload, 0.0), MOST_PAYLOAD), 1)
         if played is not None:

@@ -18,7 +18,7 @@ from musculoskeletal_ae.control.motion import MotionControl
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.safety import DEPTH, LENGTH, PAYING_OUT, TENSION, WIND, Muscles
 from musculoskeletal_ae.control.settings import METHODS, Settings
-from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
@@ -321,6 +321,88 @@ def test_exploring_goes_on_after_the_suspect_was_verified():
     bench.core.anomaly(False)
     bench.step(5)
     assert bench.core.posture.exploring
+
+
+@pytest.mark.parametrize('stopped_before', [True, False])
+def test_exploring_goes_on_whatever_stopped_the_arm_for_that_muscle_first(stopped_before):
+    bench = Bench()
+    bench.core.explore(True)
+    bench.step(20)
+    if stopped_before:
+        bench.core.stop('muscle_states: length jumped')
+        bench.step(5)
+    bench.core.anomaly(True)
+    bench.core.isolate([0])
+    bench.step(100)
+    bench.core.isolate([])
+    bench.core.anomaly(False)
+    bench.step(5)
+    assert bench.core.posture.exploring
+
+
+@pytest.mark.parametrize('wish', ['hold', 'target'])
+def test_what_is_asked_for_meanwhile_ends_exploring_for_good(wish):
+    bench = Bench()
+    bench.core.explore(True)
+    bench.step(20)
+    bench.core.anomaly(True)
+    bench.core.isolate([0])
+    bench.step(100)
+    assert bench.core.explore(False) == '' if wish == 'hold' else bench.target(THERE) is None
+    bench.step(100)
+    bench.core.isolate([])
+    bench.core.anomaly(False)
+    bench.step(5)
+    assert bench.core.safety.cause == ''
+    assert not bench.core.posture.exploring
+    if wish == 'target':
+        np.testing.assert_array_equal(bench.core.posture.theta, THERE)
+
+
+def test_data_that_was_gone_keeps_the_arm_stopped_after_a_verified_suspect_of_before():
+    bench = Verified()
+    bench.step(200)
+    bench.core.isolate([])
+    bench.core.anomaly(False)
+    bench.step(50)
+    assert bench.core.safety.cause == ''
+    bench.blind = {'estimate'}
+    bench.step(200)
+    bench.blind = set()
+    bench.step(100)
+    bench.core.isolate([LOST])
+    bench.core.anomaly(True)
+    bench.step(200)
+    bench.core.isolate([])
+    bench.core.anomaly(False)
+    bench.step(50)
+    assert 'older' in bench.core.safety.cause
+
+
+def test_a_stop_pays_an_isolated_muscle_out_no_further_than_it_can_be_long():
+    bench = Bench()
+    bench.core.isolate([LOST])
+    bench.target(REST)
+    bench.step(100)
+    bench.core.stop('controller/stop was called')
+    length, tension = rest_readings(ROBOT, REST)
+    for _ in range(600):
+        bench.now += 0.01
+        bench.core.muscles(Muscles(length + 5.0 * ~USED, tension, np.full(6, 30.0)), bench.now)
+        bench.core.estimated(REST, bench.now)
+        bench.core.step(bench.now)
+    assert bench.core.safety.command.value[LOST] <= bench.core.safety.longest[LOST]
+
+
+def test_a_trajectory_that_the_others_cannot_end_is_refused_whatever_is_done_with_targets():
+    bench = Bench(unreachable='nearest')
+    bench.core.isolate([0])
+    bench.step(5)
+    still = np.zeros((1, 2))
+    end = Points(np.array([0, 1]), np.array([3.0]), np.array([[-1.2, -0.2]]), still, still)
+    with pytest.raises(MessageError, match='nearest posture held'):
+        bench.core.trajectory(end)
+    assert not bench.core.follows
 
 
 def test_nothing_is_shared_with_whoever_else_has_the_robot():

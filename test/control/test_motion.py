@@ -13,9 +13,10 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 
 from bench.control_nominal import nominal_arm
+from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.controller import FED_BACK, Controller
 from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.methods import StiffnessModel
+from musculoskeletal_ae.control.methods import Solution, StiffnessModel, first_command
 from musculoskeletal_ae.control.motion import SETTLING, SHARE, Winches, slowness
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
@@ -309,11 +310,30 @@ def test_a_trajectory_is_judged_as_it_is_followed(monkeypatch):
 def test_a_muscle_that_is_left_out_slows_nothing():
     bench, trajectory = Bench(), Trajectory.to(Setpoint.resting(REST), OTHER, 0.2)
     robot = bench.core.robot
-    length = bench.mae.lengths(trajectory.postures, np.tile(robot.tension.bias, (200, 1)))
+    theta = trajectory.sample(np.linspace(0.0, trajectory.duration, 200)).theta
+    length = bench.mae.lengths(theta, np.tile(robot.tension.bias, (200, 1)))
     fastest = int(np.abs(np.diff(length, axis=0)).max(axis=0).argmax())
     before = slowness(robot, bench.mae, trajectory, Settings())
     robot.isolate([fastest])
     assert 1.0 < slowness(robot, bench.mae, trajectory, Settings()) < 0.99 * before
+
+
+def test_a_muscle_that_is_left_out_says_nothing_of_the_winches():
+    lags = []
+    for noise in (0.0, 0.3):
+        robot = Bench().core.robot
+        robot.isolate([0])
+        winches, length, rng = Winches(robot), np.zeros(6), np.random.default_rng(0)
+        for n in range(400):
+            if n % 10 == 0:
+                speed, tension = rng.uniform(-0.2, 0.2, 6), rng.uniform(60.0, 120.0, 6)
+            length = length + 0.01 * speed
+            command = length - (tension - robot.tension.bias) / robot.stiffness + 0.03 * speed
+            read = length + noise * (n // 50 % 2) * (np.arange(6) == 0)
+            winches.step(read, tension, command, 0.01)
+        lags.append(winches.lag)
+    assert lags[1] == pytest.approx(lags[0], rel=1e-9)
+    assert 0.02 < lags[0] < 0.04
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
@@ -371,6 +391,44 @@ def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
     assert np.linalg.norm(at - wanted) < 0.006
     moved(bench, 150)  # no other comes
     assert not bench.core.motion.moving
+    last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
+    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
+    assert np.linalg.norm(at - last) < 1e-3
+
+
+def test_the_nearest_to_a_pose_is_gone_to_as_fast_however_far_that_lies(bench):
+    bench.configure(unreachable='nearest')
+    at, taken = ROBOT.kinematics.end_effector_pose(REST), []
+    for far in (3.0, 1e3, 1e9):
+        bench.core.pose(pin.SE3(at.rotation, at.translation + [far, 0.0, 0.0]), False, bench.now)
+        taken.append(bench.core.motion.latest.duration)
+    assert max(taken) < 5.0
+    bench.step(3)
+    assert bench.core.safety.cause == ''
+
+
+def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
+    theta = np.vstack([REST, np.tile([OTHER, REST], (3, 1))])  # waits, then moves
+    slowed, still = [], np.zeros_like(theta)
+    for late in (0.0, 500.0):
+        given = Points(np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still)
+        trajectory = Trajectory.through(Setpoint.resting(REST), given)
+        slowed.append(slowness(ROBOT, bench.mae, trajectory, bench.core.settings))
+    assert slowed[0] > 1.2
+    assert slowed[1] == pytest.approx(slowed[0], rel=0.05)
+
+
+def test_another_preset_starts_anew_and_stops_nothing(bench, monkeypatch):
+    def stand_in(robot, mae, theta, _, tension):  # `ExactMae` has no decoder to descend through
+        return Solution(first_command(robot, mae, theta, tension), tension, np.zeros(2))
+
+    monkeypatch.setattr(methods, 'proposed_paper', stand_in)
+    bench.configure(preset='paper')
+    bench.target(OTHER)
+    bench.step(600)
+    bench.configure(preset='default')
+    bench.step(5)
+    assert bench.core.safety.cause == ''
 
 
 def test_a_twist_moves_the_hand_until_its_time_is_out(bench):

@@ -104,6 +104,23 @@ def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
 
 
+@pytest.mark.parametrize('late', [0.0, 500.0])
+def test_a_curve_that_leaves_the_limits_for_a_moment_of_a_long_time_is_refused(late):
+    time, rates = late + np.array([0.6, 1.6, 2.0, 5.0]), np.zeros((4, 2))
+    rates[1] = 8.0
+    points = Points(BOTH, time, np.tile(MIDDLE, (4, 1)), rates, None)
+    with pytest.raises(MessageError, match='leaves the joint limits'):
+        Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
+
+
+@pytest.mark.filterwarnings('ignore::RuntimeWarning')
+def test_a_curve_beyond_all_numbers_is_refused():
+    rates = np.array([[1e308, 0.0], [0.0, 0.0]])
+    points = Points(BOTH, np.array([10.0, 20.0]), np.array([MIDDLE, MIDDLE]), rates, None)
+    with pytest.raises(MessageError, match='too steep'):
+        Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
+
+
 def test_a_curve_that_leaves_the_limits_of_what_slides_is_told_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))

@@ -119,13 +119,21 @@ def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
             {'checkpoint': '', 'isolate_muscles': ['tail']},
             lambda node: id(node.core.mae),
         ),
+        # Another method ends what goes on.
+        (
+            Controller,
+            {'method': 'float', 'joint_stiffness': [1.0]},
+            lambda node: node.core.posture.exploring,
+        ),
     ],
 )
 def test_of_parameters_set_together_none_is_taken_if_one_is_refused(
     graph, trained_file, kind, parameters, kept
 ):
     given = {'checkpoint': trained_file} if 'checkpoint' in parameters else {}
-    node = graph.host(kind, robot='arm26', **given)
+    node = graph.host(
+        kind, robot='arm26', **given, **{'explore': True} if kind is Controller else {}
+    )
     before = kept(node)
     one, other = (RosParameter(name, value=value) for name, value in (parameters | given).items())
     result = node.set_parameters_atomically([one, other])

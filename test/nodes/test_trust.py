@@ -116,6 +116,18 @@ def test_after_an_anomaly_the_network_from_before_is_back_in_every_node(arm, tra
     assert 'anomaly' in reset.message
 
 
+@pytest.mark.parametrize('row', [0, 1])
+def test_zeros_that_no_sensor_has_are_refused_and_move_nothing(arm, row):
+    zeros = np.zeros((2, 6))
+    zeros[row] = 1e17 if row == 0 else -1.0
+    latched = arm.graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+    latched.publish(array_message(zeros, 'quantity', 'muscle'))
+    refused = 'muscle_length_zeros: impossible zeros'
+    arm.graph.wait(lambda: arm.controller.rejected[refused], 'the refusal')
+    arm.goes_to(HERE)
+    arm.never_jumped()
+
+
 def test_a_second_source_of_muscle_states_stops_the_arm_by_name_until_it_is_gone(arm):
     stranger = arm.graph.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
     space = arm.graph.namespace

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from graph import Process, executable, no_number_of
+from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
@@ -19,6 +21,8 @@ pytest.importorskip('viser', reason='./bringup.sh --view installs what the page 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.view.page import Page
 from view.browser import Browser, find_chromium
 
 SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
@@ -127,6 +131,40 @@ def test_muscles_are_shown_where_an_isolated_one_says_no_number(graph, view, arm
         assert 'brachialis' in page.text and 'nan' not in page.text
     finally:
         page.close()
+
+
+@pytest.mark.parametrize('limits', [(0.001, 0.009), (0.0, 0.05), (-1.5, 2.0)])
+def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
+    urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
+    text, before = urdf.read_text(), 'lower="0.0" upper="0.05"'
+    assert before in text
+    urdf.write_text(text.replace(before, f'lower="{limits[0]}" upper="{limits[1]}"'))
+    page = Page(Robot.load(tmp_path), '127.0.0.1', free_port(), False, lambda *_: None)
+    try:
+        slider = page._sliders[-1]
+        near = 0.011 * (limits[1] - limits[0])
+        np.testing.assert_allclose((slider.min, slider.max), limits, atol=near)
+        assert limits[0] - 1e-12 <= slider.min < slider.max <= limits[1] + 1e-12
+        assert slider.step <= near
+    finally:
+        page.close()
+
+
+def test_whoever_leaves_while_pushing_pushes_no_longer(arm26):
+    asked = []
+    page = Page(arm26, '127.0.0.1', free_port(), False, lambda *what: asked.append(what))
+    try:
+        page._count(1, True)
+        page._count(1, False)
+        assert asked == []
+        page._count(1, True)
+        ends = {'start_position': np.zeros(3), 'end_position': np.ones(3)}
+        assert page._push(SimpleNamespace(phase='update', **ends)).any()
+        page._count(1, False)
+    finally:
+        page.close()
+    ((what, force),) = asked
+    assert what == 'push' and not force.any()
 
 
 def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
