@@ -209,9 +209,12 @@ class Estimator:
         robot, read, before = self._robot, np.array([length, tension]), self._read
         self._read = read
         self._same = np.where(read == before, self._same + dt, 0.0)
-        # One without tension has another rule.
-        judged = robot.used & (tension > SLACK * robot.tension.bias)
-        since = judged * self._same.max(axis=0)
+        # One without tension has another rule; one that is paid out may keep T_bias to the bit.
+        bias = robot.tension.bias
+        judged = robot.used & (tension > SLACK * bias)
+        since = judged * np.maximum(
+            self._same[0], self._same[1] * (np.abs(tension - bias) > SLACK * bias)
+        )
         muscle = int(since.argmax())
         if since[muscle] < STILL_TIME or not (self.detector.calibrated and self.detector.judges):
             self._moved = None

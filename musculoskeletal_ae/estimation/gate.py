@@ -8,7 +8,7 @@
                and ③ have to agree with ①.
     messages   what it leaves of T and l through ②, and of l through ① at the θ of ②, on the last
                seconds of the node's own healthy messages: the median of each muscle is at most
-               WORSE times that of the network in use, or FLOOR
+               WORSE times that of the network in use, or FLOOR; not asked of the first network
     detector   a calibrated one is quiet on those messages, and would not be on the same with a
                muscle cut
 
@@ -45,6 +45,7 @@ POSTURES = 64
 SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept
 LEAST = 20  # messages that say something
 PROOF = 10.0  # [s]
+MOST_USED = 20  # networks that are kept to go back to
 LONGEST_PERIOD = 0.5  # [s] without messages in which a wire may have slid anywhere
 NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already wrong
 
@@ -125,6 +126,11 @@ class Gate:
         while now - self._messages[0][0] > SPAN:
             self._messages.popleft()
 
+    def start(self) -> None:
+        """Begin anew, without a network."""
+        self._used.clear()
+        self.forget()
+
     def forget(self) -> None:
         """Forget the messages, as when lengths are measured from other zeros."""
         self._messages.clear()
@@ -155,6 +161,8 @@ class Gate:
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
+        if len(self._used) > MOST_USED:  # the first is proven
+            del self._used[1]
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
         """Note whether an anomaly is detected; return the network that is to come back, if any."""
@@ -261,15 +269,12 @@ class Gate:
                 of = 'on the geometric model' if name.endswith('①') else 'of the lengths of ①'
                 told = f'{share[worst]:.2g} unexplained {of}'
                 yield f'{name}, {who}: {told}, limit {limit[worst]:.3g}'
-        left = self.message_errors(mae)
-        before: dict[str, Array] = {}
-        if self.mae is not None and left:
-            before = self.message_errors(self.mae.without(self.isolated))
+        # How well a first network has to explain a body that differs from its model, nobody knows.
+        left = {} if self.mae is None else self.message_errors(mae)
+        before = {} if self.mae is None else self.message_errors(self.mae.without(self.isolated))
         yield ''
         for name, error in left.items():
-            limit = np.full(len(error), FLOOR[name])
-            if name in before:
-                limit = np.fmax(limit, WORSE * before[name])
+            limit = np.fmax(np.full(len(error), FLOOR[name]), WORSE * before[name])
             over = error / limit
             if not over.max() <= 1.0:
                 worst = int(over.argmax())

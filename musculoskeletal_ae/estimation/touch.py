@@ -120,7 +120,11 @@ class HealthyTorque:
         """Start with nothing; a network is needed first."""
         self._observer, self._direction = ExternalTorque(robot), FrictionDirection()
         self._radian = robot.kinematics.radian
-        self._square, self._time = np.zeros(robot.joint_count), 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, as for another arm."""
+        self._square, self._time = np.zeros_like(self._radian), 0.0
 
     def use(self, mae: Mae) -> Mae:
         """Go on with a network; return it with what is known of the arm, if it has a body."""

@@ -30,6 +30,7 @@ HEALTHY = 'healthy'
 BEGUN, JUDGED = 0.001, 0.8  # [m] that the command has fallen, [s] of that
 PATIENCE = 8.0  # [s] without an answer
 FAR, FOLLOWED = 0.025, 0.005  # [m]
+USUAL = 30.0  # T_bias [N] of the arms that those in N are of; weaker ones need less
 CLOSE, SHARE = 8.0, 0.35  # [N]; of what is demanded beyond T_bias: T is as demanded
 TIGHT, STOOD = 20.0, 0.0005  # [N]; [m] that the winch moves by though it is told to
 STILL = 1e-6  # [m], [N] of a sensor that says always the same
@@ -42,6 +43,7 @@ class Verification:
         """The muscle's place, its T_bias [N] and K [N/m]."""
         self.muscle, self._bias, self._stiffness = muscle, bias, stiffness
         self._time, self._highest = 0.0, -math.inf
+        self._scale = min(1.0, bias / USUAL)
         self._before = bias, bias  # T and T_ref where it was not wound in yet
         self._rows: list[tuple[float, float, float, float]] = []
         self._watched = 0.0
@@ -66,7 +68,7 @@ class Verification:
         if self._time < PATIENCE:
             return ''
         # One that pulls as if it were wound in already is not.
-        return 'jammed' if tension > demand + TIGHT else 'nobody wound it in'
+        return 'jammed' if tension > demand + TIGHT * self._scale else 'nobody wound it in'
 
     def _judged(self) -> str:
         tension, length, demand, off = np.array(self._rows).T
@@ -82,11 +84,12 @@ class Verification:
         if not gone and abs(beside) > FAR:
             return f'its length sensor is off by {1e3 * beside:.0f} mm'
         stood = abs(length[:quarter].mean() - length[-quarter:].mean()) < STOOD
+        close = CLOSE * self._scale
         rise, asked = pull - self._before[0], wanted - self._before[1]
-        if stood and (gone or rise < SHARE * asked > SHARE * CLOSE):
+        if stood and (gone or rise < SHARE * asked > SHARE * close):
             return 'jammed'
         if gone:
             return 'its tension sensor stands still'
-        if abs(pull - wanted) < CLOSE + SHARE * (wanted - self._bias):
+        if abs(pull - wanted) < close + SHARE * (wanted - self._bias):
             return HEALTHY
         return 'jammed'

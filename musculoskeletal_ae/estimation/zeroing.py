@@ -49,6 +49,8 @@ COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or m
 FARTHEST = 0.3  # [m] of a zero; [rad] of a step
 ROUNDS, FIRST_ROUNDS = 20, 6
 STEP = 1e-3  # of differences
+UNHEARD = 1e-6  # what lengths of isolated muscles count
+LIGHTEST = 0.1  # of what T_bias exerts at joints: the least that a weight counts for
 #: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which zeros are
 #: not found but guessed wrong: right ones leave 0.3 mm and cost 0.2–0.5, of a wrong posture 1.1
 LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
@@ -118,13 +120,21 @@ class Zeroing:
         self._radian = radian = robot.kinematics.radian
         postures = robot.random_postures(64, self._rng)
         weight = np.abs(radian * robot.kinematics.holding_torque(postures)).max()
+        levers = np.abs(radian * robot.routes.muscle_jacobian(postures))
+        # One that carries nothing, as with upright axes, has joints that rub all the same.
+        weight = max(weight, LIGHTEST * (robot.description.tension.bias @ levers).max())
         counts = muscles, muscles, muscles, joints
         self._mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)  # of the constants, beforehand
         spread = OFFSET, FRICTION, TENSION_ZERO, JOINT_FRICTION * weight
         self._spread = np.repeat(spread, counts)
         self._spread[-joints:] /= radian
         self._torque_noise = TORQUE_NOISE / radian
-        noise = LENGTH_NOISE * _worse(mae), self._torque_noise, OUTSIDE * radian
+        self._used = ~np.isin(np.arange(muscles), mae.isolated)
+        noise = (
+            LENGTH_NOISE * _worse(mae) / np.where(self._used, 1.0, UNHEARD),
+            self._torque_noise,
+            OUTSIDE * radian,
+        )
         self._noise = np.concatenate(noise)  # of the residuals, (M + 2D,)
         self._before: Array = np.zeros(muscles)  # l_read of the last moment that moved
         self._span = self.moving = self._since = 0.0  # [s]; of motion that counted
@@ -163,6 +173,7 @@ class Zeroing:
         if self.done or (self.stands and self.trouble):
             return
         known = self._posture if self.stands else theta
+        tension, length = tension * self._used, length * self._used
         self._window.append((tension, length, self._direction.step(length)))
         self._angles += [] if known is None else [known]
         self._span += dt
@@ -209,7 +220,7 @@ class Zeroing:
         """Take a fit as the guess, or as known when it rests on enough and explains that."""
         count, muscles = len(fit.theta), self._robot.muscle_count
         offset = fit.constants[:muscles]
-        left = seen.length - offset - self._mae.lengths(fit.theta, seen.tension)
+        left = self._used * (seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
         typical = np.median(np.abs(left), axis=0)
         cost = fit.cost / (count * (len(self._noise) - self._robot.joint_count))
         self._fit, self.trouble, deviation = fit, '', np.full(muscles, UNKNOWN)
@@ -217,7 +228,7 @@ class Zeroing:
             if typical.max() > LARGEST_LEFT:
                 name = self._robot.muscles[int(typical.argmax())]
                 self.trouble = f'{1e3 * typical.max():.1f} mm of {name} are left unexplained'
-            elif cost > LARGEST_COST:  # found without angles: another posture may look alike
+            elif not cost <= LARGEST_COST:  # found without angles: another posture may look alike
                 self.trouble = f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
             else:
                 deviation = 1.48 * typical / np.sqrt(max(1.0, count / 10.0))
@@ -254,12 +265,12 @@ class Zeroing:
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(size))[:POSTURES]]
         offset = seen.length[0] - mae.lengths(first, pull)
-        largest = np.abs(offset).max(axis=1)
+        largest = np.abs(offset * self._used).max(axis=1)
         offset = offset[np.argsort(largest)[: max(PURSUED, int((largest < FARTHEST).sum()))]]
         cost, postures = np.empty(len(offset)), []
         for n, zero in enumerate(offset):
             theta = mae.estimate(few.tension, few.length - zero).theta
-            left = few.length - zero - mae.lengths(theta, few.tension)
+            left = self._used * (few.length - zero - mae.lengths(theta, few.tension))
             parts = left / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
             cost[n] = sum(np.log1p(each**2).sum() for each in parts)
             postures.append(theta)

@@ -85,7 +85,9 @@ class Learner:
         spread = SPREAD * radian if joint_source == MARKER else NOTHING
         blind = joint_source != SENSOR
         self._rests = RestCollector(robot, settings, self._healthy, blind, spread)
-        self._tilted = -math.inf  # when an IMU was heard last [s]
+        # What IMUs said of gravity, see `Sample`, and when each was heard last [s]
+        self._gravity = np.full((len(robot.kinematics.parent), 3), np.nan)
+        self._tilted: Array = np.full(len(self._gravity), -math.inf)
         self._torque = HealthyTorque(robot)
         self.rejected = self._rests.rejected  # what was not learned from, by reason
         least = self.training.preset.least_samples
@@ -104,10 +106,14 @@ class Learner:
         self.last_refused = ''
         self._state = None if directory is None else State(directory, robot)
         saved = None if self._state is None else self._state.load(self.samples)
-        # Samples without their network (damaged, or of the robot with a muscle less) bring as many
-        # updates as when they came.
+        gated = self.training.preset.gated
+        if self._state is not None and saved is not None and gated and not self._passes(saved):
+            self._state.back_up(self.samples, checkpoint.to_bytes(saved), self.last_refused)
+            saved = None
+        # Samples without their network (damaged, refused, or of the robot with a muscle less) bring
+        # as many updates as when they came.
         self._owed = len(self.samples) if saved is None else 0
-        if saved is not None and self._passes(saved):
+        if saved is not None:
             self._go_on_from(saved)
         elif mae is not None:
             self.begin(mae)
@@ -130,14 +136,9 @@ class Learner:
 
         At rest that is what holds it against gravity, so that it tells where down is.
         """
-        kinematics = self.robot.kinematics
-        joint, placement = kinematics.placement(link)
-        count = len(kinematics.parent)
-        gravity = np.full((count, 3), np.nan)
-        if self._rests.gravity.size:
-            gravity = self._rests.gravity.reshape(count, 3).copy()
-        gravity[joint] = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
-        self._rests.gravity, self._tilted = gravity.ravel(), time
+        joint, placement = self.robot.kinematics.placement(link)
+        down = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
+        self._gravity[joint], self._tilted[joint] = down, time
 
     def muscles(self, time: float, tension: Array, length: Array) -> None:
         """Take T [N] and l [m] (M,) that came at `time` [s]."""
@@ -145,8 +146,11 @@ class Learner:
         if paired is None or not (self.enabled and self._zeroed):
             return
         _, tension, length, dt, theta = paired
-        if not 0.0 <= time - self._tilted < TILT_AGE:
-            self._rests.gravity = NOTHING
+        age = time - self._tilted
+        heard = (age >= 0.0) & (age < TILT_AGE)
+        self._rests.gravity = (
+            np.where(heard[:, None], self._gravity, np.nan).ravel() if heard.any() else NOTHING
+        )
         used = self._used
         tension, length = tension * used, length * used
         self._gate_time += dt
@@ -242,7 +246,9 @@ class Learner:
             job = Job(seen, healthy, self._statistics_hold, self._steps, self.isolated)
             self.training.submit(job)
         update = self.training.poll()
-        if update is not None:
+        if update is not None and self._rests.anomaly:
+            self._news = True  # it may know the arm that the anomaly is of
+        elif update is not None:
             self._take(update)
         self._keep(changed=False)
         if not self._to_publish or _lately(self._given, now):
@@ -333,6 +339,8 @@ class Learner:
         self.samples.clear()
         self._healthy.clear()
         self.reset()
+        self.gate.start()
+        self._torque.start()
         self._mae, self.checkpoint, self._to_publish = None, None, False
         if successor is None:
             self._keep()

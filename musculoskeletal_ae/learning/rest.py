@@ -26,8 +26,8 @@ from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
-MOST = 5000  # readings of one rest: an end where the clock stands still
-LEAST_READINGS = 2  # of θ in half of `rest_time`
+MOST = 20_000  # readings of one rest: an end where the clock stands still
+LEAST_READINGS = 4  # in half of `rest_time`, which slow messages make longer: fewer hide a drift
 SURE = 3.0  # standard errors that a difference of means may have by chance
 
 
@@ -45,6 +45,7 @@ class RestDetector:
     def reset(self) -> None:
         """Forget the window, as after a jump of the clock."""
         self._window.clear()
+        self._read_at, self._periods = 0.0, (0.0, 0.0)  # of messages that count, the last two [s]
         self._rest: list[Sample] = []
         self._span = self._time = 0.0
         self._still = False
@@ -56,7 +57,13 @@ class RestDetector:
         """
         self._time += dt
         self._window.append((self._time, reading))
-        while self._time - self._window[0][0] > self.settings.rest_time + 1e-9:
+        if self.blind or _measured(reading):
+            self._periods = self._periods[1], self._time - self._read_at
+            self._read_at = self._time
+        # The shorter one: a hole is no rate.
+        readings = (2 * LEAST_READINGS + 1) * min(self._periods)
+        self._needed = max(self.settings.rest_time, readings)
+        while self._time - self._window[0][0] > self._needed + 1e-9:
             self._window.popleft()
         was_still, self._still = self._still, self._is_still()
         if not self._still and not was_still:
@@ -64,15 +71,15 @@ class RestDetector:
         if self._still:
             new = [reading] if was_still else [reading for _, reading in self._window]
             self._rest += new if self.blind else filter(_measured, new)
-            self._span = self._span + dt if was_still else self.settings.rest_time
+            self._span = self._span + dt if was_still else self._needed
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
         rest, self._rest, self._span = self._rest, [], 0.0
         return Sample(*(_mean(np.array(column)) for column in zip(*rest))) if rest else None
 
     def _is_still(self) -> bool:
-        half = 0.5 * self.settings.rest_time
-        if self._time - self._window[0][0] < 0.9 * self.settings.rest_time:
+        half = 0.5 * self._needed
+        if self._time - self._window[0][0] < 0.7 * self._needed:
             return False
         middle = self._time - half
         halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]

@@ -26,6 +26,7 @@ CREEPING = 0.5
 NOTHING: Array = np.zeros(0)
 #: length that counts as a joint angle where none was read, per radian: a usual moment arm [m]
 MOMENT_ARM = 0.04
+LEAST_DISTANCE = 1e-6  # [rad], [N] that 0 stands for: whatever differs is new
 
 
 class Sample(NamedTuple):
@@ -157,7 +158,8 @@ class SampleStore:
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
     def _scaled(self, sample: Sample) -> Array:
-        joint, tension = self._settings.new_joint_distance, self._settings.new_tension_distance
+        distances = self._settings.new_joint_distance, self._settings.new_tension_distance
+        joint, tension = (max(distance, LEAST_DISTANCE) for distance in distances)
         unread = np.isnan(sample.theta).any()
         # Of a posture that was not read the lengths tell whether it is another one.
         length = sample.length / (MOMENT_ARM * joint) if unread else np.nan * sample.length

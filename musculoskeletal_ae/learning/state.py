@@ -311,8 +311,10 @@ class State:
 
     # -- backups --------------------------------------------------------------------------------
 
-    def back_up(self, samples: SampleStore, checkpoint: bytes | None) -> None:
+    def back_up(self, samples: SampleStore, checkpoint: bytes | None, problem: str = '') -> None:
         """Make a backup of what is in memory, before that is replaced.
+
+        `problem` says why a network that was found is not used.
 
         Raises:
             StateError: If the disk is full or gone; nothing is changed then.
@@ -328,6 +330,8 @@ class State:
         except (OSError, sqlite3.Error) as error:
             shutil.rmtree(unfinished, ignore_errors=True)
             raise StateError(f'{self.directory}: no backup can be made ({error})') from error
+        if problem:
+            self.not_used = f'{problem} (kept in {backup})'
 
     def _next_backup(self) -> Path:
         number = 1

@@ -141,7 +141,9 @@ class Estimator(Shell):
     def _isolate_asked(self, _: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
             raise MusculoskeletalError('name muscles in the parameter isolate_muscles first')
-        answer = self._isolate((*self.core.robot.isolated, *self.muscles_to_isolate))
+        wanted = *self.core.robot.isolated, *self.muscles_to_isolate
+        self.core.reset()  # which would use a suspect again
+        answer = self._isolate(wanted)
         self._reset(_)
         return answer
 

@@ -14,7 +14,7 @@ from robots import DRUM_ENDS, behind_a_drum, copy_robot
 
 from bench.gate import ATTACKS, ON_MESSAGES
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
-from musculoskeletal_ae.estimation.gate import LIMITS, NOTICED, PROOF, Gate
+from musculoskeletal_ae.estimation.gate import FLOOR, LIMITS, MOST_USED, NOTICED, PROOF, Gate
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
@@ -166,3 +166,29 @@ def test_a_learner_publishes_no_network_that_the_gate_refuses_and_goes_back_on_a
     learner.anomaly(True)
     assert learner.poll(30.0) is not None
     np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
+
+
+def test_a_first_network_need_not_know_a_body_that_differs_from_its_model(trained):
+    gate = Gate(ROBOT)
+    for k, (tension, length) in enumerate(zip(*body(), strict=True)):
+        gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), 0.1 * k)
+    left = gate.message_errors(trained['default'])
+    assert any(left[name].max() > FLOOR[name] for name in FLOOR)
+    gate.check(trained['default'])
+
+
+def test_who_begins_anew_goes_back_to_nothing_from_before(trained):
+    learner = Learner(ROBOT, trained['paper'], preset='default')
+    learner.replace(None)
+    learner.begin(trained['default'])
+    learner.anomaly(True)
+    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
+
+
+def test_networks_that_nobody_could_prove_are_not_kept_for_ever(trained):
+    gate, first = Gate(ROBOT), trained['paper']
+    gate.take(first, 0.0)
+    for _ in range(3 * MOST_USED):  # no message comes meanwhile
+        gate.take(trained['default'], 0.0)
+    assert len(gate._used) <= MOST_USED
+    assert gate.anomaly(True, 0.0) is first

@@ -171,3 +171,30 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_named(robot, calibrat
             core.step(tension, length, n * DT, n * DT)
         assert bool(core.cause) == broken
     assert core.cause == f'{robot.muscles[frozen]}: a sensor stands still while the arm moves'
+
+
+def test_a_tension_that_stays_at_bias_to_the_bit_is_no_dead_sensor(robot, calibrated, healthy):
+    # As of a simulated module whose wire is paid out.
+    rng, paid_out = np.random.default_rng(0), 3
+    core = Estimator(robot)
+    quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
+    core.use(replace(calibrated, anomaly=quiet))
+    for n in range(400):
+        theta = 0.5 * (robot.lower + robot.upper) + 0.5 * np.sin(0.01 * n)
+        tension = healthy.tension + rng.standard_normal(6)
+        tension[paid_out] = robot.tension.bias[paid_out]
+        length = robot.muscle_lengths(theta, tension) + 1e-4 * rng.standard_normal(6)
+        core.step(tension, length, n * DT, n * DT)
+    assert core.cause == ''
+
+
+@pytest.mark.parametrize('scale', [1.0, 0.1])
+def test_a_weak_muscle_is_jammed_as_a_strong_one_is(scale):
+    # It stays at T_bias, demanded three times that.
+    watched = Verification(0, scale * BIAS, scale * STIFFNESS)
+    for n, (shake, stir) in enumerate(NOISE):
+        command = -min(max(0.0, (n - 150) * 0.0004), 0.006)
+        found = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)
+        if found:
+            break
+    assert found == 'jammed'

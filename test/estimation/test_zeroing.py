@@ -10,13 +10,13 @@ from musculoskeletal_ae.estimation import zeroing
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.zeroing import WINDOW, Zeroing
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
 
 
-@pytest.fixture
-def moment(robot, mae):
+def swinging(robot, mae):
     """Return T [N] and l [m] at the t-th second of a slow swing, as the network's body holds it."""
 
     def at(t):
@@ -34,6 +34,11 @@ def moment(robot, mae):
         return theta, tension, mae.lengths(theta, tension)
 
     return at
+
+
+@pytest.fixture
+def moment(robot, mae):
+    return swinging(robot, mae)
 
 
 def run(zeros, moment, seconds, sees, begin=0.0):
@@ -103,3 +108,27 @@ def test_while_zeros_are_unknown_nothing_is_judged_but_a_muscle_without_tension(
         estimate = estimator.step(tension, length + OFFSET, now, now)
         detected += [n] * bool(estimate is not None and estimate.detected)
     assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
+
+
+@pytest.mark.parametrize('sees', [True, False])
+def test_what_an_isolated_muscle_reads_is_in_nobody_s_way(robot, mae, moment, sees):
+    rng = np.random.default_rng(0)
+
+    def disturbed(t):
+        theta, tension, length = moment(t)
+        tension[3], length[3] = rng.uniform(0.0, 300.0), rng.uniform(-5.0, 5.0)
+        return theta, tension, length
+
+    found = run(Zeroing(robot, mae.without((3,))), disturbed, 120.0, sees)
+    assert found.done
+    others = np.arange(6) != 3
+    np.testing.assert_allclose(found.zeros.offset[others], OFFSET[others], atol=4e-3)
+
+
+@pytest.mark.filterwarnings('error::RuntimeWarning')
+def test_an_arm_that_carries_nothing_is_no_division_by_zero(mae):
+    robot = Robot.load('arm26')
+    robot.kinematics.model.gravity.linear = np.zeros(3)  # as with upright axes
+    found = run(Zeroing(robot, mae), swinging(robot, mae), 60.0, sees=False)
+    assert np.isfinite(found.zeros.offset).all()
+    assert np.isfinite(found._fit.cost)

@@ -301,3 +301,39 @@ def test_an_accelerometer_tells_where_down_is_while_it_is_heard(arm26, initial, 
     assert np.isnan(np.delete(gravity, joint, axis=0)).all()
     arm.rest(1.0)
     assert not learner._rests.gravity.size
+
+
+def test_an_accelerometer_that_falls_silent_says_nothing_beside_one_that_is_heard(learner, stage):
+    arm = Arm(learner, stage)
+    kinematics = learner.robot.kinematics
+    arm.rest(0.5)
+    learner.imu(arm.time, 'forearm', np.array([0.0, 0.0, 9.8]))
+    for _ in range(10):
+        learner.imu(arm.time, 'upper_arm', np.array([0.0, 0.0, 9.8]))
+        arm.rest(0.1)
+    gravity = learner._rests.gravity.reshape(-1, 3)
+    assert np.isfinite(gravity[kinematics.placement('upper_arm')[0]]).all()
+    assert np.isnan(gravity[kinematics.placement('forearm')[0]]).all()
+
+
+def test_an_update_that_ends_during_an_anomaly_is_not_used(learner, stage):
+    accept(learner, stage, 3)
+    learner.poll(0.0)
+    learner.training.released = False
+    learner.accept(stage.sample())
+    learner.poll(2.0)
+    updates = learner.updates
+    learner.anomaly(True)
+    learner.training.released = True
+    learner.poll(4.0)
+    assert learner.training.ready and learner.updates == updates
+    learner.anomaly(False)
+    jobs = len(learner.training.jobs)
+    learner.poll(6.0)
+    assert len(learner.training.jobs) == jobs + 1  # it is learned then
+
+
+def test_a_replaced_network_is_not_judged_by_what_the_last_one_felt(learner, initial):
+    learner._torque._time, learner._torque._square[:] = 180.0, 1.0
+    learner.replace(initial)
+    assert learner._torque._time == 0.0

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,38 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
     assert len(found) >= 5
     errors = [f.theta[0] - 0.5 for f in found]
     assert np.std(errors) < 0.01
+
+
+@pytest.mark.parametrize(
+    ('rate', 'rest_time'),
+    [(1.0, 0.3), (5.0, 0.3), (7.0, 0.3), (18.9, 0.3), (20.0, 0.3), (100.0, 0.0), (100.0, 0.02)],
+)  # fmt: skip
+def test_an_arm_rests_however_slow_the_messages_and_short_the_time(rate, rest_time):
+    detector = RestDetector(replace(DEFAULT, rest_time=rest_time))
+    found = [detector.step(reading(0.3, 0.01), 1.0 / rate) for _ in range(round(13.0 * rate))]
+    assert any(rest is not None for rest in found)
+    detector.reset()
+    moving = [
+        detector.step(reading(0.05 * n / rate, 0.01), 1.0 / rate) for n in range(round(13.0 * rate))
+    ]
+    assert all(rest is None for rest in moving)
+
+
+def test_an_arm_rests_where_angles_come_seldom():
+    assert len(run(RestDetector(DEFAULT), 10.0, measured=lambda n: n % 20 == 0)) >= 5
+    assert (
+        run(RestDetector(DEFAULT), 10.0, lambda t: 0.05 * t, measured=lambda n: n % 20 == 0) == []
+    )
+
+
+def test_with_no_least_distance_whatever_differs_is_new():
+    zero = replace(DEFAULT, new_joint_distance=0.0, new_tension_distance=0.0)
+    store, rng = SampleStore(zero), np.random.default_rng(0)
+    for _ in range(20):
+        sample = Sample(rng.uniform(size=2), rng.uniform(30.0, 60.0, 6), np.zeros(6), np.zeros(6))
+        assert store.is_new(sample)
+        store.add(sample)
+        assert not store.is_new(sample)
 
 
 def test_no_rest_without_joint_angles():

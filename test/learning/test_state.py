@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import copy_robot, read_muscles, write_muscles
 
-from musculoskeletal_ae.exceptions import StateError
+from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.learner import Learner
@@ -418,6 +419,33 @@ def test_a_state_that_is_replaced_is_kept_whole(begun, stage, initial, arm26, tm
     found, mae, _ = read(tmp_path / 'state', arm26)
     same(found, learner.samples)
     assert mae.version == version + 1
+
+
+def test_a_saved_network_that_is_refused_is_kept_whole_and_told(
+    begun, stage, arm26, tmp_path, monkeypatch
+):
+    learner = begun()
+    accept(learner, stage, 3)
+    before, version = read_copy(tmp_path / 'state', tmp_path / 'copy', arm26)
+    learner.close()
+    check, refused = Gate.check, []
+
+    def refuse_once(gate, mae):
+        if not refused:
+            refused.append(mae)
+            raise GateError('it does not explain the arm')
+        check(gate, mae)
+
+    monkeypatch.setattr(Gate, 'check', refuse_once)
+    learner = begun()
+    told = learner.report().values['saved state not used']
+    assert 'does not explain the arm' in told and 'backup-1' in told
+    accept(learner, stage, 1)
+    kept, mae, _ = read(tmp_path / 'state' / 'backup-1', arm26)
+    same(kept, before)
+    assert mae.version == version
+    assert len(learner.samples) == 4
+    assert learner._owed == 3  # what was learned of them is to be learned again
 
 
 def read_copy(directory, copy, robot):

@@ -93,3 +93,18 @@ def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
     graph.wait(lambda: told, 'the list')
     assert told[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
+
+
+def test_a_suspect_that_is_isolated_by_hand_while_it_is_verified_stays_so(graph, trained_file):
+    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, on_anomaly='isolate')
+    names = node.robot.muscles
+    node.core.detector.judges = True
+    for by_hand, isolated in ((3, (3,)), (5, (3, 5))):
+        node.core.isolate(())
+        node.core.jumped(3, 0.0)
+        assert node.core.cause and node.core.robot.isolated == (3,)
+        assert graph.set_parameter('estimator', 'isolate_muscles', [names[by_hand]])[0]
+        answer = graph.call(Trigger, 'estimator/isolate').message
+        assert answer == f'isolated: {", ".join(names[m] for m in isolated)}'
+        assert node.core.robot.isolated == isolated
+        assert not node.core.cause
