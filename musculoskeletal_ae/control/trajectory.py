@@ -28,7 +28,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
 STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
-SAMPLES, WITHIN = 200, 6  # of a trajectory that are looked at, and of each piece at least
+SAMPLES, WITHIN = 200, 5  # of a trajectory that are looked at, and of each piece at least
 #: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
 CUBIC = np.array(
