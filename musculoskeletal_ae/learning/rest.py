@@ -79,7 +79,7 @@ class RestDetector:
 
     def _is_still(self) -> bool:
         half = 0.5 * self._needed
-        if self._time - self._window[0][0] < 0.7 * self._needed:
+        if self._time - self._window[0][0] <= 0.7 * self._needed:
             return False
         middle = self._time - half
         halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]

@@ -194,8 +194,9 @@ def wrapped_segment(
         u = _beside(axis)
         v = _cross(axis, u)
     else:
-        u, normal = _unit(a), _cross(a, b)
-        if _dot(normal, normal) < 1e-18 * _dot(a, a) * _dot(b, b):
+        u = _unit(a)
+        normal = _cross(u, _unit(b))  # of units: that of ends near the centre is short
+        if _dot(normal, normal) < 1e-18:
             # Through the centre every plane is as good: take that of the side, or any.
             normal = _cross(a, side) if sided else _beside(u)
         v = _cross(_unit(normal), u)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from differences import slopes
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from robots import read_muscles, write_muscles, write_robot
 
@@ -64,6 +64,7 @@ point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
 
 
 @given(point, point, st.floats(0.001, 0.1))
+@example((0.0, 0.001, 1.4641753369134492e-12), (0.0, 0.25, 0.0), 0.001)  # hardly a plane
 def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
     straight = np.linalg.norm(np.subtract(end, start))
     value, leave, arrive = wire(start, end, radius)
