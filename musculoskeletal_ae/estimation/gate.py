@@ -274,7 +274,7 @@ class Gate:
         before = {} if self.mae is None else self.message_errors(self.mae.without(self.isolated))
         yield ''
         for name, error in left.items():
-            limit = np.fmax(np.full(len(error), FLOOR[name]), WORSE * before[name])
+            limit = np.fmax(FLOOR[name], WORSE * before[name])
             over = error / limit
             if not over.max() <= 1.0:
                 worst = int(over.argmax())
