@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction along the wires: which way each slid last decides what it takes of the tension.
 
-    T = T_end e^{μ s},   s ← clip(s − Δl/b, −1, 1)
+    T = T_end e^{μ s},   s ← w + (s − w) e^{−|Δl|/b},   w = −sign Δl
 
-T is the motor's, T_end the elastic unit's; s = 1 if the wire was wound in last: T is more then (the
-stop operator of hysteresis theory). The network is that of the body without friction: what it takes
-for T is T_end, so that everybody who asks it about what sensors read turns one into the other.
+T is the motor's, T_end the elastic unit's; s = 1 if the wire was wound in last: T is more then
+(Dahl's friction: a wire that turns round lets go little by little). The network is that of the body
+without friction: what it takes for T is T_end, so that everybody who asks it about what sensors
+read turns one into the other.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-REVERSAL = 0.0005  # [m] b, of sliding that turn friction round
-#: [m] by which a length is off, in the mean of about 1/LATEST messages, that is as likely the
-#: sensor's noise as sliding
-NOISE = 0.0001
-LATEST = 0.15
-SPIKE = 2.0 * NOISE  # [m] by which a reading may lie beyond the last two
+REVERSAL = 0.0004  # [m] b, of sliding that turns friction round
+#: [m] noise of a length; one that is off by as much in the mean of about 1/LATEST messages is as
+#: likely sliding
+NOISE = 0.00013
+LATEST = 0.07
+SPIKE = 0.0002  # [m] by which a reading may lie beyond the last two
 
 
 def slid(direction: Array, moved: Array) -> Array:
-    """Return s (..., M) after lengths have changed by `moved` [m] (..., M)."""
+    """Return s (..., M) after lengths have changed by `moved` [m] (..., M), straightened.
+
+    s ← clip(s − Δl/b, −1, 1): a spring of constant stiffness until the wire slides.
+    """
     after: Array = np.minimum(np.maximum(direction - moved / REVERSAL, -1.0), 1.0)
     return after
 
@@ -37,11 +41,13 @@ def end_tension(friction: Array | float, tension: Array, direction: Array) -> Ar
 class FrictionDirection:
     """Which way each wire slid last, from muscle lengths alone.
 
-        L ← L + e ē²/(ē² + NOISE²),   e = l − L
+        L ← L + g e,   g = (a + k) / (1 + k),   k = (ē / NOISE)⁴,   e = l − L
 
-    with ē the mean of the latest e. So noise slides a wire that rests only a little (that of twice
-    NOISE turns s away from ±1), and one that slides is not followed late, as it would be by a low
-    pass. Of l counts what lies at most SPIKE beyond the last two: one that is off slides little.
+    with ē the mean of the latest e, and their share a = LATEST. So the lengths of a wire that rests
+    are averaged, and one that slides is not followed late, as it would be by a low pass. It slid by
+    as much as L leaves a play of NOISE √(g / (2 − g)) each way: the noise that is left in L would
+    add up, to and fro. Of l counts what lies at most SPIKE beyond the last two: one that is off
+    slides little.
     """
 
     def __init__(self) -> None:
@@ -50,15 +56,20 @@ class FrictionDirection:
     def step(self, length: Array) -> Array:
         """Take l [m] (M,); return s (M,)."""
         if self._length is None:
-            self._length, self._read = length, (length, length)
+            self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
         least, most = np.minimum(*self._read) - SPIKE, np.maximum(*self._read) + SPIKE
         self._read = self._read[1], length
-        off = np.minimum(np.maximum(length, least), most) - self._length
+        off = np.minimum(np.maximum(length, least), most) - self._mean
         self._off = self._off + LATEST * (off - self._off)
-        moved = off * self._off**2 / (self._off**2 + NOISE**2)
-        self._length = self._length + moved
-        self._direction = slid(self._direction, moved)
+        sliding = (self._off / NOISE) ** 4
+        gain = (LATEST + sliding) / (1.0 + sliding)
+        self._mean = self._mean + gain * off
+        before, play = self._length, NOISE * np.sqrt(gain / (2.0 - gain))
+        self._length = np.minimum(np.maximum(before, self._mean - play), self._mean + play)
+        way = np.sign(before - self._length)
+        left = np.exp(-np.abs(self._length - before) / REVERSAL)
+        self._direction = way + (self._direction - way) * left
         return self._direction
 
     def end_tension(self, friction: Array | float, tension: Array, length: Array) -> Array:

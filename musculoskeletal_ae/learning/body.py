@@ -42,7 +42,7 @@ WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ran
 #: (less than 0.1 mm at the prior's spread), and the postures that it is taken over
 LEFT_OUT, POSTURES = 1e-3, 500
 # More than twice the tension at the elastic unit than at the motor is no friction.
-LARGEST_FRICTION = 0.5
+LARGEST_FRICTION = 0.7
 LARGEST_LOG = 1.5
 
 
