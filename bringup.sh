@@ -127,6 +127,12 @@ fi
 if [ "$reality" != kin ] && { [ $hardware = true ] || [ -n "$bag" ]; }; then
   refuse '--reality is of the emulator: not with --hardware or --bag'
 fi
+if [ "$explore" = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
+  refuse '--explore moves the arm: not with --no-controller or --bag'
+fi
+if [ "$joint_source" = none ] && [ $learner = false ]; then
+  refuse '--joint-source none is for the learner: not with --no-learner'
+fi
 [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
 if [ -n "$record" ]; then
   [ ! -e "$record" ] || refuse "--record '$record' is there already; name a new directory"

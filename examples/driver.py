@@ -8,6 +8,7 @@ doc/your_robot.md says what a driver must do and why; `check_driver` whether thi
 
 from __future__ import annotations
 
+import sys
 import time
 
 import numpy as np
@@ -18,6 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm  # for the fake bus only
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -83,5 +85,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(Driver())
+    except MusculoskeletalError as error:  # no such robot
+        sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -23,12 +23,9 @@ LATEST = 0.07
 SPIKE = 0.0002  # [m] by which a reading may lie beyond the last two
 
 
-def slid(direction: Array, moved: Array) -> Array:
-    """Return s (..., M) after lengths have changed by `moved` [m] (..., M), straightened.
-
-    s ← clip(s − Δl/b, −1, 1): a spring of constant stiffness until the wire slides.
-    """
-    after: Array = np.minimum(np.maximum(direction - moved / REVERSAL, -1.0), 1.0)
+def slid(direction: Array, way: Array, moved: Array) -> Array:
+    """Return s (..., M) after wires have slid by `moved` [m] in a `way`, 1: wound in, (..., M)."""
+    after: Array = way + (direction - way) * np.exp(-np.abs(moved) / REVERSAL)
     return after
 
 
@@ -67,9 +64,8 @@ class FrictionDirection:
         self._mean = self._mean + gain * off
         before, play = self._length, NOISE * np.sqrt(gain / (2.0 - gain))
         self._length = np.minimum(np.maximum(before, self._mean - play), self._mean + play)
-        way = np.sign(before - self._length)
-        left = np.exp(-np.abs(self._length - before) / REVERSAL)
-        self._direction = way + (self._direction - way) * left
+        moved = self._length - before
+        self._direction = slid(self._direction, -np.sign(moved), moved)
         return self._direction
 
     def end_tension(self, friction: Array | float, tension: Array, length: Array) -> Array:

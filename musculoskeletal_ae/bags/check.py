@@ -75,9 +75,10 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
 
     best for j = i, up to a constant offset.
     """
-    rows = np.linspace(0, len(pairs.time) - 1, min(len(pairs.time), _MOST_SAMPLES)).astype(int)
-    if len(rows) < 2:
+    known = np.flatnonzero(np.isfinite(pairs.theta).all(axis=1))
+    if len(known) < 2:
         return []
+    rows = known[np.linspace(0, len(known) - 1, min(len(known), _MOST_SAMPLES)).astype(int)]
     theta = pairs.theta[rows].clip(robot.lower, robot.upper)
     length, tension = pairs.length[rows], pairs.tension[rows]
     moved = length.std(axis=0) > _LEAST_MOTION

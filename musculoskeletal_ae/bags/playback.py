@@ -9,7 +9,9 @@ Or what a hand showed an arm, as a trajectory that the arm can follow: smoothed,
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from itertools import chain
 from typing import NamedTuple
 
@@ -20,7 +22,7 @@ from musculoskeletal_ae.bags.mcap_file import BagMessage
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.validity import read_joints
+from musculoskeletal_ae.validity import MOST_ENTRIES, read_joints
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
@@ -30,6 +32,7 @@ SMOOTHING = 0.15  # [s] standard deviation: a hand is slower, noise of the estim
 SPACING = 0.1  # [s] between points
 LEAD = 3.0  # [s] to go to where it was begun
 LEAST = 0.5  # [s]
+LONGEST_HOLE = 1.0  # [s] between two messages, over which nobody knows the motion
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
@@ -105,22 +108,27 @@ class Shown(NamedTuple):
 def shown(bag: Bag, topic: str, start: int, stop: int) -> Shown:
     """Return the motion on a recorded topic of JointState, from start to stop [ns, recorded].
 
-    A BagError says that there is none.
+    It is of the joints that most messages name. A BagError says that there is none, or none that a
+    controller could follow.
     """
-    joints, times, rows = tuple[str, ...](), list[float](), list[Array]()
+    found = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
     for message in bag.messages([topic], start, stop):
         said = bag.decode(message)
-        joints = joints or tuple(said.name)
-        try:
-            values = read_joints(said, joints, foreign_allowed=False)
-            rows.append(np.array([values[name][0] for name in joints]))
-        except (MessageError, KeyError):
-            continue  # as a node would
-        times.append((message.log_time - start) / 1e9)
-    if not times or times[-1] - times[0] < LEAST:
+        with suppress(MessageError):  # left out, as a node would
+            values = read_joints(said, names := sorted(said.name), foreign_allowed=False)
+            theta = np.array([values[name][0] for name in names])
+            found[tuple(names)].append(((message.log_time - start) / 1e9, theta))
+    joints = max(found, key=lambda names: len(found[names]), default=())
+    seen, theta = map(np.array, zip(*found[joints])) if joints else (np.zeros(1), np.zeros(1))
+    if (span := float(seen[-1] - seen[0])) < LEAST:
         problem = f'{topic} holds no motion of at least {LEAST:g} s'
         raise BagError(bag.path, problem, 'record it while the arm is shown one')
-    seen, theta = np.array(times), np.array(rows)
+    if (hole := float((gaps := np.diff(seen)).max())) > LONGEST_HOLE:
+        problem = f'{topic} says nothing for {hole:.1f} s after {seen[gaps.argmax()]:.1f} s'
+        raise BagError(bag.path, problem, 'choose a part without holes by --start and --duration')
+    if span > (longest := SPACING * (MOST_ENTRIES // len(joints) - 2)):
+        problem = f'{topic} goes on for {span:.0f} s, and a trajectory for {longest:.0f} s at most'
+        raise BagError(bag.path, problem, 'choose a part by --start and --duration')
     time = np.linspace(seen[0], seen[-1], max(2, round((seen[-1] - seen[0]) / SPACING)) + 1)
     weight = np.exp(-0.5 * ((time[:, None] - seen) / SMOOTHING) ** 2)
     smooth = weight @ theta / weight.sum(axis=1, keepdims=True)

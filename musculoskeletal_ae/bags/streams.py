@@ -15,6 +15,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import interface_topics
+from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
@@ -33,7 +34,7 @@ class Pairs(NamedTuple):
     """θ and (T, l) that belong together."""
 
     time: Array  # [s], (P,)
-    theta: Array  # θ [rad], (P, D)
+    theta: Array  # θ [rad], (P, D); NaN of joints without a sensor
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
 
@@ -41,8 +42,8 @@ class Pairs(NamedTuple):
 class Streams(NamedTuple):
     """What one arm sensed and was told; a topic that is not in the bag is an empty series."""
 
-    joints: Series  # θ [rad], (N, D)
-    muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
+    joints: Series  # θ [rad], (N, D); NaN of joints without a sensor
+    muscles: Series  # length [m] less its zero, tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
     rejected: Counter[str]  # messages left out, by topic and reason
@@ -84,14 +85,17 @@ class _Stream:
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
-    A BagError says that no message of a topic fits the robot, or that the bag is damaged.
+    From lengths comes off what `muscle_length_zeros` said last; while zeros are being found they
+    are left out. A BagError says that no message of a topic fits the robot, or that the bag is
+    damaged.
     """
-    muscles = robot.muscle_count
+    muscles, joints = robot.muscle_count, robot.joints
     streams = {
-        'joint_states': _Stream((robot.joint_count,), lambda m: read_posture(m, robot.joints)),
+        'joint_states': _Stream((len(joints),), lambda m: read_posture(m, joints, some=True)),
         'muscle_states': _Stream((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
         'muscle_length_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
         'muscle_tension_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
+        'muscle_length_zeros': _Stream((2, muscles), lambda m: read_array(m, 2, muscles)),
     }
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
@@ -107,8 +111,22 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         if why and not stream.values:
             problem = f'no message of {topic} fits the robot ({why[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
-    joints, states, lengths, tensions = (
+    theta, states, lengths, tensions, zeros = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
-    return Streams(joints, states, lengths, tensions, reception.rejected)
+    states, lost = _from_zero(states, zeros)
+    if lost:
+        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += lost
+    return Streams(theta, states, lengths, tensions, reception.rejected)
+
+
+def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:
+    """Return states with lengths from the zeros of their time, and of how many there are none."""
+    known = np.array([Zeros(*rows).known for rows in zeros.values], dtype=bool)
+    since = np.searchsorted(zeros.time, states.time, side='right')  # 0: nothing was said yet
+    use = np.append(True, known)[since]
+    offset = np.concatenate([np.zeros_like(states.values[:1, 0]), zeros.values[:, 0]])
+    values = states.values[use]
+    values[:, 0] -= offset[since[use]]
+    return Series(states.time[use], values), int((~use).sum())

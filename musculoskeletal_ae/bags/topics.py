@@ -111,7 +111,7 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
         if others:
             several = ', '.join(name or '/' for name in (namespace, *others))
             problem = f'topics of the interface lie under several namespaces: {several}'
-            remedy = 'choose one with --from-namespace, or keep all names with --keep-names'
+            remedy = 'choose one with --from-namespace (or replay all with --keep-names)'
             raise BagError(bag.path, problem, remedy)
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
     return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}

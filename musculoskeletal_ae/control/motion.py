@@ -30,12 +30,12 @@ from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiff
 from musculoskeletal_ae.control.posture import REPLAN, Pull, Ramp, RestFeedback
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
-from musculoskeletal_ae.friction import REVERSAL
+from musculoskeletal_ae.friction import slid
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-PROPORTIONAL, INTEGRAL = 1.0, 4.0  # k_p; k_i [1/s]
+PROPORTIONAL, INTEGRAL = 0.7, 4.0  # k_p; k_i [1/s]
 FRICTION = 0.05  # μ where none was learned: the mean of what hands build
 SHARE = 0.7  # of the winches' speed that lengths may use; the rest is for tensions and feedback
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
@@ -232,10 +232,7 @@ class MotionControl:
         robot, lag = self._robot, self.winches.lag
         jacobian = mae.muscle_jacobian(at.theta, self._tension)
         speed = jacobian @ at.velocity
-        # Friction turns round within `REVERSAL` of sliding (Dahl).
-        turned = np.exp(-np.abs(speed) * dt / REVERSAL)
-        direction = -np.tanh(speed / TURNING)
-        self._sliding = direction + (self._sliding - direction) * turned
+        self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
         low = robot.tension.bias + robot.stiffness * lag * np.maximum(speed, 0.0)
         loss = np.exp(self._friction * self._sliding)

@@ -78,7 +78,7 @@ class Listening:
     def joints(self, message: object) -> None:
         """Take a message of joint_states."""
         with self._rejecting('joint_states'):
-            theta = read_posture(message, self._robot.joints)
+            theta = read_posture(message, self._robot.joints, some=True)
             self._theta = self._theta if self._stated else theta
 
     @contextmanager
@@ -107,9 +107,11 @@ class Listening:
                     verdict, theta[known[few]], *states[known[few], :2].swapaxes(0, 1)
                 )
             else:
+                lacking = np.isnan(theta).all(axis=0)
+                which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'
                 verdict.notes.append(
-                    'sign, zero and order of l are not judged without θ: publish joint_states, or '
-                    'hold the arm still and state --posture'
+                    f'sign, zero and order of l are not judged without θ of {which}: publish '
+                    'joint_states, or hold the arm still and state --posture'
                 )
         return verdict
 

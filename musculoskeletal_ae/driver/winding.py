@@ -136,8 +136,9 @@ class Winding:
         end, start = self._now + duration, self._recent[-1][1] if self._recent else None
         while self._now < end:
             yield
-            (length, tension, _), limit = self._recent[-1][1], self._robot.tension.limit
-            asked = np.minimum(self._robot.demanded(length, self._target), limit)
+            length, tension, _ = self._recent[-1][1]
+            most = np.maximum(self._robot.tension.limit, self._highest)
+            asked = np.minimum(self._robot.demanded(length, self._target), most)
             self._tame_at[~(tension > asked + RUN_AWAY_TENSION * self._scale)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())

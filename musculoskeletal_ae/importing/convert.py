@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
@@ -71,8 +72,16 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     cut(source, **chain)
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
+    there = out.exists()
     write(source, out)
-    robot = Robot.load(out)
+    try:
+        robot = Robot.load(out)
+    except MusculoskeletalError:
+        for file in out.iterdir():  # which was new or empty
+            file.unlink()
+        if not there:
+            out.rmdir()
+        raise
     return Imported(robot, tuple(source.notes), compare(source, robot))
 
 

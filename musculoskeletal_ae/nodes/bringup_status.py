@@ -45,7 +45,7 @@ class BringupStatus(Shell):
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
-        self.follow_posture('joint_states', partial(setattr, self, 'theta'))
+        self.follow_posture('joint_states', partial(setattr, self, 'theta'), some=True)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
         self.follow_anomaly(partial(setattr, self.situation, 'detected'))
@@ -65,7 +65,7 @@ class BringupStatus(Shell):
 
     def _estimated(self, theta: Array) -> None:
         if self.theta is not None:
-            self.errors.append(float(np.linalg.norm(theta - self.theta)))
+            self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - self.theta))))
 
     def _print(self) -> None:
         now = time.monotonic()

@@ -80,7 +80,7 @@ class Estimator(Shell):
         self.told = self.create_publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
         # As the sensors read them: the core knows the zeros first.
         self.follow_muscle_states(self._estimate, as_read=True, unread=self._unread)
-        self.follow_posture('joint_states', self._measured)
+        self.follow_posture('joint_states', self._measured, some=True)
         self._tell_zeros()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._commanded, kind))
@@ -98,6 +98,8 @@ class Estimator(Shell):
         serve(self, Trigger, 'estimator/restore', self._restore_asked)
 
     def _measured(self, theta: Array) -> None:
+        if np.isnan(theta).any():
+            return  # some sensors tell neither zeros nor where the arm is
         self.core.joints(theta, time.monotonic())
         if self.frames is not None and self.tf_source == 'sensor':
             self.frames.publish(theta)

@@ -38,6 +38,9 @@ class Record(Node):
         super().__init__('record')
         self.writer = writer
         self.received = 0
+        #: what was latched before the first /clock, by topic; how much else came before
+        self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
+        self.timeless = 0
         self._sim_time = self.get_parameter('use_sim_time').value
         for name in topics:
             topic = TOPICS[name]
@@ -50,10 +53,21 @@ class Record(Node):
 
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
+        self.received += 1
+        if now == 0:  # of a simulated clock that has not begun
+            self.timeless += not topic.latched
+            if topic.latched:
+                self._early[name] = topic, data, info
+            return
+        early, self._early = self._early, {}
+        for each, (kind, held, its) in early.items():
+            self._write(each, kind, now, held, its)
+        self._write(name, topic, now, data, info)
+
+    def _write(self, name: str, topic: Topic, now: int, data: bytes, info: dict[str, int]) -> None:
         if name not in self.writer.topics:
             self.writer.add_topic(name, topic.type, self._offered(name, topic))
         self.writer.write(name, now, info['source_timestamp'], data)
-        self.received += 1
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
         """Return what the publishers of a topic offer; their depth cannot be seen from here."""
@@ -84,6 +98,9 @@ def _record(options: Namespace, arguments: list[str]) -> None:
             before = node.received
             spinner.spin_once(timeout_sec=0.05)
         node.destroy_node()
+    if node.timeless:
+        told = 'messages came before the first /clock, and are left out'
+        print(f'warning: {node.timeless} {told}', file=sys.stderr)
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
 
 

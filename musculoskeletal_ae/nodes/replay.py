@@ -29,7 +29,7 @@ from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
-from musculoskeletal_ae.options import Parser, names, not_negative, positive
+from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -52,6 +52,7 @@ class Replay(Node):
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
         self.length = (self._stop - self._start) / 1e9  # [s]
+        self._before = (self._start - bag.start) / 1e9  # [s] of the bag
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher = {
             recorded: self.create_publisher(
@@ -68,9 +69,10 @@ class Replay(Node):
         self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
         self._sought: int | None = None  # where to go on [ns]
         told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
-        number = FloatingPointRange(from_value=0.0, to_value=self.length)
-        told.floating_point_range = [number]
-        self.declare_parameter('position', 0.0, told)
+        end = self._before + self.length
+        legal = FloatingPointRange(from_value=self._before, to_value=end)
+        told.floating_point_range = [legal]
+        self.declare_parameter('position', self._before, told)
         self.add_post_set_parameters_callback(self._seek)
         self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
         self._next_time = self._start
@@ -129,7 +131,7 @@ class Replay(Node):
                 self._spinner.spin_once(timeout_sec=wait)
                 if now > self._next_report:
                     self._next_report = now + 1.0
-                    seconds = np.array([self._done(), self.length])
+                    seconds = self._before + np.array([self._done(), self.length])
                     self._told.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
             else:
@@ -146,7 +148,7 @@ class Replay(Node):
     def _seek(self, parameters: list[Parameter]) -> None:
         for parameter in parameters:
             if parameter.name == 'position':
-                self._sought = self._start + int(1e9 * parameter.value)
+                self._sought = self._bag.start + int(1e9 * parameter.value)
 
     def pause(self, _: Trigger.Request) -> str:
         """Stop where it is."""
@@ -170,7 +172,7 @@ class Replay(Node):
         return max(0.0, (self._timeline.recorded(time.monotonic()) - self._start) / 1e9)
 
     def _position(self) -> str:
-        return f'{(self._start - self._bag.start) / 1e9 + self._done():.6f} s'
+        return f'{self._before + self._done():.6f} s'
 
 
 def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: float) -> None:
@@ -243,7 +245,8 @@ def parse(arguments: list[str]) -> Namespace:
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     add('--keep-names', action='store_true', help='keep the recorded namespace')
     add('--from-namespace', metavar='NS', help='which arm, of a bag that has several')
-    add('--rate', type=positive, default=1.0, help='multiple of the recorded speed; needs --clock')
+    rate = 'multiple of the recorded speed; needs --clock'
+    add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again at the end')
     start = 'start this far into the bag [s]'
@@ -262,6 +265,10 @@ def parse(arguments: list[str]) -> Namespace:
         )
     if options.robot and not options.check:
         parser.error('--robot is for --check')
+    if options.check:
+        given = {name for name, value in vars(options).items() if value != parser.get_default(name)}
+        if ignored := sorted(given - {'bag', 'check', 'robot', 'from_namespace'}):
+            parser.error(f'--check plays nothing: without --{ignored[0].replace("_", "-")}')
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
     if options.as_trajectory and options.topics != [DEFAULT]:

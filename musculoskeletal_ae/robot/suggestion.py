@@ -113,7 +113,6 @@ def write(robot: Robot, change: Array, out: Path) -> None:
     document = read_yaml(here / 'muscles.yaml', refusal)
     for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
         muscle['route'] = [written(item) for item in route]
-    out.mkdir(parents=True)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
     (out / 'muscles.yaml').write_text(text, encoding='utf-8')
     for file in ('robot.urdf', checks.DECLARATION_FILE):

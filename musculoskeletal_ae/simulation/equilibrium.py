@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.friction import REVERSAL, slid
+from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
@@ -100,7 +100,8 @@ class QuasiStatics:
         jacobian, curvature = self._slopes(theta, end)
         load, load_slope = self._load(theta, wrench)
         torque = load + pullback(end)
-        # Where a wire slides, friction is like a stiff spring until it has turned round.
+        # Where a wire slides, friction is like a stiff spring until it has turned round: one of
+        # constant stiffness, where the arm's lets go little by little.
         rubbing = self._friction * end
         turning, free = state.slid, np.abs(state.slid) < 1.0
         for _ in range(ROUNDS):
@@ -127,7 +128,8 @@ class QuasiStatics:
             after = desired + stiffness * soft * stretch
             after = np.minimum(np.maximum(after, limits.bias), limits.max)
             moved = (stretch + compliance * lost - by_motor * (after - tension)) / give
-            turning, before = slid(state.slid, moved), free
+            turning = np.minimum(np.maximum(state.slid - moved / REVERSAL, -1.0), 1.0)
+            before = free
             free = np.abs(turning) < 1.0
             if (free == before).all() or not rubbing.any():
                 break

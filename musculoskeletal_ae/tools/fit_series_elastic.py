@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
@@ -21,6 +22,9 @@ COLUMNS = ['tension', 'absolute_length', 'elongation']
 EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
 EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
 EXAMPLE_NOISE = 1e-4  # [m], what a caliper on a testbed resolves
+LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # of the elastic unit, as shares of the highest tension
+SLIGHTLY = 1e-3
+LEAST_ELONGATION = -0.002  # [m], by noise
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -49,9 +53,10 @@ def fit(args: Namespace) -> None:
         raise _refusal(args.table, str(error)) from error
     residual = 1e3 * (table[:, 2] - constants.elongation(table[:, 1], table[:, 0]))
     rms = math.sqrt(float(np.mean(residual**2)))
-    force, rate, stretch = (values[0] for values in vars(constants).values())
+    found = {name: float(f'{values[0]:.6g}') for name, values in vars(constants).items()}
+    line = yaml.safe_dump(found, default_flow_style=True, sort_keys=False).strip()
     print(
-        f'series_elastic: {{force: {force:.2f}, rate: {rate:.3f}, wire_stretch: {stretch:.4e}}}\n'
+        f'series_elastic: {line}\n'
         f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
     )
     save_plot(args.plot, lambda: plot(table, constants, residual))
@@ -77,8 +82,11 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     def residual(log_constants: Array) -> Array:
         return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
 
-    start = np.log(list(DEFAULT.values()))
-    return model(least_squares(residual, start, x_scale='jac').x)
+    # A linear spring is F ≫ T, a wire alone a rate without end: both as far as it can be told.
+    most = tension.max()
+    low, high = np.log([[LEAST_FORCE * most, 1e-3, 1e-12], [MOST_FORCE * most, 1e6, 1.0]])
+    start = np.clip(np.log(list(DEFAULT.values())), low + SLIGHTLY, high - SLIGHTLY)
+    return model(least_squares(residual, start, x_scale='jac', bounds=(low, high)).x)
 
 
 def read_table(file: Path) -> Array:
@@ -94,6 +102,9 @@ def read_table(file: Path) -> Array:
         if values[0] < 0.0 or values[1] <= 0.0:
             problem = f'row {number}: expected tension >= 0 and absolute_length > 0, got {line!r}'
             raise _refusal(file, problem)
+        if not LEAST_ELONGATION <= values[2] < values[1]:
+            problem = f'row {number}: expected elongation from 0 to absolute_length, got {line!r}'
+            raise _refusal(file, f'{problem}; are both in m?')
         rows.append(values)
     return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))
 

@@ -8,6 +8,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,11 @@ def train(args: Namespace) -> None:
     for file in filter(None, (args.out, args.plot)):
         if not file.parent.is_dir() or file.is_dir():
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
+        try:  # before the work, which takes minutes
+            TemporaryFile(dir=file.parent, prefix=f'.{file.name}.').close()
+        except OSError as error:
+            told = f'{file}: cannot be written ({error.strerror}); choose another place'
+            raise MusculoskeletalError(told) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
     if told := told_of_jumps(robot):
@@ -88,7 +94,9 @@ def train(args: Namespace) -> None:
 def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
     """Learn from recordings in their order, those held out judged only; print errors."""
     # Read before the network is trained, which takes longer than finding a bag unusable.
-    recordings = {path: read(path, robot) for path in (*args.from_bag, *args.hold_out)}
+    recordings = {
+        path: read(path, robot, args.from_namespace) for path in (*args.from_bag, *args.hold_out)
+    }
     if args.checkpoint:
         mae = checkpoint.load(args.checkpoint, robot)
     else:
@@ -109,12 +117,15 @@ def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
     return learner
 
 
-def read(path: Path, robot: Robot) -> Pairs:
-    """Return the paired messages of a bag, at least one, and say what was left out."""
+def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
+    """Return the paired messages of a bag, at least one, and say what was left out.
+
+    `namespace` is the arm's own where the bag has several.
+    """
     bag = Bag.open(path, unfinished=True)
     for reason in bag.unfinished:
         print(f'warning: {path}: unfinished: {reason}', file=sys.stderr)
-    streams = read_streams(bag, robot)
+    streams = read_streams(bag, robot, namespace)
     for reason, count in streams.rejected.items():
         print(f'warning: {path}: {count} messages rejected, {reason}', file=sys.stderr)
     pairs = streams.pairs()
@@ -153,10 +164,10 @@ def learn(
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors [rad]."""
+    """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors there [rad]."""
     tension = end_tension(mae.friction, recording.tension, directions(recording.length))
     estimate = mae.estimate(tension, recording.length).theta
-    return float(np.linalg.norm(estimate - recording.theta, axis=1).mean())
+    return float(np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1).mean())
 
 
 def table(errors: list[PairError], title: str) -> str:

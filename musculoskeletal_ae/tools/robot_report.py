@@ -47,6 +47,16 @@ def check(args: Namespace) -> int:
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
     if not (count and args.suggest):
         return 1 if count else 0
+    args.out.mkdir(parents=True)  # before the search, which takes minutes
+    try:
+        return _suggested(robot, args)
+    finally:
+        if not any(args.out.iterdir()):
+            args.out.rmdir()
+
+
+def _suggested(robot: Robot, args: Namespace) -> int:
+    """Search for a sound arm and write it; return the exit status of its check."""
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
     far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
     if not before:

@@ -30,12 +30,16 @@ def main(argv: list[str] | None = None) -> int:
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
     text = 'with --from-bag: network to start from (default: train one on the geometric model)'
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
+    text = 'with --from-bag: which arm, of bags that have several'
+    parser.add_argument('--from-namespace', metavar='NS', help=text)
     text = 'where to train; refused where torch computes nothing there (default: cpu)'
     parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
     parser.add_quick('a tenth of the training, to try things out')
     args = parser.parse_args(argv)
-    if not args.from_bag and (args.hold_out or args.checkpoint):
-        parser.error('--hold-out and --checkpoint go with --from-bag')
+    if not args.from_bag and (args.hold_out or args.checkpoint or args.from_namespace):
+        parser.error('--hold-out, --checkpoint and --from-namespace go with --from-bag')
+    if args.checkpoint and args.quick:
+        parser.error('--quick shortens the initial training: not with --checkpoint')
     learned = {path.resolve() for path in args.from_bag}
     if both := [str(path) for path in args.hold_out if path.resolve() in learned]:
         parser.error(f'{both[0]} is to be learned from and held out: name it after one option only')

@@ -5,10 +5,12 @@ import math
 
 import pytest
 
-from musculoskeletal_ae.bags.playback import LONGEST_LAG, Timeline, lap, window
+from bags.arm_bag import JOINTS, Arm, joints
+from musculoskeletal_ae.bags.playback import LONGEST_LAG, SHOWN, Timeline, lap, shown, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.robot.robot import Robot
 
 SECOND = 1_000_000_000
 
@@ -78,3 +80,34 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     # They are due at once, and do not turn back recorded time.
     assert {m.log_time for m in found[:5]} == {content[40].log_time - 1}
     assert [m.data for m in found[5:]] == [sample.data for sample in content[40:]]
+
+
+def motion(tmp_path, times, first=()):
+    """Return what an arm was shown at some times [s], after messages of other joints."""
+    arm = Arm(Robot.load('arm26'), count=1)
+    for at in first:
+        arm.add(f'/{SHOWN}', JOINTS, at, joints(['other'], [0.1]))
+    for at in times:
+        arm.add(f'/{SHOWN}', JOINTS, at, joints(['shoulder', 'elbow'], [0.5 + 0.1 * at, 1.0]))
+    bag = Bag.open(arm.write(tmp_path / 'bag'))
+    return shown(bag, f'/{SHOWN}', bag.start, bag.end)
+
+
+def test_what_was_shown_is_of_the_joints_that_most_messages_name(tmp_path):
+    taught = motion(tmp_path, [0.02 * k for k in range(1, 101)], first=(0.005, 0.01))
+    assert taught.joints == ('elbow', 'shoulder')
+    assert taught.theta[:, 0] == pytest.approx(1.0)
+    assert taught.theta[-1, 1] == pytest.approx(0.7, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ('times', 'told'),
+    [
+        ([0.1 * k for k in range(20)] + [14.0, 14.1], 'says nothing for 12.1 s after 1.9 s'),
+        ([0.9 * k for k in range(600)], 'goes on for 539 s, and a trajectory for 500 s at most'),
+        ([0.1, 0.2], 'no motion of at least'),
+    ],
+)
+def test_a_motion_that_no_controller_could_follow_is_refused(tmp_path, times, told):
+    with pytest.raises(BagError, match=told):
+        motion(tmp_path, times)

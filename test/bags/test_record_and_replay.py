@@ -9,6 +9,7 @@ from array import array
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
@@ -87,6 +88,25 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tool, graph, tmp_path):
     assert messages(tmp_path / 'bag', '') == kept
 
 
+def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
+    recorder = record(tool, graph, tmp_path / 'bag', '--ros-args', '-p', 'use_sim_time:=true')
+    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data='biceps_long'))
+    publisher = graph.publisher(Float64MultiArray, 'muscle_states')
+    message = Float64MultiArray(data=array('d', [1.0] * 18))
+    publisher.publish(message)
+    graph.spin(0.5)
+    clock = graph.publisher(Clock, '/clock')
+    clock.publish(Clock(clock=Time(sec=1000)))
+    graph.spin(0.5)
+    publisher.publish(message)
+    graph.spin(0.5)
+    output = recorder.end(signal.SIGINT)
+    assert '1 messages came before the first /clock' in output
+    bag = Bag.open(tmp_path / 'bag')
+    assert bag.start == bag.end == 1000 * 10**9
+    assert bag.message_count == 2
+
+
 def test_the_end_is_recorded_too_and_duration_ends_it(tool, graph, tmp_path):
     recorder = record(tool, graph, tmp_path / 'bag', '--duration', '2', '--topics', 'anomaly')
     assert '0 messages recorded' in recorder.output()
@@ -126,14 +146,16 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
     assert 'Traceback' not in output
 
 
-def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_path):
+@pytest.mark.parametrize('start', [0.0, 0.25])
+def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_path, start):
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     told = graph.listen(Float64MultiArray, 'replay/position')
-    tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *ros(graph))
+    begin = '--start', str(start * length)
+    tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
     graph.wait(lambda: told, 'where it is')
     where, whole = read_array(told[-1], 1, 2)  # as the page's timeline does
-    assert where == 0.0 and whole == pytest.approx(length)
+    assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
     graph.wait(lambda: told[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
@@ -187,8 +209,11 @@ def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
     [
         (replay_tool.parse, [], 'BAG'),
         (replay_tool.parse, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
-        (replay_tool.parse, ['bag', '--rate', '0', '--clock'], 'expected a number above 0'),
-        (replay_tool.parse, ['bag', '--rate', 'nan', '--clock'], 'expected a number above 0'),
+        (replay_tool.parse, ['bag', '--rate', '0', '--clock'], 'expected 0.001 to 1000'),
+        (replay_tool.parse, ['bag', '--rate', 'nan', '--clock'], 'expected 0.001 to 1000'),
+        (replay_tool.parse, ['bag', '--rate', '1e305', '--clock'], 'expected 0.001 to 1000'),
+        (replay_tool.parse, ['bag', '--check', '--loop'], 'plays nothing: without --loop'),
+        (replay_tool.parse, ['bag', '--check', '--start', '5'], 'plays nothing: without --start'),
         (replay_tool.parse, ['bag', '--start', '-1'], 'expected a number of at least 0'),
         (replay_tool.parse, ['bag', '--duration', 'inf'], 'expected a number above 0'),
         (replay_tool.parse, ['bag', '--topics', ','], "',': expected a name"),

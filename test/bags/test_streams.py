@@ -67,7 +67,7 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     bad = np.full(3 * robot.muscle_count, np.nan)
     arm.add('/muscle_states', ARRAY, 0.0051, array(bad))
     arm.add('/muscle_states', ARRAY, 0.0052, array(bad[1:]))
-    arm.add('/joint_states', JOINTS, 0.0053, joints(robot.joints[:1], [0.0]))
+    arm.add('/joint_states', JOINTS, 0.0053, joints(['other'], [0.0]))
     # Joints of another arm on the same topic, and any order, are legal.
     names = ['other', *reversed(robot.joints)]
     arm.add('/joint_states', JOINTS, 0.0054, joints(names, [9.0, *arm.theta[0, ::-1]]))
@@ -79,6 +79,29 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     }
     assert len(found.muscles.time) == 200
     assert_array_equal(found.joints.values[1], arm.theta[0])
+
+
+def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path):
+    offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
+    for at, zeros, spread in ((0.5, 0.0 * offset, surely + 1.0), (1.0, offset, surely)):
+        arm.add('/muscle_length_zeros', ARRAY, at - 0.001, array([zeros, spread]))
+    found = streams(arm, robot, tmp_path)
+    assert found.rejected == {'/muscle_states: zeros unknown': 50}
+    assert_allclose(found.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
+    assert_array_equal(found.muscles.values[:50, 0], arm.length[:50])
+    assert_allclose(found.muscles.values[50:, 0], arm.length[100:] - offset)
+
+
+def test_some_joint_sensors_will_do(robot, tmp_path):
+    arm = Arm(robot, order=[1, 0, *range(2, robot.muscle_count)])
+    for i, sample in enumerate(arm.content):
+        if sample.type == JOINTS:
+            read = joints(robot.joints[1:], arm.theta[i // 2, 1:])
+            arm.content[i] = sample._replace(data=read)
+    pairs = streams(arm, robot, tmp_path).pairs()
+    assert_array_equal(pairs.theta[:, 1:], arm.theta[:, 1:])
+    assert np.isnan(pairs.theta[:, 0]).all()
+    assert misplaced_muscles(pairs, robot) == []  # that is not known
 
 
 def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):

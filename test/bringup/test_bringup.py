@@ -182,6 +182,8 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
         (['--view', '--port', '65536'], '65536'),
         (['--read-only'], 'go with --view'),
         (['--hardware', '--reality', 'foreign'], 'of the emulator'),
+        (['--explore', '--no-controller'], 'moves the arm'),
+        (['--joint-source', 'none', '--no-learner'], 'for the learner'),
         (['--seed', '-1'], '-1'),
         (['--preset', 'best'], 'default or paper'),
         (['--reality', 'dream'], 'kin, foreign or an MJCF file'),

@@ -143,6 +143,14 @@ def test_joints_of_other_names_are_heard():
     assert 'missing joint' in str(verdict) and ROBOT.joints[0] in str(verdict)
 
 
+def test_some_joint_sensors_are_no_fault():
+    driver = Driver(ROBOT)
+    driver.names = 'other', ROBOT.joints[1]
+    verdict = driver.listen()
+    assert not verdict.faults
+    assert f'without θ of {ROBOT.joints[0]}:' in str(verdict)
+
+
 def test_modules_without_thermometers_are_no_fault():
     driver = Driver(ROBOT)
     driver.publish = scaled(1, 1, math.nan)
@@ -252,6 +260,11 @@ def with_tension(limit, most):
     bias = ROBOT.tension.bias
     full = np.ones(ROBOT.muscle_count)
     return Robot(replace(ROBOT.description, tension=TensionRange(bias, limit * full, most * full)))
+
+
+def test_a_sound_driver_may_be_asked_for_more_than_the_limit():
+    verdict = Driver(ROBOT).wind((BICEPS,), 400.0)
+    assert not verdict.faults, str(verdict)
 
 
 @pytest.mark.parametrize(

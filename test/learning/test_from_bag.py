@@ -54,6 +54,8 @@ def test_the_faults_of_a_recording_are_left_out_and_said(robot, capsys):
         (['--from-bag', str(BAGS / 'README.md')], 1, 'README.md'),
         (['--from-bag', str(BAGS / 'rupture'), '--robot', 'arm26'], 1, 'missing joint'),
         (['--hold-out', str(BAGS / 'rupture')], 2, '--from-bag'),
+        (['--from-namespace', 'left'], 2, 'go with --from-bag'),
+        (['--from-bag', 'a', '--checkpoint', 'b'], 2, 'not with --checkpoint'),
         (
             [
                 '--from-bag',

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import find_robot
@@ -48,6 +49,26 @@ def test_the_fit_recovers_known_constants(force, rate, wire_stretch):
         (fitted.force, fitted.rate, fitted.wire_stretch), (force, rate, wire_stretch), strict=True
     ):
         np.testing.assert_allclose(value, true, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('spring', 'wire'),
+    [(lambda t: t / 20e3, 0.0), (lambda t: 0.0 * t, 1e-5), (lambda t: t / 20e3, 1e-5)],
+)
+def test_springs_that_are_no_rubber_give_lines_that_muscles_yaml_takes(
+    tmp_path, capsys, spring, wire
+):
+    rows = [(t, a, spring(t) + wire * a * t) for t in (5.0, 50.0, 200.0) for a in (0.1, 0.3, 0.6)]
+    file = tmp_path / 'table.csv'
+    text = '\n'.join(','.join(map(repr, row)) for row in rows)
+    file.write_text(f'{",".join(tool.COLUMNS)}\n{text}\n')
+    assert tool.main([str(file)]) == 0
+    told = capsys.readouterr().out.splitlines()[0]
+    printed = yaml.safe_load(told)['series_elastic']
+    assert all(0.0 < value <= 1e8 for value in printed.values())
+    fitted = constants(**printed)
+    for t, a, x in rows:
+        assert fitted.elongation(np.array([a]), np.array([t]))[0] == pytest.approx(x, abs=2e-5)
 
 
 def test_a_table_that_cannot_pin_down_the_constants_is_refused():
