@@ -8,7 +8,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,7 @@ def train(args: Namespace) -> None:
         if not file.parent.is_dir() or file.is_dir():
             raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
         try:  # before the work, which takes minutes
-            TemporaryFile(dir=file.parent, prefix=f'.{file.name}.').close()
+            NamedTemporaryFile(dir=file.parent, prefix=f'.{file.name}.').close()
         except OSError as error:
             told = f'{file}: cannot be written ({error.strerror}); choose another place'
             raise MusculoskeletalError(told) from error

@@ -57,4 +57,8 @@ def test_it_warns_of_lengths_that_jump_before_it_trains(tmp_path, capsys, name):
 def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):
     assert main(['--robot', 'arm26', '--out', str(tmp_path / 'none' / 'x')]) == 1
     assert main(['--robot', 'arm26', '--out', str(tmp_path)]) == 1
-    assert capsys.readouterr().err.count('\n') == 2
+    assert main(['--robot', 'arm26', '--out', str(tmp_path / (250 * 'x'))]) == 1
+    assert main(['--robot', 'arm26', '--out', '/proc/x']) == 1
+    said = capsys.readouterr().err
+    assert said.count('\n') == 4
+    assert said.count('choose another place') == 2
