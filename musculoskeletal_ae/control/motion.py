@@ -27,7 +27,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.methods import Solution, msc_compensation, stiffness_command
-from musculoskeletal_ae.control.posture import REPLAN, Pull, Ramp, RestFeedback
+from musculoskeletal_ae.control.posture import Pull, Ramp, RestFeedback, another_plan
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.friction import slid
@@ -203,7 +203,7 @@ class MotionControl:
             if self.next[1] <= 0.0:
                 trajectory = self.next[0]
                 self._begin(trajectory, -self.next[1])
-        if np.abs(limit - self._limit).max() > REPLAN:
+        if another_plan(self._motor, self._limit, limit):
             self._limit = limit
             self.plan_anew()
         if self._resting is None:

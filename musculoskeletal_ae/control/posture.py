@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 # Share of a movement in which the command moves; the arm settles and is sampled in the rest.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # fastest over mean speed of a ramp
-REPLAN = 5.0  # [N] change of a tension limit that makes a held goal worth solving anew
+REPLAN = 5.0  # [N] change of a tension limit that a plan hangs on, for which it is made anew
 CORRECTION = 0.3  # [rad] at most, or times RACK [m]
 #: [m] at most: by what lengths can be off, and by what friction keeps of a wire that was wound in
 RELIEF = 0.01
@@ -61,6 +61,16 @@ class Ramp:
         self._elapsed += dt
         u = 1.0 if self.done else self._elapsed / self.duration
         return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
+
+
+def another_plan(tension: Array, before: Array, limit: Array) -> bool:
+    """Whether T [N] (M,), planned within one limit (M,), would be another within the other.
+
+    The limit of a warm muscle falls all the time; few pull as much, and what each rest has found
+    out would be lost.
+    """
+    hangs_on_it = tension > np.minimum(before, limit) - REPLAN
+    return bool((hangs_on_it & (np.abs(limit - before) > REPLAN)).any())
 
 
 class Pull(NamedTuple):
@@ -217,7 +227,8 @@ class PostureControl:
         θ is estimated, and `limit` the highest tension planned for each muscle [N].
         """
         self._remaining -= dt
-        if np.abs(limit - self._limit).max() > REPLAN and self._remaining <= 0.0:
+        held = self.solution if self._remaining <= 0.0 else None
+        if held is not None and another_plan(held.tension, self._limit, limit):
             self._limit = limit
             self._solve_again()
         if self._remaining <= 0.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from control_bench import DT, OTHER, REST, ROBOT, Bench, values
+from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -278,6 +278,26 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
     said = status.report(core, 12.0)
     assert said.level == 'warn'
     assert robot.muscles[strongest] in said.values['tension limited by heat']
+
+
+@pytest.mark.parametrize('target_duration', [0.0, 1.2])
+def test_a_muscle_that_warms_but_hardly_pulls_disturbs_no_rest(target_duration):
+    bench = Bench(first_duration=1.0, target_duration=target_duration)
+    bench.target(OTHER)
+    bench.theta = OTHER
+    bench.step(300)
+    core = bench.core
+    held, planned = (
+        (core.motion._resting, core.motion._motor)
+        if core.follows
+        else (core.posture.solution, core.posture.solution.tension)
+    )
+    weakest = int(np.argmin(planned))
+    bench.temperature = COLD + 45.0 * (np.arange(ROBOT.muscle_count) == weakest)
+    bench.step(100)
+    limit = core.watch.limit[weakest]
+    assert planned[weakest] + REPLAN < limit < ROBOT.tension.limit[weakest] - REPLAN
+    assert (core.motion._resting if core.follows else core.posture.solution) is held
 
 
 def test_the_correction_is_bounded_and_waits_until_the_arm_rests():
