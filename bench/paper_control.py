@@ -13,7 +13,9 @@ true body; the arm goes to a start with `first`, on to the target, and is read a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -137,9 +139,21 @@ def stages(robot: Robot, mae: Mae, name: str, theta: Array) -> list[tuple[Comman
 METHODS = ('geometric', 'first', 'second', *READINGS)
 
 
+@contextmanager
+def studied(args: Namespace, preset: str) -> Iterator[Study]:
+    """Make a study of the individuals that a bench is asked for, with the initial network."""
+    robot = Robot.load(args.robot)
+    with TemporaryDirectory() as folder:
+        study = Study(
+            robot, preset, args.seeds, args.minutes, args.quick, Path(folder), args.reality
+        )
+        checkpoint.save(initial_mae(robot, preset).mae, study.network_file(preset, None))
+        yield study
+
+
 def learned(study: Study, seed: int) -> Mae:
-    """Return what preset paper learns of an individual that explores with it."""
-    learner, loop = beginner(study, study.arm(seed), seed, 'paper')
+    """Return what the study's preset learns of an individual that explores with it."""
+    learner, loop = beginner(study, study.arm(seed), seed, study.preset)
     teach(learner, explore(loop, learner, 60.0 * study.minutes))
     return learner.mae
 
@@ -191,12 +205,8 @@ def main(argv: list[str]) -> None:
     parser.add_quick('one target and start')
     args = parser.parse_args(argv)
 
-    robot, rows = Robot.load(args.robot), []
-    with TemporaryDirectory() as folder:
-        study = Study(
-            robot, 'paper', args.seeds, args.minutes, args.quick, Path(folder), args.reality
-        )
-        checkpoint.save(initial_mae(robot, 'paper').mae, study.network_file('paper', None))
+    rows = []
+    with studied(args, 'paper') as study:
         for seed in args.seeds:
             rows.append(individual(study, seed))
             print(f'individual {seed}\n{table(rows[-1:])}\n', flush=True)

@@ -72,7 +72,7 @@ def read_start(file: Path, largest: int) -> bytes:
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file of at most `largest` bytes."""
     try:
-        return read_bytes(file, refuse, largest).decode('utf-8')
+        return read_bytes(file, refuse, largest).decode('utf-8-sig')  # tables of Windows
     except UnicodeDecodeError as error:
         raise refuse(file, f'is not text in UTF-8 (byte {error.start})') from error
 

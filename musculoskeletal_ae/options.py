@@ -34,6 +34,7 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.start import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
+PICTURES = ('.png', '.svg', '.pdf', '.jpg')
 T = TypeVar('T')
 
 
@@ -77,6 +78,11 @@ numbers = _type(
     lambda text: [*map(float, _listed(text))],
     lambda values: all(map(math.isfinite, values)),
     'numbers, as in 0,-0.5,1',
+)
+picture = _type(
+    Path,
+    lambda file: file.suffix.lower() in PICTURES and file.parent.is_dir(),
+    f'a file in a directory that exists, with one of the endings {", ".join(PICTURES)}',
 )
 names = _type(lambda text: [*filter(None, dict.fromkeys(_listed(text)))], bool, 'a name')
 
@@ -147,7 +153,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_plot(self, text: str) -> None:
         """Add `--plot`, a picture that `save_plot` saves where it is asked for."""
-        self.add_argument('--plot', type=Path, metavar='FILE.png', help=f'draw {text}')
+        self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')
 
 
 def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:

@@ -35,6 +35,11 @@ POSTURES = 300  # in which they are fitted
 # slider that follows a joint that turns would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 HAND = 'hand of the emulator'
+OF_MOTORS = (
+    *('actdim', 'actearly', 'actlimited', 'actrange', 'armature', 'biasprm', 'biastype'),
+    *('ctrllimited', 'ctrlrange', 'damping', 'delay', 'dynprm', 'dyntype', 'forcelimited'),
+    *('forcerange', 'gainprm', 'gaintype', 'gear', 'group', 'nsample'),
+)
 
 Place = tuple[int, Array]  # joint, and where in its frame [m]
 Obstacle = tuple[int, Array, Array]  # the same of its middle, and its axis
@@ -58,7 +63,8 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
         long = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD  # two axes in one place stay so
         place = at.translation + LENGTH_SPREAD * off[i, 0] * long
-        body = bodies[model.parents[i]].add_body(name=name, pos=place, quat=_turn(at.rotation))
+        moved = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
+        body = bodies[model.parents[i]].add_body(**moved)
         scale = np.exp(MASS_SPREAD * off[i, 1, 0])
         body.mass, body.explicitinertial = scale * inertia.mass, True
         body.ipos = inertia.lever + CENTRE_SPREAD * off[i, 2]
@@ -292,8 +298,15 @@ def _pulled(spec: Any, robot: Robot) -> Any:
     spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # A body that is thrown out of this world stays there until it is reset.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    # Nothing that a file says of its own actuators, by default or at its tendons, is of ours.
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    spec.option.disableactuator = 0
+    plain = mujoco.MjSpec().add_actuator()
+    motor = {name: getattr(plain, name) for name in OF_MOTORS}
     for muscle in robot.muscles:
-        spec.add_actuator(name=muscle, target=muscle, trntype=mujoco.mjtTrn.mjTRN_TENDON)
+        spec.tendon(muscle).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        motor |= {'name': muscle, 'target': muscle}
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_TENDON, **motor)
     return spec
 
 

@@ -255,6 +255,11 @@ class Arm(ABC):
         return self._muscle.tension.copy()
 
     @property
+    def end_tension(self) -> Array:
+        """True tensions where the wires act on bones [N], shape (M,)."""
+        return self._muscle.end_tension.copy()
+
+    @property
     def winding(self) -> Array:
         """True temperatures of the motors' windings [°C], shape (M,)."""
         return self._muscle.winding.copy()

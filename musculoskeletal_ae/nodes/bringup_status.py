@@ -116,6 +116,6 @@ def muscle_table(robot: Robot, states: Array | None, lines: Sequence[str]) -> An
     for name, limit, (length, tension, temperature) in rows:
         colour = 'blue' if tension < limit else 'dark_orange'
         bar = Bar(limit, 0.0, max(0.0, tension), width=30, color=colour)
-        table.add_row(name, whole(1e3 * length), whole(tension), bar, whole(temperature))
+        table.add_row(Text(name), whole(1e3 * length), whole(tension), bar, whole(temperature))
     texts = [Text(printable(lines[0])), Text(printable(lines[1]), style='bold red')]
     return Group(*filter(None, texts), table)

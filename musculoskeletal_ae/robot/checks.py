@@ -38,7 +38,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.files import read_csv
-from musculoskeletal_ae.robot.description import RobotDescription, shown
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, shown
 from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
@@ -56,6 +56,7 @@ MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N; 
 MATTERS_SHARE, MATTERS_LEAST = 0.1, 1e-4  # … of the longest at its joint, if that is less; [m]
 SHORT = 0.015  # [m]; shorter moment arms are off by half of it or more in emulated individuals
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
+TOUCHED = 1e-6  # [m] by which what a wire wraps round makes it longer; less is rounding
 LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
 WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
 DECLARATION_FILE = 'moment_arms.csv'
@@ -127,7 +128,12 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     result = judge(Setting.of(robot, theta))
     arms = result.moment_arms
-    suspicious = *_other_units(robot, arms), *_small_joints(robot, arms), *_jumping_muscles(robot)
+    suspicious = (
+        *_other_units(robot, arms),
+        *_small_joints(robot, arms),
+        *_jumping_muscles(robot),
+        *_idle_objects(robot, theta),
+    )
     return replace(result, warnings=(*result.warnings, *suspicious))
 
 
@@ -368,6 +374,25 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
             f'the length of muscle {robot.muscles[m]!r} jumps by {1e3 * size:.1f} mm where '
             f'its wire slips to the other side of what it wraps round, at {place}',
             'move its side, or a point beside it, until the wire stays on one side everywhere',
+        )
+
+
+def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
+    """What wires should wrap round, and touch in no posture."""
+    described = [
+        f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
+        f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
+        for muscle, route in zip(robot.muscles, robot.description.routes, strict=True)
+        for item in route
+        if isinstance(item, Wrap)
+    ]
+    touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > TOUCHED
+    if idle := [told for told, touches in zip(described, touched, strict=True) if not touches]:
+        yield Finding(
+            'idle_object',
+            f'wires touch in no posture what they should wrap round: {", ".join(idle)}',
+            'give its place and radius in metres, and let it hold no point of the wire inside it; '
+            'or remove it',
         )
 
 

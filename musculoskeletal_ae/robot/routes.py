@@ -147,9 +147,12 @@ class Routes:
     @_in_chunks
     def detours(self, theta: Array) -> Array:
         """Return what wrapping adds to straight lines [m]: θ (..., D) gives (..., M)."""
-        if self.objects is None:
-            return np.zeros((len(theta), len(self._sum)))
-        return np.subtract(*self._segments(theta)) @ self._sum.T
+        return self.wound(theta) @ self._sum[:, self.wrapping].T
+
+    @_in_chunks
+    def wound(self, theta: Array) -> Array:
+        """Return the same of each object, as described one after another: (..., W)."""
+        return np.subtract(*self._segments(theta))[:, self.wrapping]
 
     def relative_lengths(self, theta: Array) -> Array:
         """Return f_geo(θ) [m], zero at θ = 0: θ (..., D) gives (..., M)."""

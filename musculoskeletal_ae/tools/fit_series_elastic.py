@@ -66,7 +66,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m] (N,) best.
 
     Raises:
-        ValueError: If there are fewer than four rows, or they do not pin down three constants.
+        ValueError: If there are fewer than four rows, or they tell of no spring.
     """
     from scipy.optimize import least_squares
 
@@ -75,6 +75,8 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
         raise ValueError(f'a testbed table needs at least 4 finite rows, got {len(table)} rows')
     if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
+    if elongation @ (tension - tension.mean()) <= 0.0:
+        raise ValueError('elongation does not grow with tension; from where is it measured?')
 
     def model(log_constants: Array) -> SeriesElastic:
         return SeriesElastic(*np.exp(log_constants)[:, None])

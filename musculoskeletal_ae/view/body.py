@@ -61,17 +61,17 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
     """Return the meshes of a URDF's visuals, or capsules; and why any mesh was left out."""
     solids, notes = [], []
     root = ET.fromstring(robot.description.urdf)  # noqa: S314 - checked when it was loaded
-    for link in root.iter('link'):
+    for link in root.iterfind('{*}link'):  # those deeper are of plugins
         joint, at = robot.kinematics.placement(link.get('name', ''))
-        for visual in link.iterfind('visual'):
-            if (element := visual.find('geometry/mesh')) is None:
+        for visual in link.iterfind('{*}visual'):
+            if (element := visual.find('{*}geometry/{*}mesh')) is None:
                 continue
             try:
                 mesh = _read_mesh(robot.description.directory, element)
             except Exception as error:  # noqa: BLE001 - trimesh raises whatever a file brings about
                 notes.append(f'{element.get("filename")}: {error}')
                 continue
-            origin = visual.find('origin')
+            origin = visual.find('{*}origin')
             numbers = {'xyz': '0 0 0', 'rpy': '0 0 0'} | ({} if origin is None else origin.attrib)
             xyz, rpy = (np.array(numbers[key].split(), dtype=float) for key in ('xyz', 'rpy'))
             placed = at * pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)

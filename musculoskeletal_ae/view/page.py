@@ -288,7 +288,8 @@ class Page:
             gizmo = gui.add_checkbox('move the hand with the mouse', False)
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
             # A hundredth of the range, or less, so that ends are near the limits.
-            places = np.ceil(2.0 - np.log10(robot.upper - robot.lower)).astype(int).tolist()
+            spans = np.minimum(robot.upper - robot.lower, 100.0)
+            places = np.ceil(2.0 - np.log10(spans)).astype(int).tolist()
             steps = np.array([float(f'1e-{n}') for n in places])
             limits = np.ceil(robot.lower / steps) * steps, np.floor(robot.upper / steps) * steps
             self._sliders = [

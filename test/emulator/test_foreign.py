@@ -221,6 +221,29 @@ def test_a_users_model_plays_the_robot(imported):
     assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
 
 
+def test_what_a_file_says_of_its_own_actuators_is_not_of_the_modules(imported, tmp_path):
+    file, robot = imported
+    other, tendon = tmp_path / 'other.xml', '<spatial name="front"'
+    limits = 'ctrllimited="true" ctrlrange="0 1" forcelimited="true" forcerange="-2 2"'
+    default = f'<default><general gear="7" dyntype="filter" biastype="affine" {limits}/></default>'
+    off = '<option actuatorgroupdisable="0"><flag actuation="disable"/></option>'
+    text = bodies.MJCF.replace('<worldbody>', f'{default}{off}<worldbody>')
+    text = text.replace(tendon, f'{tendon} actuatorfrclimited="true" actuatorfrcrange="0 1"')
+    other.write_text(text, encoding='utf-8')
+    played = [
+        drive(make_arm(robot, 0, str(each)))[:, : robot.joint_count] for each in (file, other)
+    ]
+    np.testing.assert_allclose(*played, atol=1e-9)
+
+
+def test_joints_may_be_called_what_the_second_body_calls_things(tmp_path):
+    directory = write_robot(tmp_path)
+    for name in ('robot.urdf', 'muscles.yaml'):
+        text = (directory / name).read_text().replace('swing', 'world')
+        (directory / name).write_text(text.replace('lift', 'hand of the emulator'))
+    assert set(ForeignArm(Robot.load(directory), 0).robot.joints) > {'world'}
+
+
 def test_a_model_whose_lengths_are_others_is_told_by_muscle_and_millimetres(imported, tmp_path):
     file, robot = imported
     assert make_arm(robot, 0, str(file)).warnings == ()

@@ -87,9 +87,10 @@ def test_a_terminal_shows_every_muscle_and_the_trouble_where_rich_is_there(arm26
     console = pytest.importorskip('rich.console', reason='rich comes with ./bringup.sh --view')
     states = np.stack([np.linspace(-0.02, 0.03, 6), np.linspace(30.0, 250.0, 6), np.full(6, 41.0)])
     screen = console.Console(width=100, record=True, file=io.StringIO())
-    screen.print(muscle_table(arm26, states, ['error 0.1 rad', 'STOPPED']))
+    marked = SimpleNamespace(muscles=[f'{m} [/l]' for m in arm26.muscles], tension=arm26.tension)
+    screen.print(muscle_table(marked, states, ['error 0.1 rad', 'STOPPED']))
     text = screen.export_text()
-    assert all(name in text for name in arm26.muscles)
+    assert all(name in text for name in marked.muscles)
     assert 'STOPPED' in text and '250' in text and '█' in text
     assert open_screen() is None  # output is kept, not a terminal
 

@@ -404,10 +404,39 @@ finally:
         assert name in done.stdout
 
 
-@pytest.mark.parametrize('file', ['no/such/plot.png', 'plot.foo'])
-def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(file, tmp_path, capsys):
-    assert main(['arm26', '--plot', str(tmp_path / file)]) == 1
+@pytest.mark.parametrize('file', ['no/such/plot.png', 'plot.foo', 'plot'])
+def test_a_plot_that_cannot_be_is_refused_before_the_work(file, tmp_path, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        main(['arm26', '--plot', str(tmp_path / file)])
+    assert "plot': expected a file" in capsys.readouterr().err.replace('.png', '').replace(
+        '.foo', ''
+    )
+
+
+def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, capsys):
+    (tmp_path / 'plot.png').mkdir()
+    assert main(['arm26', '--plot', str(tmp_path / 'plot.png')]) == 1
     assert 'cannot be written' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'change', [{'radius': 30.0}, {'xyz': [0.0, 0.0, 300.0]}, {'radius': 0.045}]
+)
+def test_a_wire_that_touches_nowhere_what_it_should_wrap_round_is_told(change, tmp_path):
+    folder = copy_robot('arm26', tmp_path)
+    document = read_muscles(folder)
+    (route,) = (m['route'] for m in document['muscles'] if m['name'] == 'triceps_lateral')
+    place = next(n for n, item in enumerate(route) if item['link'] == 'forearm')
+    wrap = {'wrap': 'cylinder', 'link': 'forearm', 'xyz': [0, 0, 0], 'axis': [0, 1, 0]}
+    for given, kinds in (({}, []), (change, ['idle_object'])):
+        document['muscles'][3]['route'] = [
+            *route[:place],
+            wrap | {'radius': 0.03} | given,
+            *route[place:],
+        ]
+        warnings = check_robot(Robot.load(write_muscles(folder, document))).warnings
+        assert [warning.kind for warning in warnings] == kinds
+    assert 'triceps_lateral (cylinder of' in warnings[0].message
 
 
 def remedies_of(directory, kind, postures=60):

@@ -93,6 +93,15 @@ def test_the_tool_fits_the_shipped_table_to_its_noise(tmp_path, capsys):
     assert (tmp_path / 'fit.png').read_bytes().startswith(b'\x89PNG')
 
 
+def test_a_table_as_spreadsheets_save_it_is_read(tmp_path, capsys):
+    file = tmp_path / 'table.csv'
+    rows = [f'{t},{length},{t / 5000:.4f}' for length in (0.1, 0.3) for t in (5, 50, 100)]
+    text = '\n'.join(['tension,absolute_length,elongation', *rows])
+    file.write_text(text, encoding='utf-8-sig')
+    assert tool.main([str(file)]) == 0
+    assert 'series_elastic: {' in capsys.readouterr().out
+
+
 def test_the_example_never_overwrites_a_file(tmp_path, capsys):
     file = tmp_path / 'mine.csv'
     file.write_text('precious')
@@ -111,6 +120,10 @@ def test_the_example_never_overwrites_a_file(tmp_path, capsys):
         ('tension,absolute_length,elongation\n5,0.2\n', ['row 2', '3 finite numbers']),
         ('# c\ntension,absolute_length,elongation\n-5,0.2,0.1\n', ['row 3', 'tension >= 0']),
         ('tension,absolute_length,elongation\n5,0.2,0.001\n', ['at least 4']),
+        (
+            'tension,absolute_length,elongation\n5,0.2,0.02\n50,0.2,0.01\n5,0.3,0.02\n50,0.3,0\n',
+            ['does not grow'],
+        ),
     ],
 )
 def test_a_bad_table_is_refused_naming_file_and_row(tmp_path, capsys, text, fragments):

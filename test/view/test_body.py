@@ -115,7 +115,10 @@ def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path)
     )
     added = ''.join(visual.format(name) for name in ('box.stl', 'fifo.stl', 'none.stl', 'arm.dae'))
     name = '<link name="upper_arm">'
-    (folder / 'robot.urdf').write_text(urdf.replace(name, name + added))
+    urdf = urdf.replace('<robot ', '<robot xmlns="http://www.ros.org" ')
+    plugin = '<gazebo><plugin name="p"><link>upper_arm</link></plugin></gazebo></robot>'
+    urdf = urdf.replace(name, name + added).replace('</robot>', plugin)
+    (folder / 'robot.urdf').write_text(urdf)
     robot = Robot.load(folder)
     ((joint, mesh),), notes = link_solids(robot)
     assert robot.kinematics.model.names[joint] == 'shoulder'

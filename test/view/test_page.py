@@ -133,7 +133,7 @@ def test_muscles_are_shown_where_an_isolated_one_says_no_number(graph, view, arm
         page.close()
 
 
-@pytest.mark.parametrize('limits', [(0.001, 0.009), (0.0, 0.05), (-1.5, 2.0)])
+@pytest.mark.parametrize('limits', [(0.001, 0.009), (0.0, 0.05), (-1.5, 2.0), (0.0, 2000.0)])
 def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
     text, before = urdf.read_text(), 'lower="0.0" upper="0.05"'
