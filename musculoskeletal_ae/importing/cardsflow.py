@@ -21,6 +21,7 @@ from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.source import (
     KINDS,
     Source,
+    distinct,
     link_inertia,
     numbers,
     refuse,
@@ -102,10 +103,11 @@ def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
     """Read a URDF and invent a muscle, to be replaced, over each joint."""
     source, _ = _read_urdf(file, root)
     carried = {source.place(link)[0]: link for link in reversed(source.links)}
-    for i, joint in enumerate(source.model.names[1:], 1):
+    names = distinct(safe_name(f'muscle_of_{joint}', '') for joint in source.model.names[1:])
+    for i, name in enumerate(names, 1):
         ends = carried[source.model.parents[i]], carried[i]
-        source.routes[f'muscle_of_{joint}'] = tuple(RoutePoint(n, np.zeros(3)) for n in ends)
-        source.note('chosen', f'muscle_of_{joint}, origin to origin: replace it')
+        source.routes[name] = tuple(RoutePoint(n, np.zeros(3)) for n in ends)
+        source.note('chosen', f'{name}, origin to origin: replace it')
     return source
 
 

@@ -230,6 +230,10 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
+    named = bodies.URDF.format(mimic=mimic).replace('"shoulder"', '"shoulder, left"')
+    put(tmp_path, 'named.urdf', named)
+    assert main([str(tmp_path / 'named.urdf'), '--out', str(tmp_path / 'named')]) == 0
+    assert Robot.load(tmp_path / 'named').muscles == ('muscle_of_shoulder_left', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
     with pytest.raises(SourceError, match="there is no joint 'moon'"):
         read_source(file)
