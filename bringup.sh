@@ -313,7 +313,7 @@ if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
   rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
   check=(--robot "$robot" --rate "$rate" --wait --seconds 3)
-  ! grep -q '^    zero_at_start: *true' "$repository/config/nodes.yaml" || check+=(--unzeroed)
+  ! grep -qiE '^    zero_at_start: *(true|yes|on)' "$repository/config/nodes.yaml" || check+=(--unzeroed)
   launch check_driver "${check[@]}" "${remap[@]}"
   status=0
   watch_until_ended check_driver || status=$?

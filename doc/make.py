@@ -24,6 +24,7 @@ MODULES = {
     'robot/tension.py': ['holding_tension', 'least_tension'],
     'mae/mae.py': ['Mae'],
     'mae/units.py': ['State'],
+    'friction.py': ['FrictionDirection'],
     'mae/checkpoint.py': ['load', 'save', 'from_bytes', 'to_bytes'],
     'mae/training.py': ['initial_mae'],
     'estimation/estimator.py': ['Estimator', 'Estimate'],

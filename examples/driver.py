@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import rclpy
@@ -53,27 +54,31 @@ class Driver(Node):
         super().__init__('driver')
         self.robot = Robot.load(self.declare_parameter('robot', 'arm26').value)
         self.bus = Bus(self.robot)
-        self.target, self.told_at = None, -SILENCE  # l_target [m], and when it came [s]
+        # l_target [m] or T [N], whichever was commanded last, and when [s]
+        self.target, self.by_tension, self.told_at = None, False, -SILENCE
         self.pulled = np.full(self.robot.muscle_count, self.robot.tension.bias)
         self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
         self.joints = self.create_publisher(JointState, 'joint_states', 10)
-        self.create_subscription(Float64MultiArray, 'muscle_length_command', self.command, 10)
+        for kind in ('length', 'tension'):
+            follow = partial(self.command, by_tension=kind == 'tension')
+            self.create_subscription(Float64MultiArray, f'muscle_{kind}_command', follow, 10)
         self.create_timer(1.0 / RATE, self.tick)
 
-    def command(self, message: Float64MultiArray) -> None:
+    def command(self, message: Float64MultiArray, by_tension: bool) -> None:
         target = np.array(message.data)
         if len(target) == self.robot.muscle_count and np.isfinite(target).all():
-            self.target, self.told_at = target, time.monotonic()
+            self.target, self.by_tension, self.told_at = target, by_tension, time.monotonic()
 
     def tick(self) -> None:
         angle, tension, temperature, theta = self.bus.read()
         length = -SPOOL * angle
         bias, most = self.robot.tension.bias, self.robot.tension.max
         if self.target is not None and time.monotonic() - self.told_at < SILENCE:
-            wanted = bias + np.maximum(0.0, self.robot.stiffness * (length - self.target))
+            stretched = self.robot.stiffness * (length - self.target)
+            wanted = self.target if self.by_tension else bias + np.maximum(0.0, stretched)
         else:
             wanted = np.maximum(bias, self.pulled - RELEASE / RATE)
-        self.pulled = np.minimum(wanted, most)
+        self.pulled = np.clip(wanted, 0.0, most)
         self.bus.pull(self.pulled)
         rows = np.stack([length, tension, temperature])
         self.states.publish(array_message(rows, 'quantity', 'muscle'))

@@ -36,7 +36,7 @@ from musculoskeletal_ae.control.methods import FloatControl, TorqueControl, msc_
 from musculoskeletal_ae.control.motion import MotionControl, slowness
 from musculoskeletal_ae.control.posture import PostureControl, Pull
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import BY_TENSION, Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.control.watch import Watch
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
@@ -345,7 +345,7 @@ class Controller:
     @property
     def by_tension(self) -> TorqueControl | None:
         """What commands tensions now; None where lengths are commanded."""
-        if self.settings.method not in ('tension', 'float') or self.posture.exploring:
+        if self.settings.method not in BY_TENSION or self.posture.exploring:
             return None
         return self.floating if self.settings.method == 'float' else self.torque
 

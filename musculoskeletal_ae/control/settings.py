@@ -11,6 +11,7 @@ from musculoskeletal_ae.parameters import PRESET, settable
 
 UNREACHABLE = ('refuse', 'nearest')
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
+BY_TENSION = ('tension', 'float')  # which command tensions, the others lengths
 
 
 @dataclass(frozen=True)

@@ -261,6 +261,8 @@ def from_file(robot: Robot, file: Path) -> Any:
             spec.delete(tie)
     for joint in held:
         spec.delete(joint)
+    for joint in spec.joints:  # limits of what the file's own actuators do
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     _add_hand(spec.body(hand), pin.SE3.Identity())
     return _pulled(spec, robot)
 

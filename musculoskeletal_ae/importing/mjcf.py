@@ -212,7 +212,7 @@ class _Reader:
         if site >= 0:
             side = turn.T @ (data.site_xpos[site] - data.xpos[body])
             if m.site_bodyid[site] != body:
-                told = f'muscle {name}: side site {self.name("site", site)} is on another body'
+                told = f'muscle {name}: side site {m.site(site).name!r} is on another body'
                 self.source.note('approximated', f'{told}; taken where it is at the start')
         axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
         radius = float(m.geom_size[geom][0])

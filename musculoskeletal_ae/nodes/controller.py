@@ -27,7 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
@@ -51,14 +51,14 @@ class Controller(Shell):
         self.core = Core(self.robot, seed=self.parameter('seed'))
         self.recording = StopRecording(self.resolve_topic_name)
         self.latched = False  # the stop, as of the last step
-        for name in parameters_of(Settings):
-            check = self._check_stiffness if name == 'joint_stiffness' else None
-            self.follow_parameter(name, partial(self._configure, name), check)
         self.logged: list[str] = []
         self.publishers_of = {
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
         }
+        checks = {'joint_stiffness': self._check_stiffness, 'method': self._check_method}
+        for name in parameters_of(Settings):
+            self.follow_parameter(name, partial(self._configure, name), checks.get(name))
         self.follow_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
@@ -105,6 +105,18 @@ class Controller(Shell):
         # Before any other that is set with it: what those end would not come back.
         checked = replace(self.core.settings, joint_stiffness=value)
         checked.desired_stiffness(self.robot.joint_count)
+        return value
+
+    def _check_method(self, value: Any) -> Any:
+        followed = {
+            kind: publisher.get_subscription_count()
+            for kind, publisher in self.publishers_of.items()
+        }
+        if value in BY_TENSION and followed[LENGTH] and not followed[TENSION]:
+            # It would let the arm go, as if no commands came.
+            legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
+            told = f'{value!r}: the driver follows muscle_length_command only; legal: {legal}'
+            raise MusculoskeletalError(f'{told}; or let it follow muscle_tension_command, too')
         return value
 
     def _shift(self, known: bool, less: Array) -> None:

@@ -70,8 +70,14 @@ class Simulation:
         self.robot.isolate(muscles)
 
     def start_from(self, theta: Array) -> None:
-        """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten."""
+        """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten.
+
+        If they become more or fewer, wrenches and fixed angles are forgotten as well.
+        """
         robot = self.robot
+        if len(theta) != len(self.wrench):
+            self.wrench = np.zeros((len(theta), 6))
+            self.fixed = np.full((len(theta), robot.joint_count), np.nan)
         theta = np.clip(theta, robot.lower, robot.upper)
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)

@@ -58,7 +58,7 @@ Solid = tuple[int, trimesh.Trimesh]  # joint of pinocchio's tree, and what moves
 
 
 def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
-    """Return the meshes of a URDF's visuals, or capsules; and why any mesh was left out."""
+    """Return meshes of a URDF's visuals, capsules of links without, and what was left out."""
     solids, notes = [], []
     root = ET.fromstring(robot.description.urdf)  # noqa: S314 - checked when it was loaded
     for link in root.iterfind('{*}link'):  # those deeper are of plugins
@@ -76,7 +76,8 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
             xyz, rpy = (np.array(numbers[key].split(), dtype=float) for key in ('xyz', 'rpy'))
             placed = at * pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
             solids.append((joint, mesh.apply_transform(placed.homogeneous)))
-    return solids or _capsules(robot), notes
+    drawn = {joint for joint, _ in solids}
+    return [*solids, *(bone for bone in _capsules(robot) if bone[0] not in drawn)], notes
 
 
 def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:

@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import io
 import logging
+import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -62,9 +63,15 @@ class Page:
         self.looked_at = threading.Event()
         # A browser opens connections that it never uses; no traceback of each.
         logging.getLogger('websockets.server').setLevel(logging.CRITICAL)
+        try:  # viser waits for ever, or takes another port
+            family = socket.getaddrinfo(host, port)[0][0]
+            socket.create_server((host, port), family=family).close()
+        except OSError as error:
+            told = f'no page at port {port} of {host}: {error.strerror}'
+            raise MusculoskeletalError(f'{told}; choose another --port or --host') from error
         with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
             server = self._server = viser.ViserServer(host, port, verbose=False)
-        if server.get_port() != port:
+        if server.get_port() != port:  # somebody was faster
             server.stop()
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
         # A tunnel to the world is nothing that a visitor may ask for.
@@ -88,12 +95,12 @@ class Page:
 
     async def _check_origin(self, connection: Any) -> None:
         """Turn away pages of other sites, which a browser lets connect to localhost."""
-        socket = self._server._websock_server._live_connections[connection.client_id]
-        asked, origin = (socket.request.headers.get(key, '') for key in ('Host', 'Origin'))
+        opened = self._server._websock_server._live_connections[connection.client_id]
+        asked, origin = (opened.request.headers.get(key, '') for key in ('Host', 'Origin'))
         came = urlsplit(origin)
         foreign = self._host in LOCAL and came.hostname not in LOCAL
         if origin and (came.netloc != asked or foreign):
-            await socket.close(1008, 'another site')
+            await opened.close(1008, 'another site')
             raise ConnectionError(f'a page of {origin} was turned away')
 
     def _count(self, visitor: int, here: bool) -> None:

@@ -228,6 +228,8 @@ def test_what_a_file_says_of_its_own_actuators_is_not_of_the_modules(imported, t
     default = f'<default><general gear="7" dyntype="filter" biastype="affine" {limits}/></default>'
     off = '<option actuatorgroupdisable="0"><flag actuation="disable"/></option>'
     text = bodies.MJCF.replace('<worldbody>', f'{default}{off}<worldbody>')
+    joint = '<joint name="lift"'
+    text = text.replace(joint, f'{joint} actuatorfrclimited="true" actuatorfrcrange="-1 1"')
     text = text.replace(tendon, f'{tendon} actuatorfrclimited="true" actuatorfrcrange="0 1"')
     other.write_text(text, encoding='utf-8')
     played = [

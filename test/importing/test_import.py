@@ -97,6 +97,13 @@ def test_a_side_site_on_the_axis_means_what_mujoco_makes_of_it(mjcf, tmp_path, t
     assert max(import_robot(mjcf, tmp_path / 'out').errors.values()) < 1e-6
 
 
+def test_a_side_site_on_another_body_is_taken_where_it_is_at_the_start(mjcf, tmp_path):
+    mjcf.write_text(mjcf.read_text().replace('sidesite="side"', 'sidesite="o2"'))
+    notes = import_robot(mjcf, tmp_path / 'out').notes
+    told = "muscle stretch: side site 'o2' is on another body; taken where it is at the start"
+    assert f'approximated: {told}' in notes
+
+
 COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
 
 

@@ -74,7 +74,7 @@ def test_limits_in_degrees_are_suspected(tmp_path, capsys, low, high, told):
     urdf = write_robot(tmp_path / 'arm') / 'robot.urdf'
     old = 'lower="-1.6" upper="-0.2"'
     urdf.write_text(urdf.read_text().replace(old, f'lower="{low}" upper="{high}"'))
-    _, out, _ = verdict(capsys, urdf.parent)
+    _, out, _ = verdict(capsys, urdf.parent, '--postures', 50)
     assert ('not degrees' in out) == bool(told)
     assert told in out
 

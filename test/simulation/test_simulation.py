@@ -260,6 +260,15 @@ def test_on_a_network_one_arm_and_a_batch_agree(arm26, mae):
             np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-5, atol=1e-5)
 
 
+def test_more_or_fewer_arms_are_not_pushed_by_what_pushed_others(arm26, mae):
+    simulation = Simulation(arm26, mae, arms=2)
+    simulation.wrench[:, 2], simulation.fixed[:, 0] = -10.0, -0.3
+    for arms in (4, 1):
+        simulation.start_from(np.zeros((arms, arm26.joint_count)))
+        free = Simulation(arm26, mae, arms=arms).step(0.02)
+        np.testing.assert_allclose(simulation.step(0.02).theta, free.theta, atol=1e-9)
+
+
 @pytest.mark.parametrize('preset', ['default', 'paper'])
 def test_a_nonsense_network_moves_it_within_its_limits_only(arm26, mae, preset):
     rng = np.random.default_rng(5)

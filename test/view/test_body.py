@@ -120,8 +120,9 @@ def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path)
     urdf = urdf.replace(name, name + added).replace('</robot>', plugin)
     (folder / 'robot.urdf').write_text(urdf)
     robot = Robot.load(folder)
-    ((joint, mesh),), notes = link_solids(robot)
-    assert robot.kinematics.model.names[joint] == 'shoulder'
+    ((joint, mesh), (other, _)), notes = link_solids(robot)
+    # A capsule of the forearm, which has no mesh.
+    assert [robot.kinematics.model.names[j] for j in (joint, other)] == ['shoulder', 'elbow']
     np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.05, -0.2], [0.05, 0.05, 0.0]])
     assert [any(word in note for note in notes) for word in ('no regular', 'No such', '.stl, .obj')]
     assert len(notes) == 3

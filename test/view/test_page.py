@@ -14,6 +14,7 @@ from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
@@ -167,6 +168,11 @@ def test_whoever_leaves_while_pushing_pushes_no_longer(arm26):
     assert what == 'push' and not force.any()
 
 
+def test_an_address_that_is_not_of_this_machine_is_refused(arm26):
+    with pytest.raises(MusculoskeletalError, match=r'no page at port \d+ of 192\.0\.2\.1: Cannot'):
+        Page(arm26, '192.0.2.1', free_port(), False, lambda *_: None)
+
+
 def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     port = view('--read-only')
     for origin in ('http://evil.example', f'http://evil.example:{port}', 'null'):
@@ -177,4 +183,5 @@ def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
     status, output = second.ended()
     assert status == 1
-    assert f'port {port} of 127.0.0.1 is in use' in output and 'Traceback' not in output
+    told = f'error: no page at port {port} of 127.0.0.1: Address already in use'
+    assert told in output and 'Traceback' not in output

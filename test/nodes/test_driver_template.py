@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The driver to start from, and what the controller asks of any."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from graph import Process
+from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.robot.robot import Robot
+
+TEMPLATE = Path(__file__).parents[2] / 'examples' / 'driver.py'
+ROBOT = Robot.load('arm26')
+
+
+def test_it_follows_lengths_and_tensions_whichever_came_last(graph):
+    command = [sys.executable, str(TEMPLATE), '--ros-args', '-r', f'__ns:={graph.namespace}']
+    graph.processes.append(Process('driver.py', command))
+    graph.listen(Float64MultiArray, 'muscle_states')
+
+    def read():
+        return np.reshape(graph.next('muscle_states').data, (3, -1))
+
+    bias, known = ROBOT.tension.bias, read()[0]
+    lengths = known - 50.0 / ROBOT.stiffness
+    for kind, value, least, most in (
+        ('length', lengths, bias + 5.0, bias + 60.0),
+        ('tension', np.full(len(bias), 120.0), bias + 75.0, bias + 95.0),
+        ('length', lengths + 1.0, bias - 10.0, bias + 10.0),
+    ):
+        publisher = graph.publisher(Float64MultiArray, f'muscle_{kind}_command')
+
+        def pulled(publisher=publisher, value=value, least=least, most=most):
+            publisher.publish(Float64MultiArray(data=value.tolist()))
+            tension = read()[1]
+            return (least < tension).all() and (tension < most).all()
+
+        graph.wait(pulled, f'{kind}s to be followed')
+
+
+def test_nothing_commands_tensions_that_no_driver_follows(graph):
+    core = graph.host(Controller, robot='arm26').core
+    graph.listen(Float64MultiArray, 'muscle_length_command')
+    graph.wait(lambda: not graph.set_parameter('controller', 'method', 'float')[0], 'a refusal')
+    done, reason = graph.set_parameter('controller', 'method', 'tension')
+    assert not done and 'follows muscle_length_command only; legal: geometric, first' in reason
+    assert core.settings.method in ('proposed', 'float')  # before the subscription was seen
+    graph.listen(Float64MultiArray, 'muscle_tension_command')
+    graph.wait(lambda: graph.set_parameter('controller', 'method', 'tension')[0], 'no refusal')
