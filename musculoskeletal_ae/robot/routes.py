@@ -152,6 +152,8 @@ class Routes:
     @_in_chunks
     def wound(self, theta: Array) -> Array:
         """Return the same of each object, as described one after another: (..., W)."""
+        if self.objects is None:
+            return np.zeros((len(theta), 0))
         return np.subtract(*self._segments(theta))[:, self.wrapping]
 
     def relative_lengths(self, theta: Array) -> Array:
