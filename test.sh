@@ -31,6 +31,8 @@ wait
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 export ROS_DOMAIN_ID=$(($$ % 33 * 3 + 1)) # and the next two: each process of pytest has its own
 export ROS_LOG_DIR=$repository/log/test
+# Its processes take all cores: torch's threads would only fight for them.
+export OMP_NUM_THREADS=1
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"
 exec "$python" -m pytest -n 3 --dist worksteal "$@"

@@ -45,6 +45,7 @@ OFFSET, OUTSIDE = 0.1, 0.05  # [m] of a zero before anything is known; [rad] bey
 FREEDOM = 4.0  # of the Student distribution
 #: postures drawn and tried as the first one, moments that tell how good they are, and those pursued
 DRAWN, POSTURES, TOLD_BY, SHORTLIST, PURSUED = 3200, 400, 24, 30, 6
+TOGETHER = 20  # of those tried, at one message
 COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: deviations that count little or much in that choice
 FARTHEST = 0.3  # [m] of a zero; [rad] of a step
 ROUNDS, FIRST_ROUNDS = 20, 6
@@ -267,15 +268,18 @@ class Zeroing:
         offset = seen.length[0] - mae.lengths(first, pull)
         largest = np.abs(offset * self._used).max(axis=1)
         offset = offset[np.argsort(largest)[: max(PURSUED, int((largest < FARTHEST).sum()))]]
-        cost, postures = np.empty(len(offset)), []
-        for n, zero in enumerate(offset):
-            theta = mae.estimate(few.tension, few.length - zero).theta
-            left = self._used * (few.length - zero - mae.lengths(theta, few.tension))
+        cost, postures = np.empty(len(offset)), list[Array]()
+        for n in range(0, len(offset), TOGETHER):
+            zero = offset[n : n + TOGETHER, None]
+            length = few.length - zero
+            pull = np.broadcast_to(few.tension, length.shape)
+            theta = mae.estimate(pull, length).theta
+            left = self._used * (length - mae.lengths(theta, pull))
             parts = left / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
-            cost[n] = sum(np.log1p(each**2).sum() for each in parts)
-            postures.append(theta)
-            if n % 20 == 19:
-                yield
+            counted = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
+            cost[n : n + TOGETHER] = np.sum(counted, axis=0)
+            postures.extend(theta)
+            yield
         order = np.argsort(cost)[:SHORTLIST]
         for n in order:
             torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE[1]
