@@ -6,7 +6,8 @@ python -m bench told [--robot …] [--reality foreign] [--seeds 0,1,2,3,4] [--qu
 Targets, starts and networks are those of `experiment control`. What is told replaces what was
 estimated at every message: the true θ, then the true G of where the network is asked, and the true
 T_end as well. `harder` lets the feedback at rest correct four times as fast and three times as far.
-Stuck: more than 0.4 rad off; ‖T‖ is beside the least that holds the target with the true G.
+Stuck: more than 0.4 rad off; ‖T‖ is beside the least that holds the target with the true G. Where θ
+is told, what the estimate is off by is still that of the estimate nobody asked.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ class ToldLoop(ClosedLoop):
     """A closed loop whose controller is told the truth in the place of estimates."""
 
     told = Told()
+    off = 0.0  # of the estimate [rad]
 
     def tell(self, told: Told, mae: Mae) -> None:
         """Tell it so much from now on; the network is the one that was learned."""
@@ -78,6 +80,7 @@ class ToldLoop(ClosedLoop):
     def estimate(self, read: Readings, now: float) -> Array:
         """Return θ [rad] (D,), estimated or true; the tensions were taken before."""
         arm, core, found = self.arm, self.core, super().estimate(read, now)
+        self.off = float(np.linalg.norm(found - arm.theta))
         if self.told.body:
             pull, lost = core._pull.motor, arm.end_tension / np.maximum(arm.tension, 1e-3)
             core._pull = Pull(pull, pull * lost)
@@ -85,7 +88,7 @@ class ToldLoop(ClosedLoop):
 
 
 def approaches(arm: Arm, mae: Mae, seed: int, count: int, told: Told) -> Array:
-    """Return distance from the target [rad] and ‖T‖ beside its bound, (count², 2)."""
+    """Return distance from the target, of the estimate [rad], ‖T‖ beside its bound, (count², 3)."""
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures, ends = robot.random_postures(TRIES, rng), list[tuple[Any, Any]]()
     for theta, least in holdable_postures(robot, postures, count, arm.individual.muscle_jacobian):
@@ -97,7 +100,7 @@ def approaches(arm: Arm, mae: Mae, seed: int, count: int, told: Told) -> Array:
             loop.tell(told, mae)
             loop.approach(theta, DURATION)
             beside = np.linalg.norm(arm.tension) / np.linalg.norm(least)
-            ends.append((np.linalg.norm(arm.theta - theta), beside))
+            ends.append((np.linalg.norm(arm.theta - theta), loop.off, beside))
     return np.array(ends)
 
 
@@ -110,18 +113,18 @@ def individual(study: Study, seed: int) -> dict[str, Array]:
 
 
 def table(rows: list[dict[str, Array]]) -> str:
-    """Return what individuals reach: means over approaches that are not stuck."""
+    """Return the median of each individual, and means over all approaches that are not stuck."""
     lines = [
-        '| told | median of each individual [rad] | stuck | others [rad] | their ‖T‖ / bound |',
-        '|---|---|---|---|---|',
+        '| told | medians [rad] | stuck | others [rad] | their estimate [rad] | ‖T‖ / bound |',
+        '|---|---|---|---|---|---|',
     ]
     for name in ROWS:
         medians = ', '.join(f'{np.median(row[name][:, 0]):.3f}' for row in rows)
         ends = np.concatenate([row[name] for row in rows])
         free = ends[:, 0] < STUCK
-        error, tension = ends[free].mean(axis=0) if free.any() else (np.nan, np.nan)
+        error, off, tension = ends[free].mean(axis=0) if free.any() else [np.nan] * 3
         stuck = f'{(~free).sum()} of {len(ends)}'
-        lines.append(f'| {name} | {medians} | {stuck} | {error:.3f} | {tension:.2f} |')
+        lines.append(f'| {name} | {medians} | {stuck} | {error:.3f} | {off:.3f} | {tension:.2f} |')
     return '\n'.join(lines)
 
 

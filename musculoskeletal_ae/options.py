@@ -143,12 +143,16 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--quick', action='store_true', help=text)
 
     def add_out(
-        self, metavar: str, text: str = 'where to write', default: Path | None = None
+        self,
+        metavar: str,
+        text: str = 'where to write',
+        default: Path | None = None,
+        read: Callable[[str], Path] = Path,
     ) -> None:
         """Add `--out`, a file or directory; without a default it must be given."""
         required = default is None
         self.add_argument(
-            '--out', type=Path, metavar=metavar, default=default, required=required, help=text
+            '--out', type=read, metavar=metavar, default=default, required=required, help=text
         )
 
     def add_plot(self, text: str) -> None:
@@ -167,11 +171,11 @@ def save_figure(figure: Any, file: Path) -> None:
     """Save a figure of matplotlib.
 
     Raises:
-        MusculoskeletalError: If it cannot be written, or the file's ending is none of a picture.
+        MusculoskeletalError: If it cannot be written.
     """
     try:
         figure.savefig(file, dpi=110)
-    except (OSError, ValueError) as error:  # a ValueError is an ending of no picture
+    except OSError as error:
         raise MusculoskeletalError(f'picture {file} cannot be written: {error}') from error
 
 

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import SENSOR
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
-from musculoskeletal_ae.options import Parser, positive
+from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 
@@ -51,7 +51,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
 
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
-    parser.add_out('FILE.png', default=Path('arm.png'))
+    parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     parser.add_argument('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
     parser.add_argument(
         '--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]'

@@ -168,7 +168,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         series_elastic=SeriesElastic(**_columns(elastic, default)),
         stiffness=_columns(module, 'K')['K'],
         tension=TensionRange(**_columns(module, TENSION_DEFAULT)),
-        end_effectors=_read_end_effectors(top, model, joints),
+        end_effectors=_read_end_effectors(top, model, joints, couplings),
         couplings=couplings,
         warnings=tuple(warnings),
     )
@@ -318,18 +318,32 @@ def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
     return {'bias': bias, 'limit': limit, 'max': most}
 
 
-def _read_end_effectors(top: Entry, model: pin.Model, joints: tuple[str, ...]) -> tuple[str, ...]:
+def _read_end_effectors(
+    top: Entry, model: pin.Model, joints: tuple[str, ...], couplings: Iterable[str]
+) -> tuple[str, ...]:
     one, several = top.get('end_effector'), top.get('end_effectors')
-    links = [str(frame.name) for frame in body_frames(model)]
+    moved, links = _joints_above(model, {*joints, *couplings}), _joints_above(model, {*joints})
     if one.value is not None and several.value is not None:
         raise several.fail('expected end_effector or end_effectors, both are given')
+
+    def read(item: Entry) -> str:
+        name = _read_link(item, list(links))
+        if not moved[name]:
+            legal = ', '.join(link for link in links if moved[link])
+            raise item.fail(f'expected a link that the joints move, {legal}; got {name!r}')
+        return name
+
     if one.value is not None:
-        return (_read_link(one, links),)
+        return (read(one),)
     if several.value is not None:
-        return several.unique([_read_link(item, links) for item in several.items(1, 'links')])
-    # The last link of the chain: the one with the most of our joints above it, and of several
-    # on the same joint the one listed last.
+        return several.unique([read(item) for item in several.items(1, 'links')])
+    # The last link of the chain: of several on the same joint the one listed last.
+    return (max(reversed(links), key=links.__getitem__),)
+
+
+def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
+    """Return how many of these joints move each link."""
     depth = [0]
     for i in range(1, model.njoints):
-        depth.append(depth[model.parents[i]] + (model.names[i] in joints))
-    return (str(max(reversed(body_frames(model)), key=lambda link: depth[link.parentJoint]).name),)
+        depth.append(depth[model.parents[i]] + (model.names[i] in names))
+    return {str(link.name): depth[link.parentJoint] for link in body_frames(model)}

@@ -114,10 +114,15 @@ def write(robot: Robot, change: Array, out: Path) -> None:
     for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
         muscle['route'] = [written(item) for item in route]
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+    # Meshes come along, wherever they lie in the directory; what is written may lie there too.
+    skipped = out.resolve()
+    shutil.copytree(
+        here,
+        out,
+        ignore=lambda folder, names: [n for n in names if Path(folder, n).resolve() == skipped],
+        dirs_exist_ok=True,
+    )
     (out / 'muscles.yaml').write_text(text, encoding='utf-8')
-    for file in ('robot.urdf', checks.DECLARATION_FILE):
-        if (here / file).exists():
-            shutil.copyfile(here / file, out / file)
     middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
     lines = []
     for was, now in zip(*(draw_arm(each, middle, bias) for each in (robot, after)), strict=True):

@@ -90,6 +90,10 @@ BAD = {
     'tension key': (put(['tension', 'min'], 1.0), ["'min'", 'bias, limit, max']),
     'tension order': (put(['tension', 'limit'], 20.0), ['bias < limit <= max', '20']),
     'tension above max': (put(['tension', 'limit'], 600.0), ['bias < limit <= max', '600']),
+    'end effector at rest': (
+        put(['end_effector'], 'torso'),
+        ["'torso'", 'that the joints move, upper_arm, forearm, hand'],
+    ),
     'end effector': (put(['end_effector'], 'claw'), ["'claw'", 'torso, upper_arm, forearm, hand']),
 }
 

@@ -61,12 +61,15 @@ def suggest(arm, out, *more):
 
 
 def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys):
-    arm, out, reach = poor_arm(tmp_path / 'arm'), tmp_path / 'better' / 'arm', 0.02
+    arm, reach = poor_arm(tmp_path / 'arm'), 0.02
+    out, mesh = arm / 'better', arm / 'meshes' / 'hand.stl'
+    mesh.parent.mkdir()
+    mesh.write_bytes(b'solid')
     before = check_robot(Robot.load(arm), 400, seed=9)
     assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # the premise
     assert suggest(arm, out, '--reach', reach) == 0
     printed = capsys.readouterr().out
-    assert 'arm: sound' in printed
+    assert 'better: sound' in printed
     assert 'changes the sign of its main action' not in printed.split(str(out))[1]
     # In postures that neither the search nor the check above has seen.
     assert check_robot(Robot.load(out), 400, seed=9).faults == ()
@@ -74,9 +77,10 @@ def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys)
     assert 0.0 < distance.max() < reach
     assert np.median(distance) < 1e-8  # most stay where they were
     assert without_points(out) == without_points(arm)
-    for name in ('robot.urdf', 'moment_arms.csv'):
+    for name in ('robot.urdf', 'moment_arms.csv', 'meshes/hand.stl'):
         assert (out / name).read_bytes() == (arm / name).read_bytes()
     assert (out / 'suggestion.png').read_bytes().startswith(b'\x89PNG')
+    assert not (out / 'better').exists()
 
 
 def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(tmp_path, capsys):
