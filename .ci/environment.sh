@@ -322,6 +322,8 @@ build_package() {
 
 environment_setup() { # [test|view]
   local lock
+  # Many containers set it; a dozen processes would each compile all of torch's sources.
+  unset PYTHONDONTWRITEBYTECODE
   # Where HOME cannot be written (containers), caches and logs go into the repository.
   if [ ! -d "${HOME-}" ] || [ ! -w "${HOME-}" ]; then
     export XDG_CACHE_HOME=$repository/.cache PIP_CACHE_DIR=$repository/.cache/pip
