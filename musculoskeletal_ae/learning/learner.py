@@ -157,8 +157,11 @@ class Learner:
         self.gate.message(tension, length, self._gate_time)
         if self._mae is not None and not self._rests.anomaly:
             self._torque.step(tension, length, dt)
-        for rest in self._rests.step(tension, length, dt, theta):
+        before = self._healthy.time
+        rests = self._rests.step(tension, length, dt, theta)
+        if self._healthy.time > before:
             self._spoiled |= ~used
+        for rest in rests:
             self._healthy.rest(rest)
             if self.samples.is_new(rest):
                 self.accept(rest)

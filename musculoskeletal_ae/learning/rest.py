@@ -89,9 +89,19 @@ class RestDetector:
         angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
         if min(map(len, angles)) < LEAST_READINGS:
             return self.blind
-        read = np.isfinite(angles[0][0])  # a robot has a sensor at a joint or has none
-        allowed = np.broadcast_to(self.settings.rest_joint_rate * half * self._radian, read.shape)
-        return _unmoved([part[:, read] for part in angles], allowed[read])
+        known = [np.isfinite(part) for part in angles]
+        enough = np.min([part.sum(axis=0) for part in known], axis=0) >= LEAST_READINGS
+        if not enough.any():
+            return self.blind
+        rate = self.settings.rest_joint_rate * half * self._radian
+        allowed, whole = np.broadcast_to(rate, enough.shape), known[0].all(0) & known[1].all(0)
+        # Of some joints only some messages tell, as where two nodes publish some joints each.
+        some = (
+            [a[k[:, j], j] for a, k in zip(angles, known)] for j in np.flatnonzero(enough & ~whole)
+        )
+        return _unmoved([part[:, whole] for part in angles], allowed[whole]) and all(
+            map(_unmoved, some, allowed[enough & ~whole])
+        )
 
 
 def _measured(reading: Sample) -> bool:

@@ -69,3 +69,14 @@ def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
     learner.isolate((LOST,))
     learner.anomaly(False)
     assert learner.mae.isolated == (LOST,)
+
+
+def test_what_moves_while_a_muscle_is_isolated_is_no_healthy_message_of_it(arm26, initial, stage):
+    learner = Learner(arm26, initial, training=Prepared)
+    _, tension, length = stage.states(500)
+    learner.isolate((LOST,))
+    for n, row in enumerate(zip(tension, length)):
+        learner.muscles(0.02 * n, *row)
+    assert len(learner._healthy.healthy().messages)
+    learner.isolate(())
+    assert not len(learner._healthy.healthy().messages)

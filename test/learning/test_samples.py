@@ -24,7 +24,7 @@ SLIDES = np.array([1.0, RACK])  # what counts as a radian where the second of tw
 
 
 def reading(theta, length):
-    return Sample(np.full(2, theta), np.full(6, 50.0), np.full(6, length), np.zeros(6))
+    return Sample(np.broadcast_to(theta, 2), np.full(6, 50.0), np.full(6, length), np.zeros(6))
 
 
 def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=lambda _: True):
@@ -35,6 +35,19 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
         if rest is not None:
             found.append(rest)
     return found
+
+
+def each_some(t, still=True):
+    """Return θ as two nodes publish it by turns, each for one joint."""
+    angles = np.array([0.3, 0.3 if still else 0.3 + 0.05 * t])
+    angles[round(t / 0.01) % 2] = np.nan
+    return angles
+
+
+def test_where_two_nodes_publish_some_joints_each_all_are_averaged():
+    (found, *_) = run(RestDetector(DEFAULT), 3.5, each_some)
+    np.testing.assert_allclose(found.theta, [0.3, 0.3])
+    assert run(RestDetector(DEFAULT), 3.5, lambda t: each_some(t, still=False)) == []
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
