@@ -360,6 +360,8 @@ class Controller:
         dt, awake, paused = self.watch.step(now, now if time is None else time, stopped)
         self._starts |= paused
         late, cause = self.watch.late(now), self.watch.present_cause(now)
+        # An estimator that starts anew knows of no suspect, and says that there is no anomaly.
+        self._verifies &= not late.startswith('estimated')
         # Before the first command there is nothing to stop.
         self.follows &= not (cause or self.safety.cause)
         if cause and self.safety.command is not None:

@@ -111,8 +111,14 @@ class Estimator:
         self._whole, self.mae = mae, less
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Go on without these muscles, places in T and l, and with all others."""
+        """Go on without these muscles, places in T and l, and with all others.
+
+        A suspect among the others is verified no longer; what was detected stays.
+        """
         self._robot.isolate(muscles)
+        suspect = self._verification
+        if suspect is not None and self._robot.used[suspect.muscle]:
+            self._verification = None
         if self._whole is not None:
             self.use(self._whole)
         self.detector.reset()

@@ -68,7 +68,6 @@ class Estimator(Shell):
         self.posture: tuple[float, ...] = ()
         self.follow_parameter('zero_posture', self._take_posture)
         self.unzeroed = self.parameter('zero_at_start')
-        self.zeros = self.core.zeros
         if self.unzeroed:  # nobody moves on what sensors say before the network is there
             self.core.zeros = Zeros.unknown(self.robot.muscle_count)
         self.follow_parameter('isolate_muscles', self._choose_muscles)

@@ -362,14 +362,25 @@ class Shell(Node):
         return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
     def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
-        """Take the estimator's zeros; tell whether they are known now, and how much less l is."""
+        """Take the estimator's zeros; tell whether they are known now, and how much less l is.
+
+        Known ones that are not those known before come from an estimator that starts anew and
+        has not heard of them: nothing is known then, until it finds them.
+        """
+        heard = Zeros.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
+            nonlocal heard
             if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
                 told = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
                 raise MessageError('impossible zeros', told)
-            less, self.zeros = rows[0] - self.zeros.offset, Zeros(*rows)
-            changed(self.zeros.known, less)
+            zeros, before, heard = Zeros(*rows), heard, Zeros(*rows)
+            if before.known and zeros.known:
+                if (zeros.offset == before.offset).all():
+                    return
+                zeros = Zeros(zeros.offset, Zeros.unknown(len(zeros.offset)).deviation)
+            less, self.zeros = zeros.offset - self.zeros.offset, zeros
+            changed(zeros.known, less)
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 

@@ -43,10 +43,10 @@ class Sim(Arm):
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.needed.append('muscle_length_command')
         self.follow_checkpoints(self._use_checkpoint)
-        self.follow_zeros(lambda *_: self.gate.forget())
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        if not as_robot:
+        if not as_robot:  # which is the modules themselves
+            self.follow_zeros(lambda *_: self.gate.forget())
             self.follow_muscle_states(self._note)
         self.follow_anomaly(self.take_anomaly)
         self.follow_isolated(self._isolate)

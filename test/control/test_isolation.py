@@ -267,6 +267,20 @@ def test_a_suspect_is_wound_in_gently_while_the_arm_is_stopped_and_then_it_goes_
     assert bench.step(400)[-1].value[LOST] == bench.core.safety.longest[LOST]
 
 
+def test_where_the_estimator_starts_anew_nobody_has_verified_the_suspect():
+    bench = Verified()
+    bench.step(50)
+    length, tension = rest_readings(ROBOT, REST)
+    for _ in range(50):  # it is gone
+        bench.now += 0.01
+        bench.core.muscles(Muscles(length, tension, np.full(6, 30.0)), bench.now)
+        bench.core.step(bench.now)
+    bench.core.anomaly(False)
+    bench.core.isolate([])
+    bench.step(100)
+    assert bench.core.safety.cause == 'anomaly_detected'
+
+
 def test_a_blind_suspect_is_wound_in_by_no_more_than_a_little():
     bench = Verified()
     bench.step(200)

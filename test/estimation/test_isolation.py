@@ -155,6 +155,15 @@ def test_a_reset_while_it_is_verified_takes_the_suspect_back(loop, healthy, cut)
     assert loop.core.cause == ''
 
 
+def test_a_suspect_that_is_used_again_is_not_verified_and_the_anomaly_stays(loop, healthy, cut):
+    loop.step(healthy, 30)
+    loop.step(cut, 20)
+    cause = loop.core.cause
+    loop.core.isolate(())
+    loop.step(cut, round(PATIENCE / 0.01) + 100)
+    assert loop.core.cause == cause
+
+
 def test_a_sensor_that_stands_still_while_the_arm_moves_is_named(robot, calibrated, healthy):
     rng, frozen = np.random.default_rng(0), 3
     quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})

@@ -175,6 +175,13 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     assert graph.node.count_publishers('sim/joint_states') == 0
 
 
+def test_as_the_robot_it_has_no_zeros_but_its_own(graph, trained_file):
+    shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True)
+    topics = {subscription.topic_name for subscription in shell.subscriptions}
+    assert f'{graph.namespace}/muscle_length_command' in topics
+    assert f'{graph.namespace}/muscle_length_zeros' not in topics
+
+
 def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     graph.host(Sim, robot='arm26', checkpoint=trained_file, preset='paper')

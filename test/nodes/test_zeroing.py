@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation import zeroing
@@ -12,6 +13,7 @@ from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 
 @pytest.mark.parametrize('stands', [True, False], ids=['stated posture', 'gentle motion'])
@@ -42,3 +44,32 @@ def test_winches_that_forgot_their_zeros_are_told_them(
         assert not any('length' in reason for reason in other.rejected)
     assert controller.core.safety.zeroed and not controller.core.safety.cause
     assert not node.core.cause
+
+
+def test_zeros_of_an_estimator_that_starts_anew_are_not_known_until_it_finds_them(
+    graph, trained_file
+):
+    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    estimator = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+
+    def told(offset, deviation):
+        rows = np.array([np.full(6, offset), np.full(6, deviation)])
+        estimator.publish(array_message(rows, 'quantity', 'muscle'))
+
+    def known(expected):
+        graph.wait(
+            lambda: controller.zeros.known == controller.core.safety.zeroed == expected,
+            'the zeros',
+        )
+
+    told(0.05, 0.0)
+    graph.wait(lambda: controller.zeros.offset.all(), 'the zeros')
+    told(0.0, 0.0)  # as a new one says
+    known(False)
+    told(0.0, 0.0)
+    graph.spin(0.3)
+    known(False)
+    told(0.01, 1.0)
+    graph.wait(lambda: controller.zeros.offset.all(), 'a guess')
+    told(0.05, 0.001)
+    known(True)
