@@ -85,9 +85,9 @@ class _Stream:
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
-    From lengths comes off what `muscle_length_zeros` said last; while zeros are being found they
-    are left out. A BagError says that no message of a topic fits the robot, or that the bag is
-    damaged.
+    From lengths comes off what `muscle_length_zeros` said last, before its first message too if
+    that says known zeros; while zeros are being found they are left out. A BagError says that no
+    message of a topic fits the robot, or that the bag is damaged.
     """
     muscles, joints = robot.muscle_count, robot.joints
     streams = {
@@ -125,6 +125,8 @@ def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:
     """Return states with lengths from the zeros of their time, and of how many there are none."""
     known = np.array([Zeros(*rows).known for rows in zeros.values], dtype=bool)
     since = np.searchsorted(zeros.time, states.time, side='right')  # 0: nothing was said yet
+    if known[:1].any():  # latched before the bag: the recorder heard the estimator a little late
+        since = np.maximum(since, 1)
     use = np.append(True, known)[since]
     offset = np.concatenate([np.zeros_like(states.values[:1, 0]), zeros.values[:, 0]])
     values = states.values[use]

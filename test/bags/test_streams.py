@@ -92,6 +92,14 @@ def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robo
     assert_allclose(found.muscles.values[50:, 0], arm.length[100:] - offset)
 
 
+def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path):
+    offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
+    arm.add('/muscle_length_zeros', ARRAY, 0.501, array([offset, surely]))
+    found = streams(arm, robot, tmp_path)
+    assert not found.rejected
+    assert_allclose(found.muscles.values[:, 0], arm.length - offset)
+
+
 def test_some_joint_sensors_will_do(robot, tmp_path):
     arm = Arm(robot, order=[1, 0, *range(2, robot.muscle_count)])
     for i, sample in enumerate(arm.content):
