@@ -82,6 +82,7 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     theta = pairs.theta[rows].clip(robot.lower, robot.upper)
     length, tension = pairs.length[rows], pairs.tension[rows]
     moved = length.std(axis=0) > _LEAST_MOTION
+    moved &= ~(pairs.isolated == 1).any(axis=0)  # what these read may be anything
     columns = range(robot.muscle_count)
     # The tension of the column stretches whichever muscle it is.
     alike = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]

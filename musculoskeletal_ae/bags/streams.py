@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import heapq
 import math
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.estimation.zeroing import Zeros
@@ -20,7 +22,7 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
 
 
 class Series(NamedTuple):
@@ -37,6 +39,7 @@ class Pairs(NamedTuple):
     theta: Array  # θ [rad], (P, D); NaN of joints without a sensor
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
+    isolated: Ints  # 1 of isolated muscles, 0 of others, -1 where nothing says who is, (P, M)
 
 
 class Streams(NamedTuple):
@@ -46,6 +49,7 @@ class Streams(NamedTuple):
     muscles: Series  # length [m] less its zero, tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
+    isolated: Series  # 1 of isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # messages left out, by topic and reason
 
     def pairs(self) -> Pairs:
@@ -63,8 +67,12 @@ class Streams(NamedTuple):
             elif (paired := pairing.muscles(came, row, row)) and paired.theta is not None:
                 rows.append((paired.theta, paired.length))
         theta, muscle = np.array(rows, dtype=int).reshape(-1, 2).T
-        values = self.muscles.values
-        return Pairs(time[muscle], self.joints.values[theta], values[muscle, 0], values[muscle, 1])
+        values, time = self.muscles.values[muscle], time[muscle]
+        isolated = np.full(values[:, 0].shape, -1)
+        if len(self.isolated.time):  # the first one was latched before it was heard
+            row = np.searchsorted(self.isolated.time, time, side='right') - 1
+            isolated[:] = self.isolated.values[row.clip(0)]
+        return Pairs(time, self.joints.values[theta], values[:, 0], values[:, 1], isolated)
 
 
 @dataclass
@@ -72,37 +80,56 @@ class _Stream:
     """A topic that is being read, and the shape of its values."""
 
     shape: tuple[int, ...]
-    read: Callable[[Any], Array]
+    read: Callable[[Any, float], Array]  # of a message and when it came [s]
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: tuple[float, Any]) -> None:
         """Take the time and the content of a message."""
-        self.values.append(self.read(message[1]))
-        self.times.append(message[0])
+        came, content = message
+        self.values.append(self.read(content, came))
+        self.times.append(came)
 
 
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
     From lengths comes off what `muscle_length_zeros` said last, before its first message too if
-    that says known zeros; while zeros are being found they are left out. A BagError says that no
-    message of a topic fits the robot, or that the bag is damaged.
+    that says known zeros; while zeros are being found they are left out. What is not finite of
+    isolated muscles is 0, a temperature NaN. A BagError says that no message of a topic fits the
+    robot, or that the bag is damaged.
     """
     muscles, joints = robot.muscle_count, robot.joints
+
+    def who(message: Any, _: float) -> Array:
+        found = robot.muscle_indices(read_names(message))
+        return np.isin(np.arange(muscles), found).astype(float)
+
+    def states(message: Any, came: float) -> Array:
+        row = max(0, bisect_right(isolated.times, came) - 1)
+        ignored = np.flatnonzero(isolated.values[row]) if isolated.values else ()
+        return read_array(message, len(QUANTITIES), muscles, ignored)
+
+    def rows(count: int) -> Callable[[Any, float], Array]:
+        return lambda message, _: read_array(message, count, muscles)
+
+    isolated = _Stream((muscles,), who)
     streams = {
-        'joint_states': _Stream((len(joints),), lambda m: read_posture(m, joints, some=True)),
-        'muscle_states': _Stream((3, muscles), lambda m: read_array(m, len(QUANTITIES), muscles)),
-        'muscle_length_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
-        'muscle_tension_command': _Stream((muscles,), lambda m: read_array(m, 1, muscles)),
-        'muscle_length_zeros': _Stream((2, muscles), lambda m: read_array(m, 2, muscles)),
+        'joint_states': _Stream((len(joints),), lambda m, _: read_posture(m, joints, some=True)),
+        'muscle_states': _Stream((3, muscles), states),
+        'muscle_length_command': _Stream((muscles,), rows(1)),
+        'muscle_tension_command': _Stream((muscles,), rows(1)),
+        'isolated_muscles': isolated,
+        'muscle_length_zeros': _Stream((2, muscles), rows(2)),
     }
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
     start, told = bag.start, list[str]()
     reception = Reception(told.append)
     receive = {name: reception.of(name, topic.take, lambda: 1) for name, topic in topics.items()}
-    for message in bag.messages(topics):
+    # Who is isolated first: the recorder may have heard of them later than of what they read.
+    early = [name for name, topic in topics.items() if topic is isolated]
+    for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
         content = (message.log_time - start) / 1e9, bag.decode(message)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         receive[message.topic](content, sent)
@@ -111,14 +138,14 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         if why and not stream.values:
             problem = f'no message of {topic} fits the robot ({why[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
-    theta, states, lengths, tensions, zeros = (
+    theta, read, lengths, tensions, who_was, zeros = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
-    states, lost = _from_zero(states, zeros)
+    read, lost = _from_zero(read, zeros)
     if lost:
         reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += lost
-    return Streams(theta, states, lengths, tensions, reception.rejected)
+    return Streams(theta, read, lengths, tensions, who_was, reception.rejected)
 
 
 def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 import time
 from argparse import Namespace
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from musculoskeletal_ae.arrays import Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
@@ -142,23 +144,30 @@ def learn(
 
     `progress` is told the recorded seconds that have passed since it was last told.
     """
-    detector = AnomalyDetector(learner.robot, preset=learner.training.preset.name)
+    robot = copy.copy(learner.robot)  # of which the detector hears who is isolated
+    robot.isolate(learner.isolated)
+    detector = AnomalyDetector(robot, preset=learner.training.preset.name)
     direction = FrictionDirection()
-    mae = learner.mae
-    detector.use(mae)
+    newest = None
     learner.reset()
     learner.anomaly(False)
     steps = np.diff(recording.time, prepend=recording.time[:1])
-    for dt, at, theta, length, tension in zip(steps, *recording, strict=True):
+    for dt, at, theta, length, tension, said in zip(steps, *recording, strict=True):
+        if (isolated := _isolated(said, robot.isolated)) != robot.isolated:
+            robot.isolate(isolated)
+            learner.isolate(isolated)
+            detector.reset()
+            newest = None
+        if learner.mae is not newest:
+            newest = learner.mae
+            mae = newest.without(isolated)
+            detector.use(mae)
         # The estimator gates live learning; here its detector does the same.
         end = direction.end_tension(mae.friction, tension, length)
         verdict = detector.step(mae.estimate(end, length), end, tension, length, dt)
         if verdict.cause:
             learner.anomaly(True)
         learner.step(at, theta, tension, length)
-        if learner.mae is not mae:
-            mae = learner.mae
-            detector.use(mae)
         if progress is not None:
             progress(dt)
 
@@ -166,8 +175,17 @@ def learn(
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors there [rad]."""
     tension = end_tension(mae.friction, recording.tension, directions(recording.length))
-    estimate = mae.estimate(tension, recording.length).theta
+    estimate = np.empty_like(recording.theta)
+    for isolated in np.unique(recording.isolated, axis=0):
+        rows = (recording.isolated == isolated).all(axis=1)
+        without = mae.without(_isolated(isolated, mae.isolated))
+        estimate[rows] = without.estimate(tension[rows], recording.length[rows]).theta
     return float(np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1).mean())
+
+
+def _isolated(said: Ints, before: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the muscles that a row of `Pairs.isolated` names; those of before if it says none."""
+    return before if (said < 0).any() else tuple(map(int, np.flatnonzero(said)))
 
 
 def table(errors: list[PairError], title: str) -> str:

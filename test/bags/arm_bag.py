@@ -10,12 +10,17 @@ from bench.bag_samples import encode, message_class
 
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 JOINTS = 'sensor_msgs/msg/JointState'
+STRING = 'std_msgs/msg/String'
 PERIOD = 0.01  # [s]
 
 
 def array(values):
     layout = message_class('std_msgs/msg/MultiArrayLayout')([], 0)
     return encode(message_class(ARRAY)(layout, np.asarray(values, dtype=float).ravel()), ARRAY)
+
+
+def string(text):
+    return encode(message_class(STRING)(text), STRING)
 
 
 def joints(names, theta):

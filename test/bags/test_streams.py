@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
+from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
 from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import read_streams
@@ -98,6 +98,29 @@ def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_p
     found = streams(arm, robot, tmp_path)
     assert not found.rejected
     assert_allclose(found.muscles.values[:, 0], arm.length - offset)
+
+
+def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path):
+    count, (first, second) = robot.muscle_count, robot.muscles[:2]
+    for i in range(0, len(arm.content), 2):
+        lost = 0 if i < 200 else 1
+        rows = [arm.length[i // 2], arm.tension[i // 2].copy(), np.full(count, 30.0)]
+        rows[1][lost] = np.nan
+        arm.content[i] = arm.content[i]._replace(data=array(rows))
+    arm.add('/isolated_muscles', STRING, 0.501, string(first))  # as latched: heard late
+    arm.add('/isolated_muscles', STRING, 0.999, string(second))
+    found = streams(arm, robot, tmp_path)
+    assert not found.rejected
+    pairs = found.pairs()
+    assert_array_equal(pairs.isolated[:, :3], [[1, 0, 0]] * 100 + [[0, 1, 0]] * 100)
+    assert (pairs.tension[:100, 0] == 0.0).all() and (pairs.tension[100:, 1] == 0.0).all()
+    assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
+    swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
+    assert misplaced_muscles(swapped, robot) == []  # that is not known
+
+
+def test_who_is_isolated_is_not_known_where_nothing_says_it(arm, robot, tmp_path):
+    assert (streams(arm, robot, tmp_path).pairs().isolated == -1).all()
 
 
 def test_some_joint_sensors_will_do(robot, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from musculoskeletal_ae.bags.streams import Pairs
@@ -37,6 +38,28 @@ def test_what_is_learned_from_one_recording_improves_another(robot):
     assert sum(told) == pytest.approx(exploration.time[-1] - exploration.time[0])
     assert learner.updates > 0
     assert error(learner.mae, other) < 0.6 * error(mae, other)
+
+
+def test_isolated_muscles_of_a_recording_teach_and_say_nothing(arm26, initial):
+    count = 500
+    theta = np.tile(0.5 * (arm26.lower + arm26.upper), (count, 1))
+    tension = np.full((count, arm26.muscle_count), 60.0)
+    length = initial.lengths(theta, tension)
+    isolated = np.zeros(tension.shape, dtype=int)
+    length[:450, 2], tension[:450, 2], isolated[:450, 2] = 0.1, 0.0, 1
+    recording = Pairs(0.01 * np.arange(count), theta, length, tension, isolated)
+    nothing_said = recording._replace(isolated=np.full_like(isolated, -1))
+    assert error(initial, recording) < 0.1 * error(initial, nothing_said)
+    learner = Learner(arm26, initial)
+    learn(learner, part(recording, 0.0, 4.0))
+    assert learner.isolated == learner.mae.isolated == (2,)
+    (known,) = learner.samples.known
+    assert np.flatnonzero(~known).tolist() == [2]
+    learn(learner, part(recording, 4.0, 5.0))
+    assert learner.isolated == ()
+    learner.isolate((1,))
+    learn(learner, nothing_said)
+    assert learner.isolated == (1,)
 
 
 def test_the_faults_of_a_recording_are_left_out_and_said(robot, capsys):
