@@ -43,8 +43,8 @@ class StopRecording:
         """Remember nothing yet; resolve: a topic's full name; directory: where bags are written."""
         self._resolve = resolve
         self._directory = directory or Path(get_logging_directory())
-        self._recent: deque[Heard] = deque(maxlen=MOST)
-        self._latched: dict[str, Heard] = {}
+        self._recent: deque[Heard] = deque()
+        self._latched: dict[str, Heard] = {}  # the last ones before those
         self._writing: threading.Thread | None = None
         self.problem = ''  # why the last recording could not be written
         self.saved: Path | None = None  # the last one
@@ -52,12 +52,11 @@ class StopRecording:
     def heard(self, topic: str, message: Any) -> None:
         """Remember a message of one of `bags.topics.TOPICS`."""
         now = time.time_ns()
-        heard = now, topic, serialize_message(message)
-        if TOPICS[topic].latched:
-            self._latched[topic] = heard
-        self._recent.append(heard)
-        while self._recent[0][0] < now - int(SECONDS * 1e9):
-            self._recent.popleft()
+        self._recent.append((now, topic, serialize_message(message)))
+        while len(self._recent) > MOST or self._recent[0][0] < now - int(SECONDS * 1e9):
+            left = self._recent.popleft()
+            if TOPICS[left[1]].latched:
+                self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
         """Write what is remembered, in the background; keep so many recordings (0: none)."""
@@ -65,7 +64,7 @@ class StopRecording:
         if not (messages and most) or (self._writing is not None and self._writing.is_alive()):
             return
         begin = messages[0][0]
-        before = [(begin, *kept[1:]) for kept in self._latched.values() if kept[0] < begin]
+        before = [(begin, *kept[1:]) for kept in self._latched.values()]
         self._writing = threading.Thread(target=self._save, args=(cause, most, before + messages))
         self._writing.start()
 

@@ -47,6 +47,19 @@ def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
     assert (recording.saved / FILE).read_text() == 'a cause\n'
 
 
+@pytest.mark.parametrize('most', [stop_recording.MOST, 3])
+def test_what_was_latched_before_is_kept_though_newer_came(recording, now, monkeypatch, most):
+    monkeypatch.setattr(stop_recording, 'MOST', most)
+    for step, detected in enumerate((True, False, True, False)):
+        now[0] += int((0.4 if step else 0.0) * SECONDS * 1e9)
+        recording.heard('anomaly_detected', Bool(data=detected))
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    told = [bag.decode(message).data for message in bag.messages()]
+    assert told == [True, False, True, False]
+
+
 def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
     (tmp_path / 'stop_20200101-000000-000000').mkdir()  # cut off by a kill
