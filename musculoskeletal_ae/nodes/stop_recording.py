@@ -77,12 +77,12 @@ class StopRecording:
         bag = self._directory / f'stop_{datetime.now():%Y%m%d-%H%M%S-%f}'  # noqa: DTZ005 - local
         try:
             self._write(bag, cause, messages)
-            for old in sorted(self._directory.glob(NAMES))[:-most]:
-                shutil.rmtree(old)
         except (MusculoskeletalError, OSError) as error:
             self.problem = f'the seconds before the stop could not be kept: {error}'
             return
         self.saved, self.problem = bag, ''
+        for old in sorted(self._directory.glob(NAMES))[:-most]:
+            shutil.rmtree(old, ignore_errors=True)  # one that stays takes nothing from the new one
 
     def _write(self, bag: Path, cause: str, messages: list[Heard]) -> None:
         """Write a bag and its cause; what cannot be written whole takes no room on the disk."""

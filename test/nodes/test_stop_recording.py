@@ -74,6 +74,16 @@ def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path
     assert len(list(tmp_path.iterdir())) == 3
 
 
+def test_an_old_one_that_cannot_be_deleted_does_not_hide_the_new_one(recording, tmp_path):
+    (tmp_path / 'elsewhere').mkdir()
+    (tmp_path / 'stop_20200101-000000-000000').symlink_to(tmp_path / 'elsewhere')
+    recording.heard('muscle_states', states(1.0))
+    recording.save('a cause', 1)
+    recording.close()
+    assert recording.problem == ''
+    assert (recording.saved / FILE).exists()
+
+
 def test_none_are_kept_where_none_are_wanted(recording, tmp_path):
     recording.heard('muscle_states', states(1.0))
     recording.save('a cause', 0)
