@@ -26,7 +26,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from musculoskeletal_ae.bags.playback import LEAD, SHOWN, Timeline, lap, shown, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
@@ -184,6 +184,9 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     """Publish what a hand showed as one trajectory."""
     names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
+    if len(names) > 1:  # all arms' names are kept
+        problem = f'has the motion of several arms: {", ".join(names)}'
+        raise BagError(bag.path, problem, 'choose one with --from-namespace')
     ((recorded, name),) = names.items()
     motion = shown(bag, recorded, *window(bag, options.start, options.duration))
     message = JointTrajectory(joint_names=motion.joints)

@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.exceptions import UnfinishedBagError
+from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 from musculoskeletal_ae.nodes import record as record_tool
 from musculoskeletal_ae.nodes import replay as replay_tool
 from musculoskeletal_ae.validity import read_array
@@ -270,3 +270,15 @@ def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
     short = tool('replay', tmp_path / 'bag', '--as-trajectory', '--duration', '0.2', *ros(graph))
     assert 'holds no motion' in short.output()
     assert short.process.returncode == 1
+
+
+def test_of_two_arms_that_were_shown_a_motion_one_is_asked_for(tmp_path):
+    data = joints(['elbow'], [0.0])
+    content = [
+        samples.Sample(f'/{arm}/estimated_joint_states', JOINTS, samples.START, 0, data)
+        for arm in 'lr'
+    ]
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    both = ['--as-trajectory', '--keep-names']
+    with pytest.raises(BagError, match=r'several arms: /l/.*, /r/.*; choose .* --from-namespace'):
+        replay_tool._work(replay_tool.parse([str(tmp_path / 'bag'), *both]), [])
