@@ -53,6 +53,7 @@ class BagTopic:
     type: str
     qos: str  # offered profiles, YAML as rosbag2 writes it
     refused: str  # why its messages cannot be used, '' if they can
+    encoding: str  # of its messages
     schema: mcap.Schema  # the recorded definition, to be copied and never used
     message_count: int = 0
 
@@ -283,7 +284,8 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
         if lie:
             raise ValueError(f'the definition of {schema.name}, type of topic {name}, {lie}')
     qos = channel.metadata.get('offered_qos_profiles', '')
-    return BagTopic(f'/{name.lstrip("/")}', schema.name, qos, refused, schema)
+    encoding = channel.message_encoding
+    return BagTopic(f'/{name.lstrip("/")}', schema.name, qos, refused, encoding, schema)
 
 
 def _unreadable(file: Path, problem: str) -> BagError:

@@ -21,6 +21,7 @@ from musculoskeletal_ae.bags.mcap_file import NO_SCHEMA
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
+CDR = 'cdr'  # the encoding of ROS 2
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 # A chunk is also closed when it has grown to this size.
 _LARGEST_CHUNK = 1 << 20  # [bytes]
@@ -72,9 +73,9 @@ class BagWriter:
         if type_name not in self._schemas:
             self._schemas[type_name] = self._mcap.register_schema(type_name, encoding, text)
         extra = {'offered_qos_profiles': metadata.qos_text(qos), 'topic_type_hash': type_hash}
-        number = self._mcap.register_channel(name, 'cdr', self._schemas[type_name], extra)
+        number = self._mcap.register_channel(name, CDR, self._schemas[type_name], extra)
         self._numbers[name] = number
-        self.topics[name] = metadata.Topic(name, type_name, 'cdr', qos, type_hash)
+        self.topics[name] = metadata.Topic(name, type_name, CDR, qos, type_hash)
         self._write_metadata(finished=False)
 
     def write(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
@@ -139,19 +140,20 @@ class BagWriter:
 
 def recover(
     path: Path, out: Path | None = None, compression: str = 'zstd'
-) -> tuple[Path, int, Path | None]:
+) -> tuple[Path, int, Path | None, list[str]]:
     """Write all complete messages of an unfinished bag, directory or .mcap, into a finished one.
 
     Without a new directory `out`, a directory is replaced, and the original kept beside it as
     `DIR.unfinished`; of `FILE.mcap` becomes `FILE_recovered`. Returned are the finished bag, its
-    number of messages, and where the original is now if it was moved.
+    number of messages, where the original is now if it was moved, and which topics were left out:
+    a bag as we write it holds CDR and nothing else.
     """
     bag, finished = _open(path)
     if finished and out is None:
         raise BagError(path, 'the recording is finished', 'there is nothing to recover')
     if out is not None or not path.is_dir():
         target = out or path.with_name(f'{path.stem}_recovered')
-        return target, _copy(bag, target, compression), None
+        return target, _copy(bag, target, compression), None, _not_cdr(bag)
     # The new bag is complete before the old one is touched; its file carries the final name.
     path = path.resolve()
     backup, scratch = _free(path, '.unfinished'), _free(path, '.recovering')
@@ -163,7 +165,7 @@ def recover(
     path.rename(backup)
     (scratch / path.name).rename(path)
     scratch.rmdir()
-    return path, messages, backup
+    return path, messages, backup, _not_cdr(bag)
 
 
 def _open(path: Path) -> tuple[Bag, bool]:
@@ -180,13 +182,18 @@ def _open(path: Path) -> tuple[Bag, bool]:
 
 
 def _copy(bag: Bag, target: Path, compression: str) -> int:
-    """Write a bag anew and read it again; return its number of messages."""
+    """Write a bag's CDR anew and read it again; return its number of messages."""
     with BagWriter(target, compression) as writer:
         for name, topic in bag.topics.items():
-            writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
-        for message in bag.messages():
+            if topic.encoding == CDR:
+                writer.add_topic(name, topic.type, metadata.read_qos(topic.qos), topic.schema)
+        for message in bag.messages(writer.topics):
             writer.write(*message[:4])
     return Bag.open(target).message_count
+
+
+def _not_cdr(bag: Bag) -> list[str]:
+    return [name for name, topic in bag.topics.items() if topic.encoding != CDR]
 
 
 def _free(path: Path, suffix: str) -> Path:

@@ -138,9 +138,12 @@ def _topics(text: str) -> list[str]:
 
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
-        bag, count, backup = recover(options.recover, options.out, options.compression)
+        bag, count, backup, left_out = recover(options.recover, options.out, options.compression)
         kept = f'; the original is kept as {backup}' if backup else ''
         print(f'{count} messages recovered to {bag}{kept}')
+        if left_out:
+            told = f'left out, since they are not in CDR: {", ".join(left_out)}'
+            print(f'warning: {options.recover}: {told}', file=sys.stderr)
     else:
         _record(options, arguments)
     return 0

@@ -38,7 +38,7 @@ def test_a_killed_recording_is_unfinished_and_loses_only_the_last_chunk(killed, 
 
 def test_recovery_in_place_keeps_the_original(killed, content):
     before = (killed / 'bag_0.mcap').read_bytes()
-    bag, count, backup = recover(killed)
+    bag, count, backup, _ = recover(killed)
     assert (bag, count) == (killed, 60)
     assert read(killed) == expected(content[:60])
     assert (killed / 'bag_0.mcap').exists()
@@ -47,7 +47,7 @@ def test_recovery_in_place_keeps_the_original(killed, content):
 
 
 def test_recovery_into_a_new_directory_leaves_the_original_alone(killed, content, tmp_path):
-    assert recover(killed, tmp_path / 'new') == (tmp_path / 'new', 60, None)
+    assert recover(killed, tmp_path / 'new') == (tmp_path / 'new', 60, None, [])
     assert read(tmp_path / 'new') == expected(content[:60])
     with pytest.raises(UnfinishedBagError):
         Bag.open(killed)
@@ -68,7 +68,7 @@ def test_recovery_compresses_as_it_is_told(
 
 
 def test_a_bare_file_is_recovered_beside_it(killed):
-    bag, count, _ = recover(killed / 'bag_0.mcap')
+    bag, count, *_ = recover(killed / 'bag_0.mcap')
     assert (bag, count) == (killed / 'bag_0_recovered', 60)
     assert Bag.open(bag).message_count == 60
 
@@ -115,3 +115,19 @@ def test_types_that_are_not_known_are_copied_as_they_are(tmp_path):
     bag = Bag.open(tmp_path / 'new')
     assert [message[:4] for message in bag.messages()] == [('/thing', 5, 4, b'\x07')]
     assert bag.topics['/thing'].schema.data == b'int32 x'
+
+
+def test_topics_that_are_not_in_cdr_are_left_out_and_named(tmp_path, monkeypatch, capsys):
+    with (tmp_path / 'a.mcap').open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2')
+        schema = writer.register_schema('other_msgs/msg/Thing', 'ros2msg', b'int32 x')
+        for name, encoding in (('/thing', 'cdr'), ('/text', 'json')):
+            writer.add_message(writer.register_channel(name, encoding, schema), 5, b'{}', 4)
+        writer.flush()
+    monkeypatch.chdir(tmp_path)
+    assert record._work(record.parse(['--recover', 'a.mcap', '-o', 'new']), []) == 0
+    assert list(Bag.open('new').topics) == ['/thing']
+    told = capsys.readouterr()
+    assert told.out == '1 messages recovered to new\n'
+    assert told.err == 'warning: a.mcap: left out, since they are not in CDR: /text\n'
