@@ -34,9 +34,14 @@ class BagWriter:
     """
 
     def __init__(self, directory: Path, compression: str = 'zstd') -> None:
-        """Create the directory; one that exists must be empty, else there is a BagError."""
+        """Create the directory; one that exists must be empty, else there is a BagError.
+
+        metadata.yaml names the file after it, so a name that is not UTF-8 is one as well.
+        """
         self.directory = Path(directory)
         self._name = f'{self.directory.resolve().name}_0.mcap'
+        if not _is_utf8(self._name):
+            raise BagError(self.directory, 'the name is not UTF-8', 'choose another name')
         self.topics: dict[str, metadata.Topic] = {}
         self._numbers: dict[str, int] = {}  # of topics
         self._schemas: dict[str, int] = {}
@@ -45,10 +50,16 @@ class BagWriter:
         self._counts: Counter[str] = Counter()
         self._times: list[int] = []  # the earliest and the latest
         with self._writing():
+            new = not self.directory.exists()
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise BagError(self.directory, 'is not empty', 'name a new directory to record to')
-            self._file = (self.directory / self._name).open('xb')
+            try:
+                self._file = (self.directory / self._name).open('xb')
+            except OSError:  # its name may be too long where the directory's is not
+                if new:
+                    self.directory.rmdir()
+                raise
             self._mcap = Writer(
                 self._file,
                 chunk_size=_LARGEST_CHUNK,
@@ -136,6 +147,13 @@ class BagWriter:
         except OSError as error:
             problem = f'cannot be written: {error.strerror or error}'
             raise BagError(self.directory, problem, 'name another place') from error
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        return bool(name.encode())
+    except UnicodeEncodeError:  # Python's stand-ins for other bytes
+        return False
 
 
 def recover(

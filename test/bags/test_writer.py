@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
 import random
 
 import pytest
@@ -98,6 +99,16 @@ def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(BagError, match=r'file/bag: cannot be written: Not a directory'):
         BagWriter(tmp_path / 'file' / 'bag')
+
+
+@pytest.mark.parametrize(
+    ('name', 'problem'),
+    [(b'b\xffg', 'the name is not UTF-8; choose'), (b'b' * 250, 'File name too long')],
+)
+def test_a_name_that_a_bag_cannot_have_is_refused_and_leaves_nothing(name, problem, tmp_path):
+    with pytest.raises(BagError, match=problem):
+        BagWriter(tmp_path / os.fsdecode(name))
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_empty_recording_is_a_sound_bag(tmp_path):
