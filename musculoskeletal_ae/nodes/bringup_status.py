@@ -27,7 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -40,12 +40,13 @@ class BringupStatus(Shell):
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')
         self.begun = time.monotonic()
-        self.theta: Array | None = None
+        self.theta: Array | None = None  # what joint sensors say
+        self.measured_at = -math.inf  # [s]
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
-        self.follow_posture('joint_states', partial(setattr, self, 'theta'), some=True)
+        self.follow_posture('joint_states', self._measured, some=True)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
         self.follow_anomaly(partial(setattr, self.situation, 'detected'))
@@ -63,7 +64,15 @@ class BringupStatus(Shell):
             self.screen.stop()
         super().destroy_node()
 
+    def _measured(self, theta: Array) -> None:
+        self.theta, self.measured_at = theta, time.monotonic()
+
+    def _forget_old(self) -> None:
+        if time.monotonic() - self.measured_at > OLD:
+            self.theta = None
+
     def _estimated(self, theta: Array) -> None:
+        self._forget_old()
         if self.theta is not None:
             self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - self.theta))))
 
@@ -74,6 +83,7 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
+        self._forget_old()
         means = (fmean(values or [math.nan]) for values in (self.errors, self.anomalies))
         told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []

@@ -8,6 +8,7 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+OLD = 1.0  # [s] after which something that moves is no longer shown
 TOLD = 'stopped', 'anomaly detected'  # errors that are told with what to do
 
 

@@ -32,7 +32,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
@@ -43,7 +43,6 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
-OLD = 1.0  # [s] after which something that moves is no longer shown
 PATIENCE = 10.0  # [s] with a service
 ARM_TOPICS = {
     'measured': 'joint_states',

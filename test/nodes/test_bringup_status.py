@@ -41,6 +41,19 @@ def test_what_is_not_known_is_said_to_be_waited_for():
     assert none == 'error waits for estimated_joint_states  A waits for anomaly'
 
 
+def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node.anomalies.append(0.5)
+    node._measured(np.zeros(2))
+    node._estimated(np.ones(2))
+    node._print()
+    assert 'error 1.414 rad  A 0.500' in capsys.readouterr().out
+    node.measured_at -= 2.0
+    node._estimated(np.ones(2))
+    node._print()
+    assert 'error waits for joint_states' in capsys.readouterr().out
+
+
 def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
     told = Situation('/left')
     told.diagnosed(said('/right/controller', 'stopped: by request'))
