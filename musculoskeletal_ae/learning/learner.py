@@ -221,7 +221,7 @@ class Learner:
         self._zeroed = known
 
     def enable(self, enabled: bool) -> None:
-        """Stop or resume learning; samples and network stay."""
+        """Stop or resume learning; samples and network stay; an update under way is not used."""
         if enabled and not self.enabled:
             self.reset()
         self.enabled = enabled
@@ -249,8 +249,8 @@ class Learner:
             job = Job(seen, healthy, self._statistics_hold, self._steps, self.isolated)
             self.training.submit(job)
         update = self.training.poll()
-        if update is not None and self._rests.anomaly:
-            self._news = True  # it may know the arm that the anomaly is of
+        if update is not None and (self._rests.anomaly or not self.enabled):
+            self._news = True  # a network that is stopped stays, and it may know an anomaly's arm
         elif update is not None:
             self._take(update)
         self._keep(changed=False)

@@ -333,6 +333,24 @@ def test_an_update_that_ends_during_an_anomaly_is_not_used(learner, stage):
     assert len(learner.training.jobs) == jobs + 1  # it is learned then
 
 
+def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stage):
+    accept(learner, stage, 3)
+    learner.poll(0.0)
+    learner.training.released = False
+    learner.accept(stage.sample())
+    learner.poll(2.0)
+    checkpoint, updates = learner.checkpoint, learner.updates
+    learner.enable(False)
+    learner.training.released = True
+    assert learner.poll(4.0) is None
+    assert learner.training.ready and learner.updates == updates
+    assert learner.checkpoint == checkpoint
+    learner.enable(True)
+    jobs = len(learner.training.jobs)
+    learner.poll(6.0)
+    assert len(learner.training.jobs) == jobs + 1  # it is learned then
+
+
 def test_a_replaced_network_is_not_judged_by_what_the_last_one_felt(learner, initial):
     learner._torque._time, learner._torque._square[:] = 180.0, 1.0
     learner.replace(initial)
