@@ -341,6 +341,7 @@ class Learner:
         self.training.close()
         self.samples.clear()
         self._healthy.clear()
+        self._spoiled[:], self._owed, self.last_update = False, 0, None
         self.reset()
         self.gate.start()
         self._torque.start()

@@ -355,3 +355,20 @@ def test_a_replaced_network_is_not_judged_by_what_the_last_one_felt(learner, ini
     learner._torque._time, learner._torque._square[:] = 180.0, 1.0
     learner.replace(initial)
     assert learner._torque._time == 0.0
+
+
+def test_nothing_of_a_replaced_network_is_owed_or_told(learner, initial, stage):
+    accept(learner, stage, 3)
+    learner.poll(0.0)
+    learner._owed = 300  # as where as many samples had come back without their network
+    learner.isolate((2,))
+    Arm(learner, stage).rest(1.0 + MARGIN + 0.5)
+    assert learner._spoiled.any()
+    learner.replace(initial)
+    assert not learner._spoiled.any()  # no healthy messages, which lacked it, are left
+    assert 'loss' not in learner.report().values
+    accept(learner, stage, 3)
+    jobs = len(learner.training.jobs)
+    for now in range(10, 20, 2):
+        learner.poll(now)
+    assert len(learner.training.jobs) == jobs + 1
