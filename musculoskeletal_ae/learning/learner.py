@@ -110,6 +110,7 @@ class Learner:
         if self._state is not None and saved is not None and gated and not self._passes(saved):
             self._state.back_up(self.samples, checkpoint.to_bytes(saved), self.last_refused)
             saved = None
+            self._keep()  # without it: else every start would make that backup
         # Samples without their network (damaged, refused, or of the robot with a muscle less) bring
         # as many updates as when they came.
         self._owed = len(self.samples) if saved is None else 0

@@ -448,6 +448,26 @@ def test_a_saved_network_that_is_refused_is_kept_whole_and_told(
     assert learner._owed == 3  # what was learned of them is to be learned again
 
 
+def test_a_saved_network_that_is_refused_becomes_one_backup(
+    begun, stage, arm26, tmp_path, monkeypatch
+):
+    learner = begun()
+    accept(learner, stage, 3)
+    learner.close()
+
+    def refuse(*_):
+        raise GateError('it does not explain the arm')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Gate, 'check', refuse)
+        for _ in range(2):  # nothing replaces it
+            again = Learner(arm26, training=Prepared, directory=tmp_path / 'state')
+            again.close()
+            same(again.samples, learner.samples)
+    assert len(list((tmp_path / 'state').glob('backup-*'))) == 1
+    assert begun()._owed == 3
+
+
 def read_copy(directory, copy, robot):
     shutil.copytree(directory, copy)
     store, mae, _ = read(copy, robot)
