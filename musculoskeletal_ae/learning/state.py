@@ -60,7 +60,11 @@ class State:
         Raises:
             StateError: If it cannot be written, or another learner works there.
         """
-        self.directory = Path(directory).expanduser()
+        name = f'state_directory {str(directory)!r}'
+        try:
+            self.directory = Path(directory).expanduser()
+        except RuntimeError as error:  # of whom nobody knows a home
+            raise StateError(f"{name}: no home to put for ~; give a whole path, or ''") from error
         self.not_used = ''  # what was found at the start and could not be used
         self.trouble = ''  # why the disk is not in line with memory
         self._file = self.directory / FILE
@@ -72,7 +76,6 @@ class State:
             for unfinished in self.directory.glob('backup-*.tmp'):
                 shutil.rmtree(unfinished, ignore_errors=True)
         except (OSError, ValueError, sqlite3.Error) as error:
-            name = f'state_directory {str(directory)!r}'
             if 'locked' in str(error):
                 raise StateError(
                     f'{name} is used by another learner; give each its own, or stop the other'

@@ -86,7 +86,7 @@ class Learner(Shell):
     def _directory(self, value: str) -> Path | None:
         if value != 'auto':
             return Path(value) if value else None
-        home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
+        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `State` knows ~
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 

@@ -300,6 +300,11 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path, arm26, place):
         State(tmp_path / place, arm26)
 
 
+def test_a_home_that_is_not_known_is_told_with_what_to_give(arm26):
+    with pytest.raises(StateError, match=r"'~nobody-here/state'.*give a whole path"):
+        State('~nobody-here/state', arm26)
+
+
 # -- a disk that fails ----------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.state import FILE
 from musculoskeletal_ae.learning.training import Training
@@ -385,6 +386,13 @@ def test_two_learners_do_not_share_a_directory(graph, host, state):
     assert status == 1
     assert 'another learner' in output
     assert 'Traceback' not in output
+
+
+def test_a_learner_whose_home_is_not_known_says_what_to_give(graph, monkeypatch):
+    monkeypatch.delenv('XDG_STATE_HOME', raising=False)
+    monkeypatch.setattr(os.path, 'expanduser', str)
+    with pytest.raises(StateError, match=r'state_directory .* give a whole path'):
+        graph.host(Learner, robot='arm26')
 
 
 def test_it_ends_quietly_and_takes_its_training_process_with_it(graph, trained_file):
