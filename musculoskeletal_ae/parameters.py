@@ -66,7 +66,9 @@ class Parameter:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
         if self.is_number_list:
             try:
-                numbers = tuple(map(float, value))
+                # Text has digits, bytes have codes: no numbers, but for ROS's empty list, b''.
+                whole = value == b'' or not isinstance(value, str | bytes)
+                numbers = tuple(map(float, value)) if whole else (math.nan,)
             except (TypeError, ValueError):
                 numbers = (math.nan,)
             low, high = self.within or (-math.inf, math.inf)

@@ -157,7 +157,10 @@ def test_an_empty_list_of_numbers_is_the_byte_array_that_ros_makes_of_it():
     assert NUMBERS.checked([1, 2.5]) == (1.0, 2.5)
 
 
-@pytest.mark.parametrize('value', [None, 3.0, 'word', ['word'], [float('nan')], [float('inf')]])
+@pytest.mark.parametrize(
+    'value',
+    [None, 3.0, '', '11', b'\x01', 'word', ['word'], [float('nan')], [float('inf')]],
+)
 def test_what_is_no_list_of_finite_numbers_is_refused(value):
     with pytest.raises(MusculoskeletalError, match='finite numbers'):
         NUMBERS.checked(value)
