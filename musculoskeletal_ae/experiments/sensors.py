@@ -46,7 +46,7 @@ def measure(study: Study, seed: int) -> Measured:
     hand = robot.description.end_effector
 
     def marker(learner: Learner, n: int, theta: Array, _: Array) -> Array | None:
-        if n % CAMERA or len(learner.samples) % SIGHTED:
+        if n % CAMERA or not sighted(learner):
             return None
         pose = seen_by_camera(robot.kinematics.end_effector_pose(theta), rng)
         guess = learner.mae.estimate(tension[n], length[n]).theta
@@ -72,6 +72,11 @@ def measure(study: Study, seed: int) -> Measured:
         if networks[name].covariance is not None:
             numbers[key] = ellipsoid_share(networks[name], held_out)
     return Measured(numbers, {})
+
+
+def sighted(learner: Learner) -> bool:
+    """Whether the marker is seen until the next sample; a full store grows no more."""
+    return learner.samples.accepted % SIGHTED == 0
 
 
 def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -> Mae:

@@ -22,7 +22,10 @@ from musculoskeletal_ae.experiments.recording import (
     ClosedLoop,
     record,
 )
+from musculoskeletal_ae.experiments.sensors import SIGHTED, sighted
 from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.presets import PRESETS
 
@@ -97,3 +100,13 @@ def test_the_error_counts_as_halved_once_it_stays_below():
     assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.3, 0.2], none)) == 5
     assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.3, 0.6], none)) is None
     assert samples_to_halve(Curve([0], [math.e], none)) is None
+
+
+def test_a_marker_is_seen_as_often_once_the_store_is_full(arm26):
+    learner, nothing = Learner(arm26), np.zeros(arm26.muscle_count)
+    learner.samples = SampleStore(capacity=2 * SIGHTED)
+    seen = []
+    for count in range(6 * SIGHTED):
+        seen.append(sighted(learner))
+        learner.accept(Sample(np.full(2, 0.1 * count), nothing, nothing, nothing))
+    assert np.flatnonzero(seen).tolist() == list(range(0, 6 * SIGHTED, SIGHTED))
