@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.robot.robot import Robot
 
 ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
@@ -15,6 +16,13 @@ ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
 def elbow(robot: Robot) -> int:
     """Return the joint to flex: elbow_pitch, else an elbow, else the last that turns."""
     return _named(robot, ELBOW, -1)
+
+
+def elbows(robot: Robot) -> Bools:
+    """Return which joints are elbows (D,): those so named, else the one to flex."""
+    named = np.array([ELBOW[-1] in name for name in robot.joints])
+    named[elbow(robot)] |= not named.any()
+    return named
 
 
 def shoulder(robot: Robot) -> int:

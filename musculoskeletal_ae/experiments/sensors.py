@@ -5,8 +5,8 @@ Paper. Musashi has joint sensors at few joints, and a marker on the hand takes t
 part of them or none is worth is not measured.
 
 Here. The messages of the default network’s exploration teach learners that see less of them: all
-joint sensors; only those of the elbow (joints so named, else the last one); none; none but a marker
-on the hand in one of ten samples, by inverse kinematics as in the estimator; none but an
+joint sensors; only those of elbows (joints so named, else the last that turns); none; none but a
+marker on the hand in one of ten samples, by inverse kinematics as in the estimator; none but an
 accelerometer on the link of the hand. All are judged on the held-out motion. "In the ellipsoid" is
 the share of its messages whose true angles lie in the ellipsoid of 95 % that the network tells,
 with all joint sensors and with none. The arm explored with the network that saw all joint sensors.
@@ -26,6 +26,7 @@ from musculoskeletal_ae.experiments.recording import (
     end_tensions,
     estimation_error,
 )
+from musculoskeletal_ae.experiments.roles import elbows
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
@@ -41,9 +42,7 @@ def measure(study: Study, seed: int) -> Measured:
     """Teach learners that see less and less of an individual."""
     robot, held_out = study.robot, study.stream(seed, 'held_out')
     rng = np.random.default_rng([seed, 0x5E])
-    elbow = np.array([name.startswith('elbow') for name in robot.joints])
-    elbow[-1] |= not elbow.any()
-    hand = robot.description.end_effector
+    elbow, hand = elbows(robot), robot.description.end_effector
 
     def marker(learner: Learner, n: int, theta: Array, _: Array) -> Array | None:
         if n % CAMERA or not sighted(learner):

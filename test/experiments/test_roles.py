@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from robots import write_robot
 
 from musculoskeletal_ae.experiments.roles import (
     elbow,
+    elbows,
     flexed,
     plotted,
     shoulder,
@@ -30,10 +32,19 @@ def test_joints_are_found_by_name(name, flexes, forced):
     assert within(robot, shoulder(robot), 30.0) == pytest.approx(math.radians(30.0), abs=1e-3)
 
 
+def test_the_elbows_of_two_arms_are_those_whose_names_say_so():
+    robot = Robot.load('musashi_upper_body')
+    named = [name for name, elbow in zip(robot.joints, elbows(robot), strict=True) if elbow]
+    assert named == [
+        f'{side}_elbow_{axis}' for side in ('left', 'right') for axis in ('pitch', 'yaw')
+    ]
+
+
 def test_foreign_names_leave_the_first_and_the_last_joint_that_turn(tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
     assert robot.kinematics.slides.tolist() == [False, False, False, True]
     assert shoulder(robot) == 0
     assert elbow(robot) == robot.joint_count - 2
+    assert np.flatnonzero(elbows(robot)).tolist() == [elbow(robot)]
     assert plotted(robot, robot.joint_count - 1) == (1000.0, 'mm')
     assert robot.lower[elbow(robot)] <= flexed(robot) <= robot.upper[elbow(robot)]
