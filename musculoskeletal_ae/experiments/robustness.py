@@ -109,7 +109,10 @@ def _learned(study: Study, seed: int, reality: str) -> Study:
     part = replace(study, reality=reality, folder=study.folder / reality)
     part.folder.mkdir(exist_ok=True)
     for preset in PRESETS:
-        copyfile(study.network_file(preset, None), part.network_file(preset, None))
+        # Other individuals do so meanwhile, and read it: it is whole at any moment.
+        own = part.folder / f'{preset}_initial_of_{seed}'
+        copyfile(study.network_file(preset, None), own)
+        own.replace(part.network_file(preset, None))
     online_learning.measure(part, seed)
     return part
 

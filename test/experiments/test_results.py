@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What result.json says of several individuals, and of parts that failed."""
+"""What result.json says of several individuals, and of parts that failed; what they share."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from musculoskeletal_ae.emulator.reality import FOREIGN
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
-from musculoskeletal_ae.experiments import online_learning, runner
+from musculoskeletal_ae.experiments import online_learning, robustness, runner
 from musculoskeletal_ae.experiments.results import combined, read, readme_table
 from musculoskeletal_ae.experiments.study import Measured, Study
+from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.tools import experiment
 
 
@@ -94,3 +96,18 @@ def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
     assert set(results) == set(runner.EXPERIMENTS)
     assert all(set(result['failed']) == {'0', '1'} for result in results.values())
     assert 'no tension at all' in (tmp_path / 'report.html').read_text('utf-8')
+
+
+def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_path, monkeypatch):
+    monkeypatch.setattr(online_learning, 'measure', lambda *_: None)
+    study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
+    for preset in PRESETS:
+        study.network_file(preset, None).write_text('first')
+    part = robustness._learned(study, 0, FOREIGN)
+    file = part.network_file('default', None)
+    with file.open() as reading:
+        study.network_file('default', None).write_text('second')
+        robustness._learned(study, 1, FOREIGN)
+        assert reading.read() == 'first'
+    assert file.read_text() == 'second'
+    assert len(list(part.folder.iterdir())) == len(PRESETS)
