@@ -33,6 +33,7 @@ import numpy as np
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN
 from musculoskeletal_ae.emulator.wires import GUIDES, load_cell, spooled
+from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.experiments import online_learning, plots
 from musculoskeletal_ae.experiments.least_squares import EVERY, nominal, oracle
 from musculoskeletal_ae.experiments.recording import (
@@ -163,7 +164,12 @@ def _frozen(study: Study, seed: int, folders: list[Path]) -> tuple[list[float | 
     with TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive)) as tar:
         tar.extractall(folder, filter='data')
         arguments = study.robot.description.directory.resolve(), str(seed), *folders
-        said = _output([sys.executable, '-c', FROZEN_RUN, *arguments], cwd=folder)
+        try:
+            said = _output([sys.executable, '-c', FROZEN_RUN, *arguments], cwd=folder)
+        except subprocess.CalledProcessError as error:  # as of a robot that it cannot read yet
+            last = error.stderr.decode(errors='replace').strip().rpartition('\n')[2]
+            why = printable(last) or f'status {error.returncode}'
+            return nothing, f'no frozen learner: that of commit {FROZEN} ended with {why}'
     return [float(line.split()[1]) for line in said.splitlines() if line.startswith(b'frozen')], ''
 
 
