@@ -5,7 +5,8 @@
 
 An experiment of one individual starts as soon as that individual is learned. Every part draws from
 its own seeds, so that the numbers are the same however the parts are spread. A part that fails
-takes only those with it that need it.
+takes only those with it that need it. What runs as a worker is killed, as without memory, runs
+again, one part at a time, and fails if its worker is killed then, too.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from typing import Any
 
@@ -27,6 +29,7 @@ EXPERIMENTS = {
 }
 LEARNING = 'online_learning'
 POLL = 0.5  # [s] between two reports
+Part = tuple[str, int]  # an experiment and a seed; or a preset to train
 
 # Threads of the numeric libraries would fight with the processes for the cores.
 SINGLE = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}
@@ -51,19 +54,38 @@ def run(
     # The longest first, so that none of them is alone at the end.
     others = sorted(set(names) - {LEARNING}, key=weights.__getitem__, reverse=True)
     measured: dict[str, dict[int, Measured | str]] = {name: {} for name in names}
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start)
-    done, running = 0.0, dict[Future[Any], tuple[str, int]]()
+    pool = _pool(jobs)
+    waiting: list[Part] = [(preset, -1) for preset in PRESETS]
+    suspects: list[Part] = []  # ran as a worker was killed; the first is next, or running, alone
+    done, running, broken = 0.0, dict[Future[Any], Part](), False
 
-    def submit(name: str, seed: int) -> None:
-        running[pool.submit(_measure, name, study, seed)] = name, seed
+    def begin(name: str, seed: int) -> None:
+        train = online_learning.train_initial, study, name
+        try:
+            future = pool.submit(*(train if name in PRESETS else (_measure, name, study, seed)))
+        except BrokenProcessPool as error:  # since the last look at it
+            future = Future()
+            future.set_exception(error)
+        running[future] = name, seed
 
     try:
-        for preset in PRESETS:
-            running[pool.submit(online_learning.train_initial, study, preset)] = preset, -1
-        while running:
+        while waiting or suspects or running:
+            if broken and not running:
+                pool.shutdown()
+                pool, broken = _pool(jobs), False
+            if suspects and not running:
+                begin(*suspects[0])
+            while waiting and not suspects and not broken and len(running) < jobs:
+                begin(*waiting.pop(0))
             ended, _ = wait(running, POLL, FIRST_COMPLETED)
             for future in ended:
                 (name, seed), error = running.pop(future), future.exception()
+                broken |= isinstance(error, BrokenProcessPool)
+                if (name, seed) in suspects:
+                    suspects.remove((name, seed))
+                elif isinstance(error, BrokenProcessPool):
+                    suspects.append((name, seed))
+                    continue
                 done += weights.get(name, 1.0)  # initial training: 1
                 if error:
                     for lost in names if name in (LEARNING, *PRESETS) else (name,):
@@ -73,11 +95,9 @@ def run(
                 if name in measured:
                     measured[name][seed] = future.result()
                 if name == LEARNING:
-                    for other in others:
-                        submit(other, seed)
-                elif name in PRESETS and not running and not measured[names[0]]:  # both are trained
-                    for each in study.seeds:
-                        submit(LEARNING, each)
+                    waiting += [(other, seed) for other in others]
+                elif name in PRESETS and not (waiting or suspects or running or measured[names[0]]):
+                    waiting += [(LEARNING, each) for each in study.seeds]  # both are trained
             report(done / total, ', '.join(sorted({name for name, _ in running.values()})))
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -86,6 +106,10 @@ def run(
         raise
     pool.shutdown()
     return {name: {seed: measured[name][seed] for seed in study.seeds} for name in names}
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start)
 
 
 def _measure(name: str, study: Study, seed: int) -> Measured:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
 
@@ -79,6 +81,34 @@ def test_a_part_that_fails_is_told_everywhere_and_the_others_go_on(
     assert list(content['seeds']) == ['0']
     assert f'body_change of individual 1: {told}' in (tmp_path / 'report.html').read_text('utf-8')
     assert f'Failed: body_change of individual 1: {told}' in readme_table(read(tmp_path))
+
+
+def is_killed(name, study, seed):
+    """Kill the worker of individual 0, at first while individual 1 is being measured."""
+    if name == 'body_change':
+        begun = study.folder / f'{seed}'
+        first = not begun.exists()
+        begun.touch()
+        if first:  # one waits for the other here
+            (study.folder / 'fifo').open('rw'[seed]).close()
+        if seed == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if first:
+            signal.pause()
+    return Measured({'error_rad': 0.5}, {})
+
+
+def test_of_what_runs_as_a_worker_is_killed_only_that_fails_whose_worker_is_killed_again(
+    arm26, tmp_path, monkeypatch
+):
+    os.mkfifo(tmp_path / 'fifo')
+    monkeypatch.setattr(online_learning, 'train_initial', learns)
+    monkeypatch.setattr(runner, '_measure', is_killed)
+    study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
+    names = 'online_learning', 'body_change', 'sensors'
+    measured = runner.run(study, names, 2, lambda *_: None)
+    assert measured['body_change'].pop(0).startswith('BrokenProcessPool in body_change')
+    assert all(isinstance(each, Measured) for rows in measured.values() for each in rows.values())
 
 
 def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
