@@ -35,6 +35,7 @@ from musculoskeletal_ae.emulator.wires import (
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
+from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
 GUIDES_EVERY = 5  # steps
@@ -156,14 +157,13 @@ class ForeignArm(Arm):
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
         self._hand = model.body(mjcf.HAND).id
-        names = [model.body(i).name for i in range(model.nbody)]
-        self._root = names.index(robot.root_link) if file and robot.root_link in names else 0
         self._guides = self._make_guides()
         muscles = robot.muscle_count
         self._memory = Memory(*(np.zeros(muscles) for _ in Memory._fields))
         self._memory = self._memory._replace(slow=np.zeros((muscles, len(TIMES))))
         still = np.zeros(muscles)
         body.look(data, 0.5 * (robot.lower + robot.upper))
+        self._root = self._root_pose() if file else pin.SE3.Identity()
         guides_step(self._guides, still, self._memory.bend, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
         theta = robot.random_postures(500, np.random.default_rng(0))
@@ -187,6 +187,22 @@ class ForeignArm(Arm):
         load = robot.joint_load(torque, body.muscle_jacobian(theta))
         joints = [self._model.joint(name).dofadr[0] for name in robot.joints]
         self._model.dof_frictionloss[joints] = load * draw.about('joint_friction', len(joints))
+
+    def _root_pose(self) -> pin.SE3:
+        """Return where a file has the robot's root link, joints mid-range.
+
+        The link nearest to it that is in the file tells: `import_robot` renames, cuts, and puts an
+        upright root below one that leans.
+        """
+        robot, model, data = self.robot, self._model, self._data
+        known = mjcf.bodies_as_imported(model)
+        links = [str(frame.name) for frame in body_frames(robot.description.model)]  # root first
+        # The end effector is in the file, by `from_file`.
+        link = next((link for link in links if link in known), robot.description.end_effector)
+        i = known.get(link, self._hand)
+        there = pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i])
+        theta = 0.5 * (robot.lower + robot.upper)
+        return there * robot.kinematics.link_pose(theta, link).inverse()
 
     def _make_guides(self) -> Guides:
         model, data, tendons, sites = self._model, self._data, self.individual.tendons, []
@@ -273,7 +289,7 @@ class ForeignArm(Arm):
         data.ctrl[self._control] = self._pull
         data.qfrc_applied[:] = 0.0
         if self._wrench.any():
-            turn = data.xmat[self._root].reshape(3, 3)
+            turn = self._root.rotation
             push, twist = turn @ self._wrench[:3], turn @ self._wrench[3:]
             at = data.xpos[self._hand]
             mujoco.mj_applyFT(model, data, push, twist, at, self._hand, data.qfrc_applied)
@@ -307,14 +323,10 @@ class ForeignArm(Arm):
     @property
     def hand(self) -> pin.SE3:
         """True pose of the end effector in the root link's frame."""
-        data = self._data
-        root, hand = (
-            pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i]) for i in (self._root, self._hand)
-        )
-        return root.actInv(hand)
+        data, i = self._data, self._hand
+        return self._root.actInv(pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i]))
 
     def route_points(self) -> Array:
         """True route points in the root link's frame [m], shape (P, 3)."""
-        root, data = self._root, self._data
-        points: Array = data.site_xpos[self._guides.site] - data.xpos[root]
-        return points @ data.xmat[root].reshape(3, 3)
+        points: Array = self._data.site_xpos[self._guides.site] - self._root.translation
+        return points @ self._root.rotation

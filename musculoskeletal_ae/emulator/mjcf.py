@@ -295,6 +295,15 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
     return next((name for name, safe in new['body'].items() if safe == hand), hand)
 
 
+def bodies_as_imported(model: Any) -> dict[str, int]:
+    """Return the bodies of a file by their own names and by those that `import_robot` gives."""
+    own = {model.body(i).name: i for i in range(model.nbody)}
+    del own[HAND]
+    ours = [i for i in range(model.nbody) if model.body(i).name != HAND]
+    given = names_of_all('body', (model.body(i).name for i in ours))
+    return own | dict(zip(given, ours, strict=True))
+
+
 def _pulled(spec: Any, robot: Robot) -> Any:
     """Return the model with a motor on the tendon of each muscle."""
     spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -221,6 +221,36 @@ def test_a_users_model_plays_the_robot(imported):
     assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
 
 
+@pytest.mark.parametrize(
+    ('old', 'new', 'base', 'root'),
+    [
+        ('', '', '', 'world'),
+        ('', '', 'base', 'base_upright'),
+        ('', '', 'upper', 'upper_upright'),
+        ('euler="0.2 0 0.1"', '', 'base', 'base'),
+        ('name="base"', 'name="my base"', 'my_base', 'my_base_upright'),
+        ('<worldbody>', '<option gravity="0 -9.81 0"/><worldbody>', '', 'world_upright'),
+    ],
+)
+def test_a_users_model_stands_where_the_robots_root_is(tmp_path, old, new, base, root):
+    file, push = tmp_path / 'own.xml', np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    file.write_text(bodies.MJCF.replace(old, new), encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'own', base=base).robot
+    assert robot.root_link == root
+    arm = make_arm(robot, 0, str(file))
+    theta = robot.random_postures(1, np.random.default_rng(0))[0]
+    arm.reset(theta)
+    hand = robot.kinematics.end_effector_pose(arm.theta)
+    np.testing.assert_allclose(arm.hand.homogeneous, hand.homogeneous, atol=1e-6)
+    points = robot.routes.points(theta[None])[0]
+    np.testing.assert_allclose(arm.route_points(), points, atol=1e-6)
+    arm.set_wrench(push)
+    arm.step(0.001)
+    applied = arm._data.qfrc_applied[arm._order]
+    due = robot.kinematics.end_effector_jacobian(theta).T @ push
+    np.testing.assert_allclose(applied[:2], due[:2], atol=0.01)  # beside what is coupled
+
+
 def test_what_a_file_says_of_its_own_actuators_is_not_of_the_modules(imported, tmp_path):
     file, robot = imported
     other, tendon = tmp_path / 'other.xml', '<spatial name="front"'
