@@ -143,9 +143,7 @@ class ForeignArm(Arm):
         self.effects = (effects or Effects()) if file is None else NONE
         draw = self._draw = Draw(seed, self.effects)
         try:
-            model = self._model = (
-                mjcf.from_file(robot, file).compile() if file else _directory(robot, draw)
-            )
+            model = self._model = mjcf.from_file(robot, file) if file else _directory(robot, draw)
         except ValueError as error:
             told = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error

@@ -21,6 +21,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.mjcf import resting_joints
 from musculoskeletal_ae.importing.source import names_of_all
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
@@ -222,7 +223,9 @@ def _loading(file: Path) -> Iterator[None]:
 
 
 def from_file(robot: Robot, file: Path) -> Any:
-    """Return a user's own MJCF arm as an MjSpec; other joints than the robot's are held.
+    """Return the model of a user's own MJCF arm; other joints than the robot's are held.
+
+    They are held where `import_robot` holds them.
 
     Raises:
         MusculoskeletalError: If MuJoCo does not load it, or what the robot's directory names is not
@@ -240,6 +243,11 @@ def from_file(robot: Robot, file: Path) -> Any:
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
+            for ball in [j.name for j in spec.joints if j.type == kinds.mjJNT_BALL]:
+                if kind == 'joint' and missing[0].startswith(f'{ball}_'):
+                    told = f'{ball!r} is a ball joint there, {missing[0]!r} of'
+                    told = f'{told} {robot.description.directory} a part of it'
+                    raise _refusal(file, f'{told}; write it as three hinges')
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
     given_kinds = {joint.name: joint.type for joint in spec.joints}
@@ -249,13 +257,19 @@ def from_file(robot: Robot, file: Path) -> Any:
             what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))
             told = f'joint {name!r} is a {what}, of {robot.description.directory} a {legal}'
             raise _refusal(file, f'{told}; import_robot')
-    for thing in [*spec.actuators, *spec.sensors, *spec.keys]:
+    for thing in [*spec.actuators, *spec.sensors, *spec.keys, *spec.tuples]:  # which name others
         spec.delete(thing)
     held = [joint for joint in spec.joints if joint.name not in followers]
     gone = {joint.name for joint in held if joint.name}
-    for tie in [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]:
-        if not gone.isdisjoint([tie.name1, tie.name2]):
-            spec.delete(tie)
+    ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]
+    ties = [tie for tie in ties if not gone.isdisjoint([tie.name1, tie.name2])]
+    moved = list[tuple[Any, dict[str, Array]]]()
+    if ties:
+        with _loading(file):
+            whole = spec.compile()
+        moved = _moved_by(whole, spec, held)
+    for tie in ties:
+        spec.delete(tie)
     for tie in [tendon for tendon in spec.tendons if tendon not in tendons]:
         if not gone.isdisjoint(wrap.target.name for wrap in tie.path):
             spec.delete(tie)
@@ -264,7 +278,38 @@ def from_file(robot: Robot, file: Path) -> Any:
     for joint in spec.joints:  # limits of what the file's own actuators do
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     _add_hand(spec.body(hand), pin.SE3.Identity())
-    return _pulled(spec, robot)
+    with _loading(file):
+        model = _pulled(spec, robot).compile()
+    for thing, values in moved:
+        for name, value in values.items():
+            getattr(model, name)[thing.id] = value
+    if moved:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _moved_by(model: Any, spec: Any, held: list[Any]) -> list[tuple[Any, dict[str, Array]]]:
+    """Return bodies and joints of a file that stand elsewhere in their parents, as joints are held.
+
+    Each comes with values for the model that has no such joints any more.
+    """
+    rest, data = resting_joints(model), mujoco.MjData(model)
+    for joint in held:
+        if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            data.qpos[model.jnt_qposadr[joint.id]] = rest[joint.id]
+    mujoco.mj_kinematics(model, data)
+    poses = [pin.SE3(turn.reshape(3, 3), at) for turn, at in zip(data.xmat, data.xpos)]
+    holders, moved = {joint.parent.id for joint in held}, list[tuple[Any, dict[str, Array]]]()
+    for body in spec.bodies:
+        if body.id in holders:
+            pose = poses[model.body_parentid[body.id]].actInv(poses[body.id])
+            moved.append((body, {'body_pos': pose.translation, 'body_quat': _turn(pose.rotation)}))
+    for joint in spec.joints:
+        if joint.parent.id in holders and joint not in held:  # on which a held one may follow
+            pose, i = poses[joint.parent.id], joint.id
+            axis = pose.rotation.T @ data.xaxis[i]
+            moved.append((joint, {'jnt_pos': pose.actInv(data.xanchor[i]), 'jnt_axis': axis}))
+    return moved
 
 
 def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
@@ -280,17 +325,24 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
     for kind, things in kinds.items():
         ordered = sorted(things, key=lambda thing: thing.id)
         names = names_of_all(kind, (thing.name for thing in ordered))
+        called = list[tuple[Any, str]]()
         for thing, name in zip(ordered, names, strict=True):
             before = thing.name
-            if kind == 'joint' and before in bound and name != before and name in wanted:
+            # What has a name that another is to have has to give it up.
+            called_so = kind != 'body' and not {before, name}.isdisjoint(wanted)
+            if kind == 'joint' and before in bound and name != before and called_so:
                 told = f'tendon {bound[before]!r} is of joint {before!r}, which import_robot calls'
                 raise _refusal(file, f'{told} {name!r}; call it so in the file')
-            if not before or (kind != 'body' and name in wanted):
-                thing.name = name
+            if not before or called_so:
+                called.append((thing, name))
+                thing.name = ''
             new[kind][before or name] = name
+        for thing, name in called:
+            thing.name = name
     ties = {mujoco.mjtEq.mjEQ_JOINT: 'joint', mujoco.mjtEq.mjEQ_TENDON: 'tendon'}
     for tie in [e for e in spec.equalities if e.type in ties]:
-        again = {old: name for old, name in new[ties[tie.type]].items() if name in wanted}
+        pairs = new[ties[tie.type]].items()
+        again = {old: name for old, name in pairs if not {old, name}.isdisjoint(wanted)}
         tie.name1, tie.name2 = (again.get(name, name) for name in (tie.name1, tie.name2))
     return next((name for name, safe in new['body'].items() if safe == hand), hand)
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.importing.source import Source, distinct, names_of_all, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
+from musculoskeletal_ae.robot.kinematics import resolved
 
 #: where a model says how many it has of each kind that has names here
 COUNTS = {
@@ -43,6 +44,15 @@ def read_mjcf(file: Path, _root: ET.Element) -> Source:
     for warning in warnings:
         source.note('MuJoCo warns', ' '.join(warning.split()))
     return source
+
+
+def resting_joints(model: Any) -> list[float]:
+    """Return where `import_robot` holds each hinge and slide of a model, if it leaves it out."""
+    reader = _Reader(model, '')
+    source = reader.source
+    source.couplings = resolved(source.couplings)
+    source.settle()
+    return [source.rest.get(name, 0.0) for name in reader.names['joint']]
 
 
 class _Reader:

@@ -140,6 +140,11 @@ class Source:
             told = f'{slave} follows {master} by a line, off by up to {error:.3g}'
             self.note('approximated', f'joint {told} {"m" if self.slides(slave) else "rad"}')
 
+    def settle(self) -> None:
+        """Let coupled joints rest where those that they follow put them."""
+        for slave, c in self.couplings.items():
+            self.rest[slave] = c.ratio * self.rest.get(c.master, 0.0) + c.offset
+
 
 def numbers(text: str | None, count: int, where: str) -> Array:
     """Return numbers of an XML text; a ValueError says where they are not."""
@@ -231,9 +236,8 @@ def cut(
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
         # A joint whose coupled one is in the chain moves the chain as well.
         wanted &= above | {c.master for slave, c in couplings.items() if slave in above}
+    source.settle()
     source.couplings = {s: c for s, c in couplings.items() if s in movable and c.master in wanted}
-    for slave, c in couplings.items():
-        source.rest[slave] = c.ratio * source.rest.get(c.master, 0.0) + c.offset
     velocity = np.zeros(model.nv)
     for name, value in source.rest.items():
         velocity[model.joints[model.getJointId(name)].idx_v] = value

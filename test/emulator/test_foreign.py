@@ -321,6 +321,63 @@ def test_what_ties_joints_that_are_held_is_left_out(imported, tmp_path):
     assert make_arm(imported[1], 0, str(other))._model.neq == 1
 
 
+@pytest.mark.parametrize('tie', ['joint1="more"', 'joint1="more" joint2="swing"'])
+def test_what_the_file_ties_is_held_where_import_robot_holds_it(tmp_path, tie):
+    file, text = tmp_path / 'own.xml', bodies.MJCF
+    axis = 'axis="1 0 0.2" range="-1 1" limited="true" pos="0 0.02 0" ref="0.1"'
+    for name, place in {'more': '<joint name="elbow"', 'other': '<site name="l1"'}.items():
+        text = text.replace(place, f'<joint name="{name}" {axis}/>{place}')
+        tied = tie.replace('more', name)
+        equality = f'<equality><joint {tied} polycoef="0.4 0.3 0.1 0 0"/>'
+        text = text.replace('<equality>', equality)
+    file.write_text(text, encoding='utf-8')
+    chain = {'joints': ['lift', 'elbow'], 'muscles': ['out', 'in', 'bend', 'stretch', 'curler']}
+    robot = import_robot(file, tmp_path / 'own', **chain).robot
+    arm = make_arm(robot, 0, str(file))
+    assert arm.warnings == ()
+    theta = robot.random_postures(5, np.random.default_rng(0))
+    arm.reset(theta[0])
+    hand = robot.kinematics.end_effector_pose(arm.theta)
+    np.testing.assert_allclose(arm.hand.homogeneous, hand.homogeneous, atol=1e-6)
+    lengths = robot.routes.absolute_lengths(theta)
+    np.testing.assert_allclose(arm.individual.absolute_lengths(theta), lengths, atol=1e-6)
+
+
+def test_what_names_what_is_left_out_is_left_out(imported, tmp_path):
+    other, motor = tmp_path / 'other.xml', '<element objtype="actuator" objname="m1"/>'
+    group = f'<custom><tuple name="motors">{motor}</tuple></custom></mujoco>'
+    other.write_text(bodies.MJCF.replace('</mujoco>', group), encoding='utf-8')
+    assert make_arm(imported[1], 0, str(other))._model.ntuple == 0
+
+
+def test_names_that_import_robot_makes_of_each_other_are_told_apart(tmp_path):
+    file, text = tmp_path / 'own.xml', bodies.MJCF
+    for old, new in {'bend': 's h', 'stretch': 's_h', 'swing': 'j 1', 'lift': 'j_1'}.items():
+        text = text.replace(f'"{old}"', f'"{new}"')
+    file.write_text(text, encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'own').robot
+    assert {'s_h', 's_h_'} < set(robot.muscles) and robot.joints[:2] == ('j_1', 'j_1_')
+    assert make_arm(robot, 0, str(file)).warnings == ()
+
+
+def test_a_missing_mesh_is_refused_as_what_mujoco_does_not_load(imported, tmp_path):
+    other, mesh = tmp_path / 'other.xml', '<asset><mesh name="m" file="nope.stl"/></asset>'
+    other.write_text(bodies.MJCF.replace('<worldbody>', f'{mesh}<worldbody>'), encoding='utf-8')
+    with pytest.raises(MusculoskeletalError, match=r'MuJoCo does not load it: .*nope'):
+        make_arm(imported[1], 0, str(other))
+
+
+def test_a_ball_joint_that_was_imported_is_to_be_written_as_hinges(tmp_path):
+    file, end = tmp_path / 'own.xml', ' ref="0.2" limited="true"/>'
+    first = '<joint name="swing" axis="0 1 0" range="-1 1.2" pos="0 0 0.01"'
+    second = '<joint name="lift" axis="1 0.1 0" range="-0.6 0.6" limited="true"/>'
+    text = bodies.MJCF.replace(f'{first}{end}', '<joint name="ball" type="ball" range="0 0.6"/>')
+    file.write_text(text.replace(second, ''), encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'own').robot
+    with pytest.raises(MusculoskeletalError, match=r"'ball' is a ball joint there, .*three"):
+        make_arm(robot, 0, str(file))
+
+
 def test_a_file_whose_names_import_robot_had_to_change_plays_what_it_made_of_it(imported, tmp_path):
     text, other = bodies.MJCF, tmp_path / 'other.xml'
     for old, new in {'elbow': 'el/bow', 'front': 'front (left)', 'finger': 'a finger'}.items():
