@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ HOUR = 3600.0  # [s]
 BEDDING_TIME = 2.0 * HOUR  # [s]
 NUDGE = 1e-7  # [rad]
 SLIP_TIME = 5.0 * HOUR  # [s] between two slips of a wire on its spool
+OTHER_LIMITS = 0.02  # share of a joint's range by which a file's limits may be off
 OTHER_ROUTE = 0.02  # [m] by which a file's lengths are not off if its routes are the robot's
 
 
@@ -127,6 +129,20 @@ def _other_routes(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
     )
 
 
+def _other_limits(robot: Robot, file: Path, model: Any) -> Iterator[str]:
+    """Say which joints of a file have other limits than the robot's."""
+    for name, *due in zip(robot.joints, robot.lower, robot.upper):
+        joint = model.joint(name).id
+        given = model.jnt_range[joint] if model.jnt_limited[joint] else np.array([-np.inf, np.inf])
+        if np.abs(given - due).max() > OTHER_LIMITS * (due[1] - due[0]):
+            there = f'moves from {given[0]:.4g} to {given[1]:.4g} there'
+            yield (
+                f'reality {file}: joint {name!r} {there}, in {robot.description.directory} from '
+                f'{due[0]:.4g} to {due[1]:.4g}; its stops are those of the file: '
+                'give it the same range in both (MJCF counts in degrees unless told)'
+            )
+
+
 class ForeignArm(Arm):
     """An arm of MuJoCo."""
 
@@ -167,7 +183,8 @@ class ForeignArm(Arm):
         theta = robot.random_postures(500, np.random.default_rng(0))
         span = body.absolute_lengths(theta) - at_zero
         if file:
-            self.warnings = _other_routes(robot, file, span - robot.muscle_lengths(theta, still))
+            routes = _other_routes(robot, file, span - robot.muscle_lengths(theta, still))
+            self.warnings = *routes, *_other_limits(robot, file, model)
         self.wires = make_wires(robot, body.elastic, at_zero, span, bend, draw)
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
         self._draw_sensors()

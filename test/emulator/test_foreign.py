@@ -290,6 +290,21 @@ def test_a_model_whose_lengths_are_others_is_told_by_muscle_and_millimetres(impo
 
 
 @pytest.mark.parametrize(
+    ('given', 'told'),
+    [('range="-1.5 0.2" limited="true"', '-1.5 to 0.2'), ('limited="false"', '-inf to inf')],
+)
+def test_a_joint_whose_limits_are_others_is_told(imported, tmp_path, given, told):
+    other = tmp_path / 'other.xml'
+    text = bodies.MJCF.replace('range="-1.8 0.2" limited="true"', given)
+    other.write_text(text, encoding='utf-8')
+    (warning,) = make_arm(imported[1], 0, str(other)).warnings
+    assert (
+        f"joint 'elbow' moves from {told} there, in {imported[1].description.directory}" in warning
+    )
+    assert 'from -1.8 to 0.2' in warning
+
+
+@pytest.mark.parametrize(
     ('old', 'new', 'told'),
     [
         ('name="swing"', 'name="swung"', "joint 'swing'"),
