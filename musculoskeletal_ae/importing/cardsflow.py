@@ -134,6 +134,10 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
     model = source.model
     source.links = [str(frame.name) for frame in body_frames(model)]
+    for joint in root.findall('joint'):
+        parent, child = joint.find('parent'), joint.find('child')
+        if parent is not None and child is not None:
+            source.above[child.get('link', '')] = parent.get('link', '')
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for name, joint in zip(model.names[1:], model.joints[1:]):
         if joint.shortname() in KINDS:
@@ -180,6 +184,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     if set(order) != set(links) or not above.keys() <= links.keys():
         lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
         raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
+    source.above = above
     #: by link: number of the joint that carries it, and where that joint stands in the model
     stands: dict[str, tuple[int, pin.SE3]] = {}
     for name in order:

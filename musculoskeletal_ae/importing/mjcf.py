@@ -115,6 +115,8 @@ class _Reader:
             centre = at.inverse() * pin.SE3(data.ximat[i].reshape(3, 3), data.xipos[i].copy())
             link = self.name('body', i), carrier, stand.inverse() * at
             self.source.add_link(*link, centre.act(weight))
+            if i:
+                self.source.above[link[0]] = self.name('body', m.body_parentid[i])
 
     def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
         """Add a joint that stands at a pose in the carrier at the start; return its number."""

@@ -244,6 +244,7 @@ class _Reader:
                 mass, centre = _number(bodies[name], 'mass'), _vector(bodies[name], 'mass_center')
                 own = link_inertia(name, max(mass, 0.0), centre, tensor)
                 source.add_link(name, carrier, at * after, own)
+                source.above[name] = above
                 order.append(name)
         if lost := waiting.keys() | bodies.keys() - set(order):
             raise ValueError(f'body {min(lost)} does not hang on ground')

@@ -63,6 +63,7 @@ class Source:
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
     end_effector: str = ''
+    above: dict[str, str] = field(default_factory=dict)  # link that each link hangs on, where known
 
     def note(self, kind: str, told: str) -> None:
         """Remember, in a line, what was 'chosen', 'dropped', 'held fixed', 'renamed' and so on."""
@@ -146,6 +147,21 @@ class Source:
             self.rest[slave] = c.ratio * self.rest.get(c.master, 0.0) + c.offset
 
 
+def tip(source: Source) -> str:
+    """Return the link at the end of the longest chain: most joints, then most links on the last."""
+    model, depth = source.model, [0]
+    for i in range(1, model.njoints):
+        depth.append(depth[model.parents[i]] + (model.names[i] not in source.couplings))
+
+    def length(link: str) -> tuple[bool, int, int, int]:
+        joint, links, up = source.place(link)[0], 0, source.above.get(link)
+        while up in source.links and source.place(up)[0] == joint:
+            links, up = links + 1, source.above.get(up)
+        return joint > 0, depth[joint], links, source.links.index(link)
+
+    return max(source.links, key=length)
+
+
 def numbers(text: str | None, count: int, where: str) -> Array:
     """Return numbers of an XML text; a ValueError says where they are not."""
     try:
@@ -221,7 +237,6 @@ def cut(
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
         raise SourceError(f'--end {end}: it does not hang on --base {base}')
-    source.end_effector = end
     source.links = [name for name in links if source.place(name)[0] in inside]
     source.links.sort(key=lambda name: name != base)
     inner = [model.names[i] for i in inside if i not in (0, root)]
@@ -264,6 +279,9 @@ def cut(
         source.note('chosen', STRENGTH)
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note('chosen', f'tension of {count} muscles: the default, the source has none')
+    source.end_effector = end or tip(source)
+    if not end:
+        source.note('chosen', f'end effector {source.end_effector} (--end is another)')
     if not wanted:
         held = [note for note in source.notes if note.startswith('held fixed')]
         raise SourceError('; '.join(['no joint is left that moves', *held[:3]]))
@@ -333,8 +351,7 @@ def write(source: Source, out: Path) -> None:
             muscles[-1]['tension'] = {k: float(f'{v:.6g}') for k, v in tension.items()}
     joints = [name for name in source.model.names[1:] if name not in source.couplings]
     document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
-    if source.end_effector:
-        document['end_effector'] = source.end_effector
+    document['end_effector'] = source.end_effector
     if source.couplings:
         document['couplings'] = [{'joint': s, **c._asdict()} for s, c in source.couplings.items()]
     text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)

@@ -137,8 +137,9 @@ def load_description(robot: str | Path) -> RobotDescription:
         'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector',
         'end_effectors', 'couplings',
     )  # fmt: skip
-    joints = _read_joints(top['joints'], model)
-    couplings = _read_couplings(top, read_mimics(parse_xml(urdf_file, urdf)), joints, model)
+    joints, parsed = _read_joints(top['joints'], model), parse_xml(urdf_file, urdf)
+    couplings = _read_couplings(top, read_mimics(parsed), joints, model)
+    order = [link.get('name', '') for link in parsed.iter('link')]
     default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
     links = [str(frame.name) for frame in body_frames(model)]
     stiffness = top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0)
@@ -168,7 +169,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         series_elastic=SeriesElastic(**_columns(elastic, default)),
         stiffness=_columns(module, 'K')['K'],
         tension=TensionRange(**_columns(module, TENSION_DEFAULT)),
-        end_effectors=_read_end_effectors(top, model, joints, couplings),
+        end_effectors=_read_end_effectors(top, model, joints, couplings, order),
         couplings=couplings,
         warnings=tuple(warnings),
     )
@@ -319,7 +320,11 @@ def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
 
 
 def _read_end_effectors(
-    top: Entry, model: pin.Model, joints: tuple[str, ...], couplings: Iterable[str]
+    top: Entry,
+    model: pin.Model,
+    joints: tuple[str, ...],
+    couplings: Iterable[str],
+    order: Iterable[str],
 ) -> tuple[str, ...]:
     one, several = top.get('end_effector'), top.get('end_effectors')
     moved, links = _joints_above(model, {*joints, *couplings}), _joints_above(model, {*joints})
@@ -337,8 +342,21 @@ def _read_end_effectors(
         return (read(one),)
     if several.value is not None:
         return several.unique([read(item) for item in several.items(1, 'links')])
-    # The last link of the chain: of several on the same joint the one listed last.
-    return (max(reversed(links), key=links.__getitem__),)
+    # The last link of the chain: of several that so many joints move the tip of what is fixed to
+    # them, then the one listed last, as the file has them.
+    tips, last = _fixed_above(model), {link: i for i, link in enumerate(order)}
+    return (max(links, key=lambda link: (links[link], tips[link], last[link])),)
+
+
+def _fixed_above(model: pin.Model) -> dict[str, int]:
+    """Return how many fixed joints are between each link and the joint that moves it."""
+    counts = dict[str, int]()
+    for link in body_frames(model):
+        counts[str(link.name)], above = 0, link.parentFrame
+        while above > 0 and model.frames[above].type != pin.FrameType.JOINT:
+            counts[str(link.name)] += model.frames[above].type == pin.FrameType.FIXED_JOINT
+            above = model.frames[above].parentFrame
+    return counts
 
 
 def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:

@@ -67,6 +67,19 @@ def test_what_the_format_cannot_express_is_told_and_measured(
     assert max(result.errors.values()) < 1e-6
 
 
+@pytest.mark.parametrize('names', [('wrist', 'grip'), ('a', 'b'), ('b', 'a')])
+def test_the_end_effector_is_the_tip_of_the_chain_whatever_its_name(mjcf, tmp_path, names, capsys):
+    inner, tip = (f'<body name="{name}" pos="0 0 -0.05">' for name in names)
+    beside = '<body name="zz" pos="0.01 0 0"/>'
+    more = f'{inner}{tip}</body></body>{beside}<site name="hole"'
+    mjcf.write_text(mjcf.read_text().replace('<site name="hole"', more))
+    out = tmp_path / 'out'
+    assert main([str(mjcf), '--out', str(out)]) == 0
+    assert f'chosen: end effector {names[1]} ' in capsys.readouterr().out
+    assert f'\nend_effector: {names[1]}\n' in (out / 'muscles.yaml').read_text()
+    assert Robot.load(out).description.end_effector == names[1]
+
+
 def test_a_motor_on_a_tendon_pulls_what_its_control_range_and_gear_say(mjcf, tmp_path):
     muscle, motor = '<muscle name="m3" tendon="out" force="150"/>', '<motor tendon="out" gear="20" '
     motor += 'ctrllimited="true" ctrlrange="-1 0"/>'

@@ -202,6 +202,29 @@ def test_defaults_apply_where_the_optional_keys_are_left_out(tmp_path):
     assert (description.series_elastic.force > 0.0).all()
 
 
+@pytest.mark.parametrize('names', [('zz', 'aa'), ('aa', 'zz')])
+def test_of_links_on_the_last_joint_the_tip_is_the_end_effector_then_the_last(tmp_path, names):
+    directory = write_robot(tmp_path)
+    document, file = read_muscles(directory), directory / 'robot.urdf'
+    del document['end_effector']
+    write_muscles(directory, document)
+    links = ''.join(f'<link name="{name}"/>' for name in names)
+    fixed = '<joint name="to_{1}" type="fixed"><parent link="{0}"/><child link="{1}"/></joint>'
+    text = file.read_text()
+    for above, tip in (('tool', names[1]), (names[0], names[1]), (names[1], names[0])):
+        below = names[0] if tip == names[1] else names[1]
+        joints = fixed.format('tool', below) + fixed.format(above, tip)
+        file.write_text(text.replace('</robot>', f'{links}{joints}</robot>'))
+        assert load_description(str(directory)).end_effector == tip
+
+
+@pytest.mark.parametrize('name', shipped_robots())
+def test_shipped_robots_name_their_end_effectors(name):
+    text = (shipped_robots()[name] / 'muscles.yaml').read_text()
+    first = re.search(r'^end_effectors?: \[?(\w+)', text, re.M)[1]
+    assert load_description(name).end_effector == first
+
+
 def test_elastic_constants_of_one_muscle_override_those_of_all(tmp_path):
     directory = write_robot(tmp_path, series_elastic={'force': 80.0, 'rate': 25.0})
     document = read_muscles(directory)
