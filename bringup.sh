@@ -306,6 +306,10 @@ elif [ $hardware = false ]; then
   camera=()
   [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
   start hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")" "${camera[@]}"
+  # Whether a file is the same robot is for who started it to know, not for a log alone.
+  tail -n +1 -s 0.2 -f --pid="${pid_of[hardware_emulator]}" "$logs/hardware_emulator.log" \
+    </dev/null 2>/dev/null |
+    sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &
 fi
 
 [ -n "$checkpoint" ] || train_once

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import bodies
 import numpy as np
 import pytest
 from graph import DEADLINE, Graph, Process
@@ -19,6 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -171,6 +173,23 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     assert len(statuses(output)) >= 3, output
     assert 'hardware_emulator' not in output and 'controller' not in output
     assert left_behind(live) == left_behind(played) == ''
+
+
+def test_that_a_reality_is_another_robot_is_told_where_it_was_started(environment, tmp_path):
+    file = tmp_path / 'own.xml'
+    file.write_text(bodies.MJCF, encoding='utf-8')
+    import_robot(file, tmp_path / 'own')
+    file.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
+    run = bringup(environment, '--robot', str(tmp_path / 'own'), '--reality', str(file))
+    told = []
+    for line in iter(run.process.stdout.readline, ''):
+        told.append(line)
+        if line.startswith(f"-- reality {file}: joint 'elbow' moves from -1.5 to 0.2 there"):
+            break
+    else:
+        raise AssertionError(''.join(told))
+    run.end(signal.SIGINT)
+    assert left_behind(run) == ''
 
 
 @pytest.mark.parametrize(
