@@ -69,8 +69,8 @@ class _Reader:
         self.tendons: dict[str, int] = {}
         self._bodies()
         self._couplings()
-        self._tendons()
         self._not_modelled()
+        self._tendons()
         self.source.lengths = self._lengths
 
     def _names(self, kind: str) -> list[str]:
@@ -92,10 +92,16 @@ class _Reader:
             ('joint', 'springs', m.jnt_stiffness),
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
             ('tendon', 'springs', m.tendon_stiffness),
+            ('tendon', 'limits', m.tendon_limited),
+            ('tendon', 'damping', m.tendon_damping),
+            ('tendon', 'friction', m.tendon_frictionloss),
             ('body', 'compensated weight', m.body_gravcomp),
         ):
             if named := ', '.join(self.name(kind, i) for i in np.flatnonzero(values).tolist()):
                 self.source.note('dropped', f'{told}: {kind} {named}')
+        touching = int(np.count_nonzero(m.geom_contype | m.geom_conaffinity))
+        if m.npair or touching > 1:
+            self.source.note('dropped', f'contacts: {touching} geoms may touch each other')
 
     def _bodies(self) -> None:
         """Add links and joints; at the start a joint stands as its body does, in its anchor."""
@@ -176,24 +182,32 @@ class _Reader:
             else:
                 self.tendons[name] = t
                 self._route(name, range(first, first + m.tendon_num[t]))
-                source.strength[name] = max(driven.get(t, [0.0]))
+                known = [force for force in driven.get(t, []) if force < np.inf]
+                source.strength[name] = sum(known)
         if self.tendons and not driven:
             source.note('chosen', 'every tendon is a muscle: no actuator pulls any')
 
     def _strength(self, a: int) -> float:
-        m = self.model
-        gain, force = m.actuator_gainprm[a], np.inf
+        """Return what an actuator of a tendon can pull [N]; inf: the file does not limit it."""
+        m, ends = self.model, np.array([-np.inf, np.inf])
+        gain, gear = m.actuator_gainprm[a], m.actuator_gear[a][0]
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
             force = gain[2] if gain[2] >= 0.0 else gain[3] / max(m.actuator_acc0[a], 1e-15)
+            ends = np.array([-force, 0.0])
         elif (
             m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
             and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
             and m.actuator_ctrllimited[a]
         ):  # a motor
-            force = np.abs(gain[0] * m.actuator_ctrlrange[a]).max()
+            ends = gain[0] * m.actuator_ctrlrange[a]
         if m.actuator_forcelimited[a]:
-            force = min(force, np.abs(m.actuator_forcerange[a]).max())
-        return float(force * abs(m.actuator_gear[a][0])) if force <= STRONGEST else 0.0
+            ends = np.clip(ends, *m.actuator_forcerange[a])
+        # A force that shortens is negative in MuJoCo.
+        pull = float(max(-gear * ends)) if gear else 0.0
+        if pull <= 0.0:
+            told = f'actuator {self.name("actuator", a)}: it can only push, and a wire only pulls'
+            self.source.note('dropped', told)
+        return max(pull, 0.0) if pull <= STRONGEST else np.inf
 
     def _route(self, name: str, wraps: range) -> None:
         m, types = self.model, mujoco.mjtWrap

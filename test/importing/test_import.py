@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot, read_source
 from musculoskeletal_ae.importing.source import SourceError, cut, urdf
+from musculoskeletal_ae.robot.description import TENSION_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.import_robot import main
 
@@ -86,6 +87,44 @@ def test_a_motor_on_a_tendon_pulls_what_its_control_range_and_gear_say(mjcf, tmp
     mjcf.write_text(mjcf.read_text().replace(muscle, motor))
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.tension.limit[result.robot.muscles.index('out')] == pytest.approx(20.0)
+
+
+RANGE = 'tendon="out" ctrllimited="true" ctrlrange='
+FORCES = 'forcelimited="true" forcerange="-100 500"'
+
+
+@pytest.mark.parametrize(
+    ('actuators', 'limit'),
+    [
+        (f'<motor {RANGE}"-50 250"/>', 50.0),
+        (f'<motor gear="-2" {RANGE}"-50 100"/>', 200.0),
+        (f'<motor {RANGE}"-250 0" {FORCES}/>', 100.0),
+        (f'<motor {RANGE}"-250 0"/><motor gear="-1" {RANGE}"0 100"/>', 350.0),
+        (f'<muscle tendon="out" force="150" {FORCES}/>', 100.0),
+        (f'<motor {RANGE}"0 250"/>', None),
+        ('<muscle tendon="out" force="150" gear="-1"/>', None),
+    ],
+)
+def test_what_pushes_is_no_strength_and_what_pulls_together_adds(mjcf, tmp_path, actuators, limit):
+    muscle = '<muscle name="m3" tendon="out" force="150"/>'
+    mjcf.write_text(mjcf.read_text().replace(muscle, actuators))
+    result = import_robot(mjcf, tmp_path / 'out')
+    given = result.robot.tension.limit[result.robot.muscles.index('out')]
+    assert given == pytest.approx(limit or TENSION_DEFAULT['limit'])
+    assert any('it can only push' in note for note in result.notes) == (limit is None)
+
+
+def test_what_tendons_and_contacts_do_beside_pulling_is_said_to_be_dropped(mjcf, tmp_path):
+    more = 'limited="true" range="0 9" damping="1" frictionloss="2" stiffness="3" name="out"'
+    mjcf.write_text(mjcf.read_text().replace('name="out"', more))
+    notes = import_robot(mjcf, tmp_path / 'out').notes
+    for told in ('limits', 'damping', 'friction', 'springs'):
+        assert f'dropped: {told}: tendon out' in notes
+    assert any(re.match(r'dropped: contacts: \d+ geoms', note) for note in notes)
+    free = '<default><geom contype="0" conaffinity="0"/></default><worldbody>'
+    mjcf.write_text(mjcf.read_text().replace('<worldbody>', free))
+    notes = import_robot(mjcf, tmp_path / 'other').notes
+    assert not any('contacts' in note for note in notes)
 
 
 def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
