@@ -284,7 +284,10 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
             'one_way_joint',
             f'joint {robot.joints[joint]!r} has no muscle that pulls in direction '
             f'{missing}; muscles that act on it: {acting or "none"}',
-            f'a wire only pulls: lead a muscle {told.other} its axis',
+            f'a wire only pulls: lead a muscle {told.other} its axis'
+            if acting
+            else 'lead muscles past its axis, or leave it out: by import_robot --joints, or as '
+            'type="fixed" in robot.urdf',
         )
 
 

@@ -108,7 +108,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
         }.items():
             spread = np.percentile(values, [0, 5, 50, 100])
             told = [figure(value, 1, np.abs(spread).max()) for value in spread]
-            lines.append(f'{title:<44}' + ''.join(f'{value:>9}' for value in told))
+            lines.append(f'{title:<44}' + ''.join(f' {value:>8}' for value in told))
     return '\n'.join(lines)
 
 
@@ -134,10 +134,10 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     ]
     for name, row in zip(robot.muscles, spread):
         cells = [
-            '.' if np.abs(cell).max() < least else ''.join(f'{v:+5.{digits}f}' for v in cell)
+            '.' if np.abs(cell).max() < least else ' '.join(f'{v:+.{digits}f}' for v in cell)
             for cell, least, digits in zip(row, scale * matters, decimals)
         ]
-        lines.append(name.ljust(first) + ''.join(cell.rjust(width) for cell in cells))
+        lines.append(name.ljust(first) + ''.join(f' {cell.rjust(width - 1)}' for cell in cells))
     return '\n'.join([*lines, ''])
 
 

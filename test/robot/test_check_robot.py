@@ -211,6 +211,21 @@ def test_without_declared_actions_a_joint_pulled_one_way_only_is_named(tmp_path,
         assert fragment in line
 
 
+def test_a_joint_that_no_muscle_moves_is_to_be_left_out(tmp_path, capsys):
+    directory = write_robot(tmp_path, joints=['swing', 'lift', 'bend', 'finger'], finger=True)
+    _, printed, _ = verdict(capsys, directory, '--postures', 40)
+    (line,) = [row for row in printed.splitlines() if 'muscles that act on it: none' in row]
+    told = printed[printed.index(line) :]
+    assert 'import_robot --joints' in told and 'type="fixed" in robot.urdf' in told
+
+
+def test_columns_of_large_numbers_stay_apart(tmp_path, capsys):
+    directory = change(write_robot(tmp_path), in_millimetres)
+    _, printed, _ = verdict(capsys, directory, '--postures', 20)
+    assert re.search(r'[-+]\d{5,}', printed)
+    assert not re.search(r'\d[-+]\d', printed[printed.index('moment arms [mm]') :])
+
+
 def test_an_arm_too_heavy_for_its_muscles_is_named_with_the_joint_that_lacks_torque(
     tmp_path, capsys
 ):
