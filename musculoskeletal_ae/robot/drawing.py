@@ -77,7 +77,7 @@ def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool
     Or what of them is where the muscles are.
 
     Raises:
-        MusculoskeletalError: If it cannot be written, or the path's ending is none of a picture.
+        MusculoskeletalError: If it cannot be written.
     """
     from matplotlib.figure import Figure
 
