@@ -90,7 +90,7 @@ class ToldLoop(ClosedLoop):
 def approaches(arm: Arm, mae: Mae, seed: int, count: int, told: Told) -> Array:
     """Return distance from the target, of the estimate [rad], ‖T‖ beside its bound, (count², 3)."""
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
-    postures, ends = robot.random_postures(TRIES, rng), list[tuple[Any, Any]]()
+    postures, ends = robot.random_postures(TRIES, rng), list[tuple[Any, ...]]()
     for theta, least in holdable_postures(robot, postures, count, arm.individual.muscle_jacobian):
         for start in robot.random_postures(count, rng):
             loop = ToldLoop(arm, mae)

@@ -40,7 +40,8 @@ _HEAD = struct.Struct('<BQ')  # of a record: opcode and length
 _ANYWHERE = frozenset(Opcode)
 _IN_CHUNK = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
 _LONGEST_RUN = 1 << 20  # [bytes]
-_CDR = (b'\x00\x01', b'\x00\x00')
+CDR = 'cdr'  # the encoding of ROS 2
+_CDR_HEADS = (b'\x00\x01', b'\x00\x00')
 _NAME = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 _LONGEST_NAME = 256
 
@@ -188,7 +189,7 @@ class McapFile:
             raise ValueError(f'a message of channel {message.channel_id}, which is not there')
         if max(message.log_time, message.publish_time) > LATEST:
             raise ValueError('a message has a time beyond all ROS times')
-        if not topic.refused and message.data[:2] not in _CDR:
+        if not topic.refused and message.data[:2] not in _CDR_HEADS:
             raise ValueError('a message is not in CDR')
         topic.message_count += 1
         time, last = message.log_time, self.blocks[-1] if self.blocks else None
@@ -274,7 +275,7 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
     if schema is None:
         raise ValueError(f'topic {name} has schema {channel.schema_id}, which is not there')
     refused = ''
-    if channel.message_encoding != 'cdr':
+    if channel.message_encoding != CDR:
         refused = f'is encoded as {channel.message_encoding[:40]!r}, not cdr'
     elif not message_types.known(schema.name):
         refused = f'has the type {schema.name[:80]!r}, which is none of ROS 2 Jazzy'

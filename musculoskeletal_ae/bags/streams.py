@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import heapq
 import math
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
@@ -69,9 +69,8 @@ class Streams(NamedTuple):
         theta, muscle = np.array(rows, dtype=int).reshape(-1, 2).T
         values, time = self.muscles.values[muscle], time[muscle]
         isolated = np.full(values[:, 0].shape, -1)
-        if len(self.isolated.time):  # the first one was latched before it was heard
-            row = np.searchsorted(self.isolated.time, time, side='right') - 1
-            isolated[:] = self.isolated.values[row.clip(0)]
+        if len(self.isolated.time):
+            isolated[:] = self.isolated.values[_latched(self.isolated.time, time)]
         return Pairs(time, self.joints.values[theta], values[:, 0], values[:, 1], isolated)
 
 
@@ -106,8 +105,8 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         return np.isin(np.arange(muscles), found).astype(float)
 
     def states(message: Any, came: float) -> Array:
-        row = max(0, bisect_right(isolated.times, came) - 1)
-        ignored = np.flatnonzero(isolated.values[row]) if isolated.values else ()
+        last = isolated.values and isolated.values[_latched(isolated.times, came)]
+        ignored = np.flatnonzero(last)
         return read_array(message, len(QUANTITIES), muscles, ignored)
 
     def rows(count: int) -> Callable[[Any, float], Array]:
@@ -146,6 +145,11 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     if lost:
         reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += lost
     return Streams(theta, read, lengths, tensions, who_was, reception.rejected)
+
+
+def _latched(times: ArrayLike, when: ArrayLike) -> Any:
+    """Return which message was the last at some times; the first was latched before it came."""
+    return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
 
 
 def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:

@@ -17,11 +17,10 @@ from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
 from musculoskeletal_ae.bags import message_types, metadata
-from musculoskeletal_ae.bags.mcap_file import NO_SCHEMA
+from musculoskeletal_ae.bags.mcap_file import CDR, NO_SCHEMA
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
-CDR = 'cdr'  # the encoding of ROS 2
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 # A chunk is also closed when it has grown to this size.
 _LARGEST_CHUNK = 1 << 20  # [bytes]

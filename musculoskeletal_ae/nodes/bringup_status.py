@@ -40,8 +40,7 @@ class BringupStatus(Shell):
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')
         self.begun = time.monotonic()
-        self.theta: Array | None = None  # what joint sensors say
-        self.measured_at = -math.inf  # [s]
+        self.measured: tuple[float, Array | None] = -math.inf, None  # when [s], and θ
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
@@ -65,16 +64,17 @@ class BringupStatus(Shell):
         super().destroy_node()
 
     def _measured(self, theta: Array) -> None:
-        self.theta, self.measured_at = theta, time.monotonic()
+        self.measured = time.monotonic(), theta
 
-    def _forget_old(self) -> None:
-        if time.monotonic() - self.measured_at > OLD:
-            self.theta = None
+    @property
+    def theta(self) -> Array | None:
+        """What joint sensors say [rad] (D,); None while they are silent."""
+        at, theta = self.measured
+        return theta if time.monotonic() - at <= OLD else None
 
     def _estimated(self, theta: Array) -> None:
-        self._forget_old()
-        if self.theta is not None:
-            self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - self.theta))))
+        if (measured := self.theta) is not None:
+            self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
 
     def _print(self) -> None:
         now = time.monotonic()
@@ -83,7 +83,6 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        self._forget_old()
         means = (fmean(values or [math.nan]) for values in (self.errors, self.anomalies))
         told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []

@@ -316,36 +316,24 @@ def test_an_accelerometer_that_falls_silent_says_nothing_beside_one_that_is_hear
     assert np.isnan(gravity[kinematics.placement('forearm')[0]]).all()
 
 
-def test_an_update_that_ends_during_an_anomaly_is_not_used(learner, stage):
-    accept(learner, stage, 3)
-    learner.poll(0.0)
-    learner.training.released = False
-    learner.accept(stage.sample())
-    learner.poll(2.0)
-    updates = learner.updates
-    learner.anomaly(True)
-    learner.training.released = True
-    learner.poll(4.0)
-    assert learner.training.ready and learner.updates == updates
-    learner.anomaly(False)
-    jobs = len(learner.training.jobs)
-    learner.poll(6.0)
-    assert len(learner.training.jobs) == jobs + 1  # it is learned then
-
-
-def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stage):
+@pytest.mark.parametrize(
+    ('stop', 'goes_back'),
+    [(Learner.anomaly, True), (lambda learner, stopped: learner.enable(not stopped), False)],
+)
+def test_an_update_that_ends_while_nothing_is_learned_is_not_used(learner, stage, stop, goes_back):
     accept(learner, stage, 3)
     learner.poll(0.0)
     learner.training.released = False
     learner.accept(stage.sample())
     learner.poll(2.0)
     checkpoint, updates = learner.checkpoint, learner.updates
-    learner.enable(False)
+    stop(learner, True)
     learner.training.released = True
-    assert learner.poll(4.0) is None
+    published = learner.poll(4.0)
     assert learner.training.ready and learner.updates == updates
-    assert learner.checkpoint == checkpoint
-    learner.enable(True)
+    if not goes_back:  # to the network before, as on an anomaly
+        assert published is None and learner.checkpoint == checkpoint
+    stop(learner, False)
     jobs = len(learner.training.jobs)
     learner.poll(6.0)
     assert len(learner.training.jobs) == jobs + 1  # it is learned then

@@ -48,7 +48,7 @@ def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
     node._estimated(np.ones(2))
     node._print()
     assert 'error 1.414 rad  A 0.500' in capsys.readouterr().out
-    node.measured_at -= 2.0
+    node.measured = node.measured[0] - 2.0, node.measured[1]
     node._estimated(np.ones(2))
     node._print()
     assert 'error waits for joint_states' in capsys.readouterr().out
