@@ -168,6 +168,7 @@ environment_setup $view # installs nothing more without --view
 # run on another machine.
 [ $hardware = true ] ||
   export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+use_udp
 
 # One arm to a namespace. The lock is held until the last of what is started here has ended.
 in_use=/tmp/musculoskeletal_ae-${ROS_DOMAIN_ID:-0}-${namespace//\//.}.lock

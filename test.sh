@@ -29,6 +29,7 @@ wait
 
 # A graph of our own: not the network's, and not that of another run on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+use_udp
 export ROS_DOMAIN_ID=$(($$ % 33 * 3 + 1)) # and the next two: each process of pytest has its own
 export ROS_LOG_DIR=$repository/log/test
 # Its processes take all cores: torch's threads would only fight for them.

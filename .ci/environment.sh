@@ -320,6 +320,16 @@ build_package() {
 
 # --- all of it -----------------------------------------------------------------------------------
 
+# Where a node was killed, Fast DDS may leave shared memory through which its successor on the same
+# ports hears nothing (eProsima/Fast-DDS 4737, 5053, 5469). On one machine UDP costs no more. Where
+# the graph is kept to it, rmw_fastrtps adds shared memory whatever the first variable says, and the
+# file keeps messages out of that.
+use_udp() {
+  export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
+  [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||
+    export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$repository/config/udp.xml}
+}
+
 environment_setup() { # [test|view]
   local lock
   # Many containers set it; a dozen processes would each compile all of torch's sources.
@@ -354,9 +364,6 @@ environment_setup() { # [test|view]
   export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
   # The wheels are an installation of ROS like any other.
   [ "$ros" = wheels ] && export AMENT_PREFIX_PATH=$venv
-  # Where a node was killed, Fast DDS may leave shared memory through which its successor on the same
-  # ports hears nothing (eProsima/Fast-DDS 4737, 5053, 5469). On one machine UDP costs no more.
-  export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
   install_packages "$@"
   [ "${1-}" != test ] || install_chromium
   build_package

@@ -63,6 +63,14 @@ def left_behind(run):
     return running(run)
 
 
+def ports_in_shared_memory(run):
+    """Return the threads that wait there for messages: who succeeds a killed node may be deaf."""
+    pids = [line.split()[0] for line in running(run).splitlines()]
+    names = [file.read_text() for pid in pids for file in Path(f'/proc/{pid}/task').glob('*/comm')]
+    assert any(name.startswith('dds.udp.') for name in names)
+    return [name for name in names if re.match(r'dds\.shm\.\d', name)]
+
+
 def statuses(output):
     return [match for line in output.splitlines() if (match := STATUS.match(line))]
 
@@ -111,6 +119,7 @@ def test_two_arms_share_a_graph_one_learns_and_ctrl_c_ends_both_cleanly(environm
             )
         learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
         graph.wait(lambda: len(learned) > 6, 'six updates of the network', 8 * DEADLINE)
+        assert ports_in_shared_memory(left) == []
         graph.spin(5.0)  # a status line is printed once a second
     finally:
         graph.processes.clear()
