@@ -64,7 +64,8 @@ the network's multiply-adds at the rate of this machine's own products of matric
 `bench wire`: from the publishing of `muscle_states` to that of the command that answers it; late:
 after two periods; missed: messages that did not come; CPU: all nodes, learner and its training
 included. "Combined": estimator and controller in one process (`bringup.sh --combined`). "Plain
-node": what one would write, torch eager in one rclpy node, no safety, no control.
+node": what one would write, torch eager in one rclpy node, no safety, no control. "Messages alone":
+five nodes that exchange the same messages and compute nothing.
 
 {wire}
 
@@ -72,6 +73,8 @@ node": what one would write, torch eager in one rclpy node, no safety, no contro
 
 CPU until the first command or answer, with everything compiled before; resident memory, of which
 shared libraries, which all processes have once together, are {shared:.0f} MB of the estimator's.
+Messages alone: a node that computes nothing, with numpy and pinocchio loaded; who uses them in
+Python on rclpy has no less.
 
 {start}
 
@@ -149,8 +152,15 @@ def starting(network: Path) -> tuple[str, float]:
     said = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )
+    system = System(ARM, network, FLAME_RATE, KINDS['messages alone'])
+    try:
+        time.sleep(SETTLING)
+        floor, _ = resident(system.nodes['bare_estimator'].pid)
+    finally:
+        system.end()
     head = 'node | CPU until the first command [s] | memory before [MB] | now [MB]'
-    return rows(head, said), held['estimator'][1]
+    table = rows(head, (*said, ('messages alone', '', '', f'{floor:.0f}')))
+    return table, held['estimator'][1]
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:

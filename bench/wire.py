@@ -6,9 +6,10 @@
 Emulator, estimator, sim, controller and, where it says so, learner, as `bringup.sh` starts them,
 each in a process of its own, with the arm exploring. A message and the command that answers it are
 told by their numbers at the source: latency is from the publishing of muscle_states to that of the
-first muscle_length_command after it. Beside it estimator and controller in one process, and what a
-user would write: one plain rclpy node in which torch eager estimates and a tension is turned into a
-length, no safety, no control.
+first muscle_length_command after it. Beside it estimator and controller in one process; what a user
+would write: one plain rclpy node in which torch eager estimates and a tension is turned into a
+length, no safety, no control; and the floor: as many nodes that exchange the same messages, by the
+same executor, and compute nothing, so that no node in Python on this machine can do with less.
 
     late      no command within two periods
     missed    messages that the emulator should have sent, and that did not come
@@ -44,6 +45,7 @@ KINDS = {
     'combined': ('hardware_emulator', 'sim', 'combined'),
     'with learner': (*NODES, 'learner'),
     'plain node, torch': ('hardware_emulator', 'plain'),
+    'messages alone': tuple(f'bare_{name}' for name in (*NODES, 'learner')),
 }
 WARM_UP = 8.0  # [s] until the first message counts
 PLAIN = """
@@ -71,6 +73,52 @@ class Plain(Node):
         goal = l - np.maximum(T - 30.0, 0.0) / 1e4 + 0.0 * float(out[0, 0])
         self.out.publish(Float64MultiArray(data=goal.tolist()))
 rclpy.init(); rclpy.spin(Plain())
+"""
+#: node: when it publishes (at a message, or at its rate), what, and what else it hears
+BARE = {
+    'bare_hardware_emulator': ('', 'muscle_states joint_states', 'muscle_length_command'),
+    'bare_estimator': (
+        'muscle_states',
+        'estimated_joint_states estimated_joint_covariance estimated_muscle_states anomaly wrench',
+        'joint_states muscle_length_command',
+    ),
+    'bare_sim': ('', 'sim/joint_states sim/muscle_states', 'muscle_states muscle_length_command'),
+    'bare_controller': ('estimated_joint_states', 'muscle_length_command', 'muscle_states'),
+    'bare_learner': ('muscle_states', '', 'joint_states'),
+}
+ALONE = """
+import sys, rclpy
+from array import array
+from contextlib import suppress
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from musculoskeletal_ae.nodes.running import LeanExecutor
+from musculoskeletal_ae.robot.robot import Robot
+name, robot, rate, at, out, hears = sys.argv[1:]
+robot = Robot.load(robot)
+def kind(topic):
+    return JointState if topic.endswith('joint_states') else Float64MultiArray
+def message(topic):
+    if kind(topic) is JointState:
+        return JointState(name=robot.joints, position=[0.0] * robot.joint_count)
+    rows = 3 if topic.endswith('muscle_states') else 1
+    return Float64MultiArray(data=array('d', [0.0] * rows * robot.muscle_count))
+rclpy.init()
+node = rclpy.create_node(name)
+outs = [(node.create_publisher(kind(topic), topic, 10), topic) for topic in out.split()]
+def tell(_=None):
+    for publisher, topic in outs:
+        publisher.publish(message(topic))
+for topic in {at, *hears.split()} - {''}:
+    heard = tell if topic == at else lambda _: None
+    node.create_subscription(kind(topic), topic, heard, qos_profile_sensor_data)
+if not at:
+    node.create_timer(1.0 / float(rate), tell)
+with LeanExecutor() as executor, suppress(KeyboardInterrupt, ExternalShutdownException):
+    executor.add_node(node)
+    executor.spin()
 """
 
 
@@ -102,6 +150,8 @@ class System:
             command = [str(folder / name), '--ros-args', *values]
             if name == 'plain':
                 command = [sys.executable, '-c', PLAIN, str(network)]
+            if name in BARE:
+                command = [sys.executable, '-c', ALONE, name, robot, str(rate), *BARE[name]]
             self.nodes[name] = subprocess.Popen(command, **quiet)
         rclpy.init()
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
