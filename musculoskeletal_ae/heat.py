@@ -72,7 +72,8 @@ class Heat:
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ as first known
         self._sums: Array = np.zeros((2, count))
         self._passed, self._messages = 0.0, 0
-        self._ahead: list[tuple[Array, Array]] | None = None  # as `_look_ahead` finds it, if it did
+        #: by the highest temperature, as long as nothing else is known
+        self._limits: dict[float, tuple[Array, Array]] = {}
         #: muscles whose constants are not what they were when they were first known, and how
         self.changed: dict[int, str] = {}
 
@@ -92,15 +93,16 @@ class Heat:
 
         Between T_bias and tension.max; an unknown temperature limits nothing.
         """
-        if self._ahead is None:
-            self._ahead = self._look_ahead()
+        if highest in self._limits:
+            return self._limits[highest]
         found = []
-        for free, warming in self._ahead:
+        for free, warming in self._look_ahead():
             square = np.where(self._state[1] < highest, (highest - free) / warming, 0.0)
             most = np.sqrt(np.maximum(square, 0.0))
             most = np.where(self._known, most, np.inf)
             found.append(np.clip(most, self._tension.bias, self._tension.max))
-        return found[0], found[1]
+        self._limits = {highest: (found[0], found[1])}
+        return self._limits[highest]
 
     def step(self, tension: Array, housing: Array, dt: float) -> None:
         """Take T [N] and temperatures of the housings [°C] (M,), dt [s] after the last ones.
@@ -110,18 +112,19 @@ class Heat:
         known, measured = np.isfinite(housing), self._state[1]
         strange = known & ((np.abs(housing - measured) > JUMP) | ~self._known)
         self._state[1] = np.where(strange, housing, measured)
-        self._spoilt |= strange | (known != self._known)
+        changed = strange | (known != self._known)
+        if changed.any():
+            self._spoilt |= changed
+            self._limits = {}
         self._known = known
         self._sums += tension * tension, np.where(known, housing, 0.0)
         self._messages, self._passed = self._messages + 1, self._passed + dt
-        if strange.any():
-            self._ahead = None
         if self._passed < EVERY:
             return
         square, mean = self._sums / self._messages
         # One thermometer that fails tells nothing; windings warm all the same, and others tell.
         self._update(square, mean, known & ~self._spoilt, min(self._passed, LONGEST))
-        self._ahead, self._spoilt[:] = None, False
+        self._limits, self._spoilt[:] = {}, False
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
 
     def _update(self, square: Array, housing: Array, told: Bools, dt: float) -> None:

@@ -44,12 +44,13 @@ def read_array(
     Of ignored columns nothing counts: what is not finite there is returned as `unknown`, a
     temperature as NaN.
     """
-    if len(message.data) > MOST_ENTRIES:
-        raise MessageError('oversized', f'{len(message.data)} values, at most {MOST_ENTRIES}')
-    if len(message.data) == 0:
+    count = len(message.data)
+    if count > MOST_ENTRIES:
+        raise MessageError('oversized', f'{count} values, at most {MOST_ENTRIES}')
+    if count == 0:
         raise MessageError('empty', f'no values, expected {rows * columns}')
-    if len(message.data) != rows * columns:
-        raise MessageError('wrong length', f'{len(message.data)} values, not {rows * columns}')
+    if count != rows * columns:
+        raise MessageError('wrong length', f'{count} values, not {rows * columns}')
     given = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
     legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
     # Without labels or strides the sizes alone say the layout; what is given must match.
@@ -63,6 +64,9 @@ def read_array(
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
     values = np.array(message.data, dtype=float)
     finite = np.isfinite(values)
+    shape = (rows, columns) if rows > 1 else columns
+    if finite.all():
+        return values.reshape(shape)
     left_out = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
     values[left_out], finite[left_out] = unknown, True
     if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
@@ -70,7 +74,7 @@ def read_array(
         finite[2 * columns :] |= np.isnan(values[2 * columns :])
     if not finite.all():
         raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')
-    return values.reshape(rows, columns) if rows > 1 else values
+    return values.reshape(shape)
 
 
 def read_joints(
@@ -122,6 +126,12 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
 
     Where `some` are enough, the others are NaN.
     """
+    count, others = len(joints), {len(message.velocity), len(message.effort)}
+    # As nearly all messages are; the other way says what is wrong, and takes its time.
+    if [*message.name] == [*joints] and len(message.position) == count and others <= {0, count}:
+        theta = np.array(message.position, dtype=float)
+        if np.isfinite(theta).all():
+            return theta
     values = read_joints(message, joints, foreign_allowed=True, some=some)
     return np.array([values[name][0] if name in values else np.nan for name in joints])
 

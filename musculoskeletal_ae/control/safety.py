@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, median_of_rows
 from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
@@ -97,7 +97,7 @@ class SafetyFilter:
     def muscles(self, muscles: Muscles) -> Muscles:
         """Take new muscle_states; return the medians of the last three, isolated ones without T."""
         self._readings.append(muscles)
-        median = Muscles(*np.median(np.array(self._readings), axis=0))
+        median = Muscles(*median_of_rows(np.array(self._readings)))
         self.now = median._replace(tension=median.tension * self._robot.used)
         return self.now
 

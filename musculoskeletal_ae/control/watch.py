@@ -18,7 +18,7 @@ from collections import deque
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.heat import Heat
@@ -72,7 +72,7 @@ class Watch:
         possible = (temperature >= low) & (temperature <= high)
         self._temperatures.append(np.where(possible, temperature, -np.inf))
         pull = np.where(self._robot.used, tension, self._robot.description.tension.bias)
-        self.heat.step(pull, np.median(np.array(self._temperatures), axis=0), since)
+        self.heat.step(pull, median_of_rows(np.array(self._temperatures)), since)
 
     def pulled(self, tension: Array, now: float) -> None:
         """Take T [N] (M,) of the same muscle_states, without glitches."""
@@ -159,7 +159,7 @@ class Watch:
         return ''
 
     def _overheat(self) -> str:
-        now, robot = np.nan_to_num(self.heat.core, nan=-np.inf), self._robot
+        now, robot = np.fmax(self.heat.core, -np.inf), self._robot  # NaN is not known
         highest = self.settings.temperature_limit
         hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
         exhausted = (self.limit <= robot.tension.bias)[robot.used]

@@ -200,6 +200,9 @@ class AnomalyDetector:
         )
         far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
         told = far & self._robot.used
+        if not told.any():
+            self._stands, self._jammed[:] = length, 0.0
+            return None
         stands = told & (np.abs(length - self._stands) < STANDS)
         self._stands = np.where(stands, self._stands, length)
         self._jammed = np.where(stands, self._jammed + dt, 0.0)
@@ -218,6 +221,9 @@ class AnomalyDetector:
                 return None
             demand = np.full(len(tension), bias)
         torn = (tension < SLACK * demand) & (demand >= bias) & self._robot.used
+        if not (torn.any() or self._torn.any()):
+            self._winds_slack[:] = False
+            return None
         begins = torn & (self._torn == 0.0)
         # What an arm that moves makes shorter is no slack.
         beyond = length - self._robot.routes.relative_lengths(theta) if torn.any() else length

@@ -193,7 +193,9 @@ class Learner:
 
     @property
     def _used(self) -> Bools:
-        return ~np.isin(np.arange(self.robot.muscle_count), self.isolated)
+        used = np.ones(self.robot.muscle_count, dtype=bool)
+        used[list(self.isolated)] = False
+        return used
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Learn nothing of these muscles, and of all others as before; samples so far stay."""

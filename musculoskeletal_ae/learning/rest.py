@@ -12,7 +12,9 @@ messages therefore wait that long before they count.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter, deque
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +42,8 @@ class RestDetector:
         """Start with an empty window; `radian` is that of `SampleStore`."""
         self.settings, self.blind, self._radian = settings, blind, radian
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
+        # Rows from `_first` on are l of the window's readings: no new array while an arm moves.
+        self._lengths, self._first = np.empty((0, 1)), 0
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +60,7 @@ class RestDetector:
         Returns the mean of a rest that ended or is long enough.
         """
         self._time += dt
-        self._window.append((self._time, reading))
+        self._append(reading)
         if self.blind or _measured(reading):
             self._periods = self._periods[1], self._time - self._read_at
             self._read_at = self._time
@@ -65,6 +69,7 @@ class RestDetector:
         self._needed = max(self.settings.rest_time, readings)
         while self._time - self._window[0][0] > self._needed + 1e-9:
             self._window.popleft()
+            self._first += 1
         was_still, self._still = self._still, self._is_still()
         if not self._still and not was_still:
             return None
@@ -77,15 +82,27 @@ class RestDetector:
         rest, self._rest, self._span = self._rest, [], 0.0
         return Sample(*(_mean(np.array(column)) for column in zip(*rest))) if rest else None
 
+    def _append(self, reading: Sample) -> None:
+        held = min(len(self._window), MOST - 1)  # of which one goes when the window is full
+        self._first += len(self._window) - held
+        if self._first + held == len(self._lengths):
+            kept = self._lengths[self._first :]
+            self._lengths, self._first = np.empty((2 * held + 100, len(reading.length))), 0
+            self._lengths[:held] = kept
+        self._lengths[self._first + held] = reading.length
+        self._window.append((self._time, reading))
+
     def _is_still(self) -> bool:
         half = 0.5 * self._needed
         if self._time - self._window[0][0] <= 0.7 * self._needed:
             return False
-        middle = self._time - half
-        halves = [[r for t, r in self._window if (t > middle) == late] for late in (False, True)]
-        lengths = [np.array([r.length for r in part]) for part in halves]
+        cut = bisect_right(self._window, self._time - half, key=itemgetter(0))
+        middle, end = self._first + cut, self._first + len(self._window)
+        lengths = [self._lengths[self._first : middle], self._lengths[middle:end]]
         if not _unmoved(lengths, self.settings.rest_length_rate * half):
             return False
+        window = [reading for _, reading in self._window]
+        halves = window[:cut], window[cut:]
         angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
         if min(map(len, angles)) < LEAST_READINGS:
             return self.blind

@@ -18,7 +18,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, joint_message
+from musculoskeletal_ae.nodes.messages import (
+    LATCHED,
+    RELIABLE,
+    array_message,
+    is_heard,
+    joint_message,
+)
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
 from musculoskeletal_ae.robot.kinematics import body_frames
@@ -43,7 +49,7 @@ class Markers:
         node.create_timer(1.0 / MARKER_RATE, self._publish)
 
     def _publish(self) -> None:
-        if self._publisher.get_subscription_count() == 0 or not (lines := self._lines()):
+        if not is_heard(self._publisher) or not (lines := self._lines()):
             return
         message, names = MarkerArray(), iter(self._node.robot.muscles)
         for number, line in enumerate(lines):
@@ -119,8 +125,9 @@ class Arm(Shell):
         self, theta: Array, length: Array, tension: Array, temperature: Array
     ) -> None:
         """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,), as of now."""
-        if self._joints is not None:
+        if self._joints is not None and is_heard(self._joints):
             stamp = self.get_clock().now().to_msg()
             self._joints.publish(joint_message(self.robot.joints, theta, stamp))
-        rows = np.stack([length, tension, temperature])
-        self._muscles.publish(array_message(rows, 'quantity', 'muscle'))
+        if is_heard(self._muscles):
+            rows = np.array([length, tension, temperature])
+            self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

@@ -33,6 +33,7 @@ from musculoskeletal_ae.nodes.messages import (
     RELIABLE,
     SENSOR,
     array_message,
+    is_heard,
     joint_message,
     serve,
 )
@@ -205,12 +206,15 @@ class Estimator(Shell):
             self.gate.message(tension, from_zero, now)
         state = estimate.state
         self.joints.publish(joint_message(self.robot.joints, state.theta, clock.to_msg()))
-        if self.core.mae is not None and (covariance := self.core.mae.covariance) is not None:
+        covariance = None if self.core.mae is None else self.core.mae.covariance
+        if covariance is not None and is_heard(self.covariance):
             self.covariance.publish(array_message(covariance, 'joint', 'joint'))
-        restored = np.stack([state.length, state.tension])
-        self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
-        self.anomaly.publish(Float64(data=estimate.anomaly))
-        if (touch := estimate.touch) is not None:
+        if is_heard(self.muscles):
+            restored = np.array([state.length, state.tension])
+            self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
+        if is_heard(self.anomaly):
+            self.anomaly.publish(Float64(data=estimate.anomaly))
+        if (touch := estimate.touch) is not None and is_heard(self.wrench):
             wrench = WrenchStamped()
             wrench.header.stamp, wrench.header.frame_id = clock.to_msg(), self.root_frame
             wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force.tolist())))

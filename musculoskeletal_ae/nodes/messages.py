@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
@@ -30,7 +31,7 @@ def array_message(values: Array, *labels: str) -> Float64MultiArray:
     """Return a multi-array of values (…) with one label per dimension."""
     sizes = values.shape
     dimensions = [
-        MultiArrayDimension(label=label, size=size, stride=int(np.prod(sizes[i:])))
+        MultiArrayDimension(label=label, size=size, stride=math.prod(sizes[i:]))
         for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
     ]
     layout = MultiArrayLayout(dim=dimensions)
@@ -39,9 +40,14 @@ def array_message(values: Array, *labels: str) -> Float64MultiArray:
 
 def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointState:
     """Return a joint state of θ [rad] (D,)."""
-    message = JointState(name=joints, position=theta.tolist())
+    message = JointState(name=joints, position=array('d', theta.tobytes()))
     message.header.stamp = stamp
     return message
+
+
+def is_heard(publisher: Publisher) -> bool:
+    """Whether anybody listens: a message that nobody hears need not be made."""
+    return publisher.get_subscription_count() > 0
 
 
 def bytes_message(data: bytes) -> UInt8MultiArray:

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+from musculoskeletal_ae.arrays import median_of_rows
 from musculoskeletal_ae.control.safety import (
     LENGTH,
     LENGTH_MARGIN,
@@ -25,6 +27,13 @@ COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias[0], ROBOT.tension.max[
 COLD = np.full(COUNT, 25.0)
 LIMIT = np.full(COUNT, MAX)
 DT = 0.01
+VALUES = st.floats(-1e3, 1e3) | st.sampled_from([np.nan, -np.inf])
+
+
+@given(st.integers(1, 6).flatmap(lambda rows: arrays(float, (rows, 3), elements=VALUES)))
+@pytest.mark.filterwarnings('ignore:invalid value')
+def test_the_median_of_rows_is_that_of_numpy(rows):
+    np.testing.assert_array_equal(median_of_rows(rows), np.median(rows, axis=0))
 
 
 def muscles(length=0.0, tension=BIAS):

@@ -62,6 +62,22 @@ def test_a_moving_joint_or_wire_is_no_rest():
     assert run(RestDetector(DEFAULT), 3.0, length=lambda t: 0.01 * t) == []
 
 
+@pytest.mark.parametrize('before', [0.1, 0.7, 3.0, 12.3])
+def test_what_was_before_does_not_matter(before):
+    def theta(t):  # moves, rests from 0.5 s to 1.4 s, and moves
+        return max(0.0, 0.5 - t) + max(0.0, t - 1.4)
+
+    def rest(detector, before):
+        (found,) = run(detector, before + 3.0, *[lambda t: theta(t - before)] * 2)
+        return found
+
+    used = RestDetector(DEFAULT)
+    for _ in range(2):
+        found, expected = rest(used, before), rest(RestDetector(DEFAULT), 0.0)
+        np.testing.assert_allclose(found.length, expected.length, atol=1e-9)
+        used.reset()
+
+
 def test_what_slides_a_centimetre_a_second_is_no_rest():
     assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.01 * t)
     assert run(RestDetector(DEFAULT, radian=SLIDES), 3.0, theta=lambda t: 0.01 * t) == []
