@@ -19,15 +19,9 @@ REORDERING = 1_000_000_000  # [ns]
 class Reception:
     """Counts what is received."""
 
-    def __init__(
-        self, warn: Callable[[str], object], heard: Callable[[str, Any], object] | None = None
-    ) -> None:
-        """Nothing has come yet.
-
-        `warn` is told of the first rejection for each reason, `heard` of every message, with its
-        topic, that came neither twice nor late.
-        """
-        self._warn, self._heard = warn, heard
+    def __init__(self, warn: Callable[[str], object]) -> None:
+        """Nothing has come yet; `warn` is told of the first rejection for each reason."""
+        self._warn = warn
         self.last_rejected = ''  # what was wrong with the last one of them
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         self._received: Counter[str] = Counter()
@@ -48,7 +42,7 @@ class Reception:
         """
         before, last = 0, 0  # when the last one was sent [ns], and its number
 
-        def is_new(message: Any, info: dict[str, Any]) -> bool:
+        def is_new(info: dict[str, Any]) -> bool:
             nonlocal before, last
             sent, number = info['source_timestamp'], info['publication_sequence_number']
             late = sent > 0 and 0 <= before - sent < REORDERING and number <= last
@@ -57,17 +51,15 @@ class Reception:
                 return False
             self.turns[topic] += number < last
             before, last = sent, number
-            if self._heard:
-                self._heard(topic, message)
             return True
 
         def receive(message: Any, info: dict[str, Any]) -> None:
-            if is_new(message, info):
+            if is_new(info):
                 with self._counting(topic):
                     callback(message)
 
         async def receive_in_pieces(message: Any, info: dict[str, Any]) -> None:
-            if is_new(message, info):
+            if is_new(info):
                 with self._counting(topic):
                     await callback(message)
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.duration import Duration
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -49,7 +50,7 @@ class Controller(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
-        self.recording = StopRecording(self.resolve_topic_name)
+        self.recording: StopRecording = StopRecording(self.resolve_topic_name)
         self.latched = False  # the stop, as of the last step
         self.logged: list[str] = []
         self.publishers_of = {
@@ -88,10 +89,6 @@ class Controller(Shell):
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
-
-    def heard(self, topic: str, message: Any) -> None:
-        """Remember what came for the next stop's recording."""
-        self.recording.heard(topic, message)
 
     def destroy_node(self) -> None:
         """Let a recording be finished."""
@@ -214,7 +211,7 @@ class Controller(Shell):
         command = self.core.step(time.monotonic(), self.now())
         if command is not None:
             value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
-            message = array_message(value, 'muscle')
+            message = serialize_message(array_message(value, 'muscle'))
             self.publishers_of[command.kind].publish(message)
             self.core.sent_at = time.monotonic()
             self.recording.heard(f'muscle_{command.kind}_command', message)

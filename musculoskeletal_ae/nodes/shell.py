@@ -10,7 +10,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from inspect import iscoroutinefunction
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -25,6 +26,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
@@ -49,6 +51,9 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
 
+if TYPE_CHECKING:  # it needs what writes bags
+    from musculoskeletal_ae.nodes.stop_recording import StopRecording
+
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 MOST_ZERO = 10.0  # [m] of a length sensor
@@ -61,6 +66,7 @@ class Shell(Node):
 
     core: Any = None  # what computes
     hurried = True  # whether commands wait for it
+    recording: StopRecording | None = None  # told of every message that is new, before it is used
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
@@ -81,9 +87,7 @@ class Shell(Node):
         #: name of the root link's frame in messages that are published
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self._reception = Reception(
-            lambda text: warn(f'{text} (counted in /diagnostics)'), self.heard
-        )
+        self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
@@ -106,9 +110,6 @@ class Shell(Node):
     def report(self) -> Report:
         """Return what /diagnostics shows: what the core says, where there is one."""
         return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
-
-    def heard(self, topic: str, message: Any) -> None:
-        """Note a message before it is used."""
 
     def clock_jumped_back(self) -> None:
         """Forget buffers, rates and filters; latches stay."""
@@ -291,10 +292,13 @@ class Shell(Node):
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
         """Subscribe; what comes twice or late, or the callback refuses by raising, is counted."""
-        full = self.resolve_topic_name(topic)
+        full, recording = self.resolve_topic_name(topic), self.recording
+        if recording is not None:
+            callback = _recorded(recording, topic, kind, callback)
         receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
-        self.create_subscription(kind, topic, receive, qos)  # type: ignore[arg-type]
+        raw = recording is not None
+        self.create_subscription(kind, topic, receive, qos, raw=raw)  # type: ignore[arg-type]
 
     def follow_muscles(
         self,
@@ -449,6 +453,22 @@ class Shell(Node):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _recorded(
+    recording: StopRecording, topic: str, kind: type, callback: Callable[[Any], Any]
+) -> Callable[[bytes], Any]:
+    """Return what takes the bytes of a message, records them, and calls back with the message."""
+
+    def read(data: bytes) -> Any:
+        message = deserialize_message(data, kind)
+        recording.heard(topic, data)
+        return message
+
+    async def take_in_pieces(data: bytes) -> None:
+        await callback(read(data))
+
+    return take_in_pieces if iscoroutinefunction(callback) else lambda data: callback(read(data))
 
 
 @contextmanager

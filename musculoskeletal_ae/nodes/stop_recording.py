@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.logging import get_logging_directory
-from rclpy.serialization import serialize_message
 
 from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import TOPICS
@@ -49,10 +48,10 @@ class StopRecording:
         self.problem = ''  # why the last recording could not be written
         self.saved: Path | None = None  # the last one
 
-    def heard(self, topic: str, message: Any) -> None:
-        """Remember a message of one of `bags.topics.TOPICS`."""
+    def heard(self, topic: str, data: bytes) -> None:
+        """Remember a message of one of `bags.topics.TOPICS`, in CDR."""
         now = time.time_ns()
-        self._recent.append((now, topic, serialize_message(message)))
+        self._recent.append((now, topic, data))
         while len(self._recent) > MOST or self._recent[0][0] < now - int(SECONDS * 1e9):
             left = self._recent.popleft()
             if TOPICS[left[1]].latched:

@@ -7,6 +7,7 @@ import errno
 import os
 
 import pytest
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool, Float64MultiArray
 
 from musculoskeletal_ae.bags.reader import Bag
@@ -28,11 +29,11 @@ def recording(tmp_path):
 
 
 def states(value):
-    return Float64MultiArray(data=[value] * 3)
+    return serialize_message(Float64MultiArray(data=[value] * 3))
 
 
 def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
-    recording.heard('anomaly_detected', Bool(data=True))
+    recording.heard('anomaly_detected', serialize_message(Bool(data=True)))
     for n in range(400):
         now[0] += 100_000_000
         recording.heard('muscle_states', states(float(n)))
@@ -52,7 +53,7 @@ def test_what_was_latched_before_is_kept_though_newer_came(recording, now, monke
     monkeypatch.setattr(stop_recording, 'MOST', most)
     for step, detected in enumerate((True, False, True, False)):
         now[0] += int((0.4 if step else 0.0) * SECONDS * 1e9)
-        recording.heard('anomaly_detected', Bool(data=detected))
+        recording.heard('anomaly_detected', serialize_message(Bool(data=detected)))
     recording.save('a cause', 10)
     recording.close()
     bag = Bag.open(recording.saved)
