@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of each step of the core beside the same step in plain torch, in one run.
 
-    python -m bench timings [--robot NAME|DIR] [--preset NAME]
+    python -m bench timings [--robot NAME|DIR] [--preset NAME] [--device cuda]
 
 The torch side is the same algorithm with the same numbers going in; only the network runs in torch,
 and its gradients come from autograd. The bound is what the network's multiply-adds alone take, at
@@ -252,24 +252,31 @@ class EagerLengths:
         return length.detach().numpy().astype(float), pullback
 
 
-def simulation_rows(robot: Robot, preset: str) -> list[Row]:
+def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
     """Return a step of the simulator (preset default), one arm and many, and a new network."""
     mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
-    def step(arms: int, body: Any) -> Callable[[], object]:
-        simulated = Simulation(robot, body, arms=arms)
+    def step(arms: int, body: Any, device: str | None = None) -> Callable[[], object]:
+        simulated = Simulation(robot, body, arms=arms, device=device)
         theta = robot.random_postures(arms, rng)
         tension = rng.uniform(robot.tension.bias, robot.tension.limit, (arms, robot.muscle_count))
         simulated.command = first_command(robot, mae, theta, tension)
         simulated.wrench[:, 2] = -10.0
-        return lambda: simulated.step(0.01)
+        # The last one's angles are there when all of them are.
+        return lambda: simulated.step(0.01).theta[-1].tolist()
 
     eager, work = EagerLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     many = f'the same, each of {MANY} in one batch'
+    there = [
+        Row(f'the same, each of {arms} on {device}', step(arms, mae, device), None, arms)
+        for arms in (MANY, 16 * MANY)
+        if device is not None
+    ]
     return [
         Row('simulation step', step(1, mae), step(1, eager), 1, work),
         Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
+        *there,
         Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
     ]
 
@@ -279,27 +286,27 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
     return torch.autograd.grad(network.decode(leaf).sum(), leaf)
 
 
-def measure(robot: Robot, preset: str) -> list[Timed]:
+def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]:
     """Return what each step takes."""
     torch.set_num_threads(1)
-    rates = {1: gemm_rate(1), MANY: gemm_rate(256)}
+    one, many = gemm_rate(1), gemm_rate(256)
     return [
         Timed(
             row.name,
             row_time(row, row.ours),
             row_time(row, row.torch_eager) if row.torch_eager else 0.0,
-            row.products / rates[row.several],
+            row.products / (one if row.several == 1 else many),
         )
-        for row in mae_rows(robot, preset) + simulation_rows(robot, preset)
+        for row in mae_rows(robot, preset) + simulation_rows(robot, preset, device)
     ]
 
 
-def show(robot: Robot, preset: str) -> None:
+def show(robot: Robot, preset: str, device: str | None = None) -> None:
     """Print the table."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}, µs of one call (median), torch on one thread')
     print(f'{"":<42}{"ours":>10}{"torch eager":>14}{"bound":>10}')
-    for row in measure(robot, preset):
+    for row in measure(robot, preset, device):
         numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))
         told = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
         print(f'{row.name:<42}{"".join(told)}')
@@ -310,5 +317,6 @@ def main(argv: list[str]) -> None:
     parser = Parser('timings', 'Times each step of the core beside the same in plain torch.')
     parser.add_robot()
     parser.add_preset()
+    parser.add_argument('--device', help='of torch, such as cuda: time batches there, too')
     args = parser.parse_args(argv)
-    show(Robot.load(args.robot), args.preset)
+    show(Robot.load(args.robot), args.preset, args.device)

@@ -23,12 +23,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints, Singles
+from musculoskeletal_ae.arrays import Array, Ints, Singles, library
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask, State, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
@@ -53,64 +52,67 @@ class BlockDiagonal:
         x[into] are their inputs, one block's after the other's, and y[out] of theirs the outputs;
         None: they stand like that.
         """
-        sizes = np.cumsum([(0, 0), *(block.shape for block in blocks)], axis=0).tolist()
-        self._blocks = [
-            (slice(i, j), block, slice(m, n))
-            for block, ((i, m), (j, n)) in zip(blocks, pairwise(sizes), strict=True)
-        ]
-        self._into, self._out, self._outputs = into, out, sizes[-1][1]
+        ends = np.cumsum([0, *map(len, blocks)]).tolist()
+        self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
+        self._into, self._out = into, out
 
     def __rmatmul__(self, x: Singles) -> Singles:
         """Return x @ weight, shape (..., out), for x (..., in)."""
         if self._into is not None:
             x = x[..., self._into]
-        result = np.empty((*x.shape[:-1], self._outputs), np.float32)
-        for into, block, out in self._blocks:
-            np.matmul(x[..., into], block, out=result[..., out])
+        parts = [x[..., into] @ block for into, block in self._blocks]
+        result: Singles = library(x).concatenate(parts, axis=-1)
         return result if self._out is None else result[..., self._out]
 
     @cached_property
     def T(self) -> BlockDiagonal:
         """The transposed weight, as of an array."""
-        into, out = (None if p is None else np.argsort(p) for p in (self._out, self._into))
-        return BlockDiagonal([block.T for _, block, _ in self._blocks], into, out)
+        into, out = (None if p is None else p.argsort() for p in (self._out, self._into))
+        return BlockDiagonal([block.T for _, block in self._blocks], into, out)
 
 
 class Activation(NamedTuple):
-    """An activation h(u), and (h, dh/du) together, of u = gain · x; both may overwrite u."""
+    """An activation h(u), and (h, dh/du) together, of u = gain · x; both may overwrite u.
 
-    value: Callable[[Singles], Singles]
-    with_slope: Callable[[Singles], tuple[Singles, Singles]]
+    Both are given the library of u first.
+    """
+
+    value: Callable[[Any, Singles], Singles]
+    with_slope: Callable[[Any, Singles], tuple[Singles, Singles]]
     gain: float
 
 
-def _tanh_slope(u: Singles) -> tuple[Singles, Singles]:
-    h = np.tanh(u, out=u)
-    slope = h * h
-    return h, np.subtract(1.0, slope, out=slope)
+def _tanh(xp: Any, u: Singles) -> Singles:
+    h: Singles = xp.tanh(u, out=u)
+    return h
 
 
-def _silu(u: Singles) -> Singles:
+def _tanh_slope(xp: Any, u: Singles) -> tuple[Singles, Singles]:
+    h = _tanh(xp, u)
+    return h, 1.0 - h * h
+
+
+def _silu(xp: Any, u: Singles) -> Singles:
     # x σ(x) = u t with u = x/2 and t = 1 + tanh u: does not overflow, in one temporary array.
-    result: Singles = np.tanh(u)
+    result: Singles = xp.tanh(u)
     result += 1.0
     result *= u
     return result
 
 
-def _silu_slope(u: Singles) -> tuple[Singles, Singles]:
+def _silu_slope(xp: Any, u: Singles) -> tuple[Singles, Singles]:
     # h = u t and dh/du = t + h (2 − t), in three arrays: a batch then stays in the cache.
-    t = np.tanh(u)
+    t = xp.tanh(u)
     t += 1.0
-    h = np.multiply(u, t, out=u)
-    slope: Singles = np.subtract(2.0, t)
+    u *= t
+    h, slope = u, 2.0 - t
     slope *= h
     slope += t
     return h, slope
 
 
 ACTIVATIONS = {
-    'tanh': Activation(lambda u: np.tanh(u, out=u), _tanh_slope, 1.0),
+    'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
 
@@ -127,32 +129,34 @@ class Stack(NamedTuple):
 
     def __call__(self, given: Array) -> Array:
         """Return the output (..., out) for an input (..., in)."""
-        x = given.astype(np.float32)
+        xp = library(given)
+        x = xp.asarray(given, dtype=xp.float32)
         for weight, bias in self.layers[:-1]:
             x = x @ weight
             x += bias
-            x = self.activation.value(x)
+            x = self.activation.value(xp, x)
         weight, bias = self.layers[-1]
-        return (x @ weight + bias).astype(np.float64)
+        return xp.asarray(x @ weight + bias, dtype=xp.float64)
 
     def with_pullback(self, given: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return the output and the function that maps a gradient by it to one by the input."""
-        x, slopes = given.astype(np.float32), []
+        xp = library(given)
+        x, slopes = xp.asarray(given, dtype=xp.float32), []
         for weight, bias in self.layers[:-1]:
             x = x @ weight
             x += bias
-            x, slope = self.activation.with_slope(x)
+            x, slope = self.activation.with_slope(xp, x)
             slopes.append(slope)
         last, last_bias = self.layers[-1]
 
         def pullback(by_output: Array) -> Array:
-            gradient = by_output.astype(np.float32) @ last.T
+            gradient = xp.asarray(by_output, dtype=xp.float32) @ last.T
             for (weight, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient *= slope
                 gradient = gradient @ weight.T
-            return gradient.astype(np.float64)
+            return xp.asarray(gradient, dtype=xp.float64)
 
-        return (x @ last + last_bias).astype(np.float64), pullback
+        return xp.asarray(x @ last + last_bias, dtype=xp.float64), pullback
 
     def tangent(self, given: Array, directions: Array) -> tuple[Array, Array]:
         """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
@@ -160,7 +164,7 @@ class Stack(NamedTuple):
         for i, (weight, bias) in enumerate(self.layers):
             x, tangent = x @ weight + bias, tangent @ weight
             if i < len(self.layers) - 1:
-                x, slope = self.activation.with_slope(x)
+                x, slope = self.activation.with_slope(np, x)
                 tangent = tangent * slope[..., None, :]
         return x.astype(np.float64), tangent.astype(np.float64)
 
@@ -374,7 +378,7 @@ class Mae:
 
         The pullback of T is Gᵀ T, at the price of one more evaluation instead of D.
         """
-        x = np.concatenate((theta, tension), axis=-1)
+        x = library(theta).concatenate((theta, tension), axis=-1)
         z, to_input = self._enter[Mask.THETA_TENSION].with_pullback(x)
         length, to_latent = self._leave_length.with_pullback(z)
         joints = len(self.joints)

@@ -183,12 +183,8 @@ def annealing(progress: float) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))
 
 
-def train_on(device: str) -> None:
-    """Let everything that is trained from now on be on one of `presets.DEVICES`.
-
-    Raises:
-        MusculoskeletalError: If torch computes nothing there.
-    """
+def check_device(device: str) -> None:
+    """Raise a MusculoskeletalError if torch computes nothing on a device."""
     try:
         torch.ones(1, device=device).sum().item()  # to be there is not yet to compute
     except (RuntimeError, AssertionError) as error:  # the latter of a torch built without it
@@ -196,6 +192,15 @@ def train_on(device: str) -> None:
             f'device {device!r}: torch {torch.__version__} computes nothing there; legal: cpu. '
             'For a GPU, install its driver and a torch that is built for it (pytorch.org)'
         ) from error
+
+
+def train_on(device: str) -> None:
+    """Let everything that is trained from now on be on one of `presets.DEVICES`.
+
+    Raises:
+        MusculoskeletalError: If torch computes nothing there.
+    """
+    check_device(device)
     # Every call of torch passes a default device, which takes a fifth of a step, even on the CPU.
     torch.set_default_device(None if device == 'cpu' else device)
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, library
 
 REVOLUTE = ('JointModelRX', 'JointModelRY', 'JointModelRZ', 'JointModelRevoluteUnaligned')
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
@@ -145,6 +145,8 @@ class Kinematics:
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
         count = self.model.njoints
         self.parent = np.array(self.model.parents)
+        #: joints whose parent is another one, with that
+        self._hanging = [(i, parent) for i, parent in enumerate(self.parent.tolist()) if parent > 0]
         self.placement_rotation = np.stack([m.rotation for m in self.model.jointPlacements])
         self.placement_translation = np.stack([m.translation for m in self.model.jointPlacements])
         self.prismatic = np.array([joint.shortname() in PRISMATIC for joint in self.model.joints])
@@ -194,22 +196,20 @@ class Kinematics:
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
-        angle = self.tree_angles(theta)[:, :, None, None]
-        first, second = np.sin(angle), 1.0 - np.cos(angle)
+        xp, angle = library(theta), theta[:, self.theta_index, None, None]
+        if self.transmission is not None:
+            angle = self.ratio[:, None, None] * angle + self.offset[:, None, None]
+        first, second = xp.sin(angle), 1.0 - xp.cos(angle)
         if self.prismatic.any():
-            slides = self.prismatic[1:, None, None]
-            first, second = np.where(slides, angle, first), np.where(slides, 0.0, second)
-        poses = np.empty((len(theta), *self._placement.shape))
-        poses[:, 0] = self._placement[0]
-        poses[:, 1:] = self._placement[1:] + first * self._first[1:] + second * self._second[1:]
-        return poses
+            slides = self.prismatic[:, None, None]
+            first, second = xp.where(slides, angle, first), xp.where(slides, 0.0, second)
+        return self._placement + first * self._first + second * self._second
 
     def transforms(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
         poses = self.in_parents(theta)
-        for i in range(2, len(self.parent)):
-            if self.parent[i] > 0:
-                poses[:, i] = poses[:, self.parent[i]] @ poses[:, i]
+        for i, parent in self._hanging:
+            poses[:, i] = poses[:, parent] @ poses[:, i]
         return poses
 
     def joint_poses(self, theta: Array) -> JointPoses:

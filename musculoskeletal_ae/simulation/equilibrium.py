@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, library
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
@@ -59,7 +59,7 @@ class QuasiStatics:
     """The equations above for one robot, and for the network that was given to `use` last."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+        self._robot, self._length_at_zero = robot, robot.routes.length_at_zero
         self._load, self._slopes = Load(robot.kinematics), Slopes(robot)
         self._eye = np.eye(robot.joint_count)
         postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
@@ -88,13 +88,13 @@ class QuasiStatics:
         """
         robot, theta, tension = self._robot, state.theta, state.tension
         stiffness, limits = robot.stiffness, robot.tension
-        passed = np.exp(-self._friction * state.slid)  # from the motor to the elastic unit
+        xp = library(theta)
+        passed = xp.exp(-self._friction * state.slid)  # from the motor to the elastic unit
         end = passed * tension
         length, pullback = self._mae.lengths_with_pullback(theta, end)
         span = (limits.max - limits.bias) / stiffness
         followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
-        absolute = robot.routes.length_at_zero + length
-        compliance = robot.series_elastic.compliance(absolute, end)
+        compliance = robot.series_elastic.compliance(self._length_at_zero + length, end)
         by_motor = passed * compliance
         command_tension = limits.bias + stiffness * (length - followed)
         jacobian, curvature = self._slopes(theta, end)
@@ -103,7 +103,7 @@ class QuasiStatics:
         # Where a wire slides, friction is like a stiff spring until it has turned round: one of
         # constant stiffness, where the arm's lets go little by little.
         rubbing = self._friction * end
-        turning, free = state.slid, np.abs(state.slid) < 1.0
+        turning, free = state.slid, abs(state.slid) < 1.0
         for _ in range(ROUNDS):
             rub = rubbing * free / REVERSAL
             lost = rubbing * ~free * (turning - state.slid)
@@ -115,48 +115,47 @@ class QuasiStatics:
             desired = command_tension + stiffness * soft * slack
             # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
             # Newton).
-            settled = np.minimum(np.maximum(desired, limits.bias), limits.max)
+            settled = desired.clip(limits.bias, limits.max)
             moved = (compliance * lost - by_motor * (settled - tension)) / give
             change = passed * (settled - tension) + rub * moved - lost
-            spring = np.where(desired == settled, (passed * stiffness + rub) * soft, rub / give)
+            spring = xp.where(desired == settled, (passed * stiffness + rub) * soft, rub / give)
             push = -(torque + (change[:, None, :] @ jacobian)[:, 0])
             matrix = (jacobian * spring[..., None]).swapaxes(1, 2) @ jacobian
             matrix += curvature + load_slope + self._viscosity / h
             turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
-            arrived = np.minimum(np.maximum(theta + turned, robot.lower), robot.upper)
+            arrived = (theta + turned).clip(robot.lower, robot.upper)
             stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
-            after = desired + stiffness * soft * stretch
-            after = np.minimum(np.maximum(after, limits.bias), limits.max)
+            after = (desired + stiffness * soft * stretch).clip(limits.bias, limits.max)
             moved = (stretch + compliance * lost - by_motor * (after - tension)) / give
-            turning = np.minimum(np.maximum(state.slid - moved / REVERSAL, -1.0), 1.0)
+            turning = (state.slid - moved / REVERSAL).clip(-1.0, 1.0)
             before = free
-            free = np.abs(turning) < 1.0
+            free = abs(turning) < 1.0
             if (free == before).all() or not rubbing.any():
                 break
         held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
         if fixed is not None:
-            held |= np.isfinite(fixed)
-        holding = np.where(held, -push, 0.0)
+            held |= xp.isfinite(fixed)
+        holding = xp.where(held, -push, 0.0)
         return ArmState(arrived, after, length + moved, followed, holding, turning)
 
     def _turn(
         self, theta: Array, push: Array, matrix: Array, most: float, fixed: Array | None
     ) -> Array:
         """Return Δθ of one step; joints at a stop stay, forced joints go where they are forced."""
-        robot = self._robot
+        robot, xp = self._robot, library(theta)
         held = (theta <= robot.lower) & (push < 0.0) | (theta >= robot.upper) & (push > 0.0)
-        forced = np.zeros_like(theta)
+        forced = xp.zeros_like(theta)
         if fixed is not None:
-            given = np.isfinite(fixed)
-            way = np.minimum(np.maximum(fixed, robot.lower), robot.upper) - theta
-            forced[given] = np.minimum(np.maximum(way, -most), most)[given]
+            given = xp.isfinite(fixed)
+            way = (fixed.clip(robot.lower, robot.upper) - theta).clip(-most, most)
+            forced = xp.where(given, way, forced)
             held |= given
             push = push - (matrix @ forced[..., None])[..., 0]
         free = ~held
         matrix = matrix * (free[:, :, None] & free[:, None, :]) + held[:, :, None] * self._eye
-        turned = np.linalg.solve(matrix, (push * free)[..., None])[..., 0]
-        largest = np.abs(turned).max(axis=1, keepdims=True)
-        scaled: Array = turned * (most / np.maximum(largest, most)) + forced
+        turned = xp.linalg.solve(matrix, (push * free)[..., None])[..., 0]
+        largest = xp.amax(abs(turned), axis=1, keepdims=True)
+        scaled: Array = turned * (most / largest.clip(min=most)) + forced
         return scaled
 
 
@@ -166,10 +165,9 @@ def follow(command: Array, followed: Array, length: Array, span: Array, most: fl
     Command, how far they had `followed` it a step before, and length are (N, M) [m]; a command
     adds tension as far as `span` [m] (M,) below the length.
     """
-    reached = followed + np.minimum(np.maximum(command - followed, -most), most)
+    reached = followed + (command - followed).clip(-most, most)
     # What lies beyond changes no tension; following it would take as long to come back from.
-    within: Array = np.minimum(np.maximum(reached, length - span), length + most)
-    return within
+    return reached.clip(length - span, length + most)
 
 
 class Slopes:
@@ -185,7 +183,6 @@ class Slopes:
 
     def __init__(self, robot: Robot) -> None:
         """Prepare to fit over the whole joint range, muscles in the middle of their tensions."""
-        self._shape = robot.muscle_count, robot.joint_count
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))
@@ -205,9 +202,9 @@ class Slopes:
         """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
         if len(self._limbs) == 1:
             return self._limbs[0](theta, tension)
-        count, (muscles, joints) = len(theta), self._shape
-        jacobian = np.zeros((count, muscles, joints))
-        curvature = np.zeros((count, joints, joints))
+        xp, each = library(theta), theta[:, None, :]
+        jacobian = xp.zeros_like(tension[:, :, None] * each)
+        curvature = xp.zeros_like(theta[:, :, None] * each)
         for limb in self._limbs:
             (pulled, turned), (down, across) = limb.of_jacobian, limb.of_curvature
             own = limb(theta[:, limb.joints], tension[:, limb.muscles])
@@ -244,11 +241,10 @@ class Cubics:
 
     def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at the limb's θ, T."""
-        count, joints = theta.shape
-        linear = np.ones((count, 1 + joints))
-        linear[:, 1:] = theta
+        xp, (count, joints) = library(theta), theta.shape
         products = theta[:, self._left] * theta[:, self._right]
-        jacobian = np.concatenate((linear, products), axis=1) @ self._first
+        basis = xp.concatenate((xp.ones_like(theta[:, :1]), theta, products), axis=1)
+        linear, jacobian = basis[:, : 1 + joints], basis @ self._first
         weighted = (tension[:, :, None] * linear[:, None, :]).reshape(count, -1)
         curvature = weighted @ self._second
         return jacobian.reshape(count, -1, joints), curvature.reshape(count, joints, joints)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, library
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 #: flattened (r fᵀ) @ this gives r × f and, in the last column, r · f
@@ -51,6 +51,7 @@ class Load:
         before = kin.hangs_on[np.ix_(self._tree, self._tree)].T
         self._upper: Array = before * ~self._slides[:, None] * 1.0
         self._strict: Array = self._upper * ~np.eye(len(before), dtype=bool)
+        self._cross_and_dot = CROSS_AND_DOT
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
         """Return load [N·m] (N, D) and ∂load/∂θ [N·m/rad] (N, D, D) at θ [rad] (N, D).
@@ -68,14 +69,15 @@ class Load:
             point = poses[:, self._effector_joint, :3] @ self._effector
             arm = (point[:, None] - origin) * self._carries_effector[:, None]
             spread = spread + arm[..., None] * wrench[:, None, None, :3]
-        turning = spread.reshape(*axis.shape[:2], 9) @ CROSS_AND_DOT  # (N, D, 4)
+        turning = spread.reshape(*axis.shape[:2], 9) @ self._cross_and_dot  # (N, D, 4)
         pull, bend = turning[..., :3], (spread @ axis[..., None])[..., 0] - turning[..., 3:] * axis
         if self._slides.any():
-            force = np.broadcast_to(self._carried_mass * self._gravity, axis.shape)
+            xp = library(axis)
+            force = xp.broadcast_to(self._carried_mass * self._gravity, axis.shape)
             if wrench is not None:
                 force = force + self._carries_effector[:, None] * wrench[:, None, :3]
-            pull = np.where(self._slides[:, None], force, pull)
-            bend = np.where(self._slides[:, None], np.cross(axis, force), bend)
+            pull = xp.where(self._slides[:, None], force, pull)
+            bend = xp.where(self._slides[:, None], xp.linalg.cross(axis, force), bend)
         if wrench is not None:
             rotary = self._carries_effector * ~self._slides
             pull = pull + rotary[:, None] * wrench[:, None, 3:]

@@ -4,8 +4,8 @@
 (Paper, section "Simulation Using Musculoskeletal AutoEncoder".) The simulated arms follow the same
 muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
 l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
-command rests at T_bias. One arm or thousands are the same array operations; `equilibrium` has the
-equations of preset `default`, `paper` the printed descent.
+command rests at T_bias. One arm or thousands are the same array operations, by numpy or, on a GPU,
+by torch; `equilibrium` has the equations of preset `default`, `paper` the printed descent.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, library, moved
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.report import Report
@@ -39,7 +41,7 @@ STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
 
 
 class Simulation:
-    """N simulated arms of one robot."""
+    """N simulated arms of one robot; on a device of torch, what follows are tensors there."""
 
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign it to go back to a state kept before
@@ -47,13 +49,26 @@ class Simulation:
     wrench: Array  # on the end effectors, axes of the root link [N, N·m], (N, 6)
     fixed: Array  # angles joints are forced to [rad], (N, D); nan for a free joint
 
-    def __init__(self, robot: Robot, mae: Mae, preset: str = 'default', arms: int = 1) -> None:
-        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command."""
+    def __init__(
+        self,
+        robot: Robot,
+        mae: Mae,
+        preset: str = 'default',
+        arms: int = 1,
+        device: str | None = None,
+    ) -> None:
+        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
+
+        A device of torch, such as `cuda`, has them all in one batch there (preset `default` only).
+
+        Raises:
+            MusculoskeletalError: If torch computes nothing there, or the preset cannot.
+        """
         self.robot = copy.copy(robot)
         kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
-        self._body = kind(self.robot)
-        self.wrench = np.zeros((arms, 6))
-        self.fixed = np.full((arms, robot.joint_count), np.nan)
+        self._body, self._device = kind(self.robot), device
+        self._put: Callable[[Any], Any] = np.asarray if device is None else _tensors(device, preset)
+        self.wrench = self._put(np.zeros((0, 6)))  # those of the arms that start
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
 
@@ -64,26 +79,28 @@ class Simulation:
         """
         self._body.use(mae)
         self.mae = mae
+        self._move()
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
         self.robot.isolate(muscles)
+        self._move()
 
     def start_from(self, theta: Array) -> None:
-        """Put the arms at θ [rad] (N, D) with T_bias, commands forgotten.
+        """Put the arms at θ [rad] (N, D), of numpy, with T_bias, commands forgotten.
 
         If they become more or fewer, wrenches and fixed angles are forgotten as well.
         """
-        robot = self.robot
+        robot, put = self.robot, self._put
         if len(theta) != len(self.wrench):
-            self.wrench = np.zeros((len(theta), 6))
-            self.fixed = np.full((len(theta), robot.joint_count), np.nan)
+            self.wrench = put(np.zeros((len(theta), 6)))
+            self.fixed = put(np.full((len(theta), robot.joint_count), np.nan))
         theta = np.clip(theta, robot.lower, robot.upper)
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
-        self.command = np.full_like(tension, PAID_OUT)
+        self.command = put(np.full_like(tension, PAID_OUT))
         length = self.mae.lengths(theta, tension)
         nothing, not_slid = np.zeros_like(theta), np.zeros_like(tension)
-        self.state = ArmState(theta, tension, length, length, nothing, not_slid)
+        self.state = ArmState(*map(put, (theta, tension, length, length, nothing, not_slid)))
 
     def step(self, dt: float) -> ArmState:
         """Let time pass [s]; return the arms."""
@@ -100,47 +117,74 @@ class Simulation:
         for _ in range(SETTLING_STEPS):
             before = self.state
             self._advance(SETTLING_STEP)
-            moved = np.abs(self.state.theta - before.theta).max()
-            if max(moved, 1e-3 * np.abs(self.state.tension - before.tension).max()) < SETTLED:
+            turned = abs(self.state.theta - before.theta).max()
+            if max(turned, 1e-3 * abs(self.state.tension - before.tension).max()) < SETTLED:
                 break
         return self.state
 
     def limits(self, arm: int = 0) -> list[str]:
         """Return the joints and muscles of one arm that are at the end of what they can do."""
-        robot, state, forced = self.robot, self.state, self.fixed[arm]
-        stopped = np.isnan(forced) & (np.abs(state.holding[arm]) > STOP_TORQUE)
+        robot, one = self.robot, (self.fixed[arm], self.state.holding[arm], self.state.tension[arm])
+        forced, holding, tension = (np.array(part.tolist()) for part in one)
+        stopped = np.isnan(forced) & (np.abs(holding) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
-        full = state.tension[arm] > robot.tension.max - TENSION_MARGIN
+        full = tension > robot.tension.max - TENSION_MARGIN
         return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
 
     def report(self) -> Report:
         """Say what acts on the first arm, and whether it is at a limit."""
         values = {'checkpoint version': str(self.mae.version)}
-        if forced := ', '.join(compress(self.robot.joints, np.isfinite(self.fixed[0]))):
+        one = self.fixed[0], self.wrench[0], self.command[0]
+        fixed, wrench, command = (np.array(part.tolist()) for part in one)
+        if forced := ', '.join(compress(self.robot.joints, np.isfinite(fixed))):
             values['forced joints'] = forced
-        if self.wrench[0].any():
-            values['external wrench'] = f'{np.round(self.wrench[0], 3).tolist()} N, N·m'
+        if wrench.any():
+            values['external wrench'] = f'{np.round(wrench, 3).tolist()} N, N·m'
         if limits := self.limits():
             return Report('warn', f'at the limit: {", ".join(limits)}', values)
-        commanded = np.isfinite(self.command[0]).all()
+        commanded = np.isfinite(command).all()
         return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
+    def _move(self) -> None:
+        self._there = self._body if self._device is None else moved(self._body, self._put)
+
     def _advance(self, h: float) -> None:
-        wrench = self.wrench if self.wrench.any() else None
-        fixed = self.fixed if np.isfinite(self.fixed).any() else None
+        # Others may have assigned them.
+        command, wrench, fixed = map(self._put, (self.command, self.wrench, self.fixed))
+        wrench = wrench if wrench.any() else None
+        fixed = fixed if library(fixed).isfinite(fixed).any() else None
 
         def advance(rows: slice) -> ArmState:
             state = ArmState(*(part[rows] for part in self.state))
             pushed, forced = (None if part is None else part[rows] for part in (wrench, fixed))
-            return self._body.step(state, self.command[rows], h, pushed, forced)
+            return self._there.step(state, command[rows], h, pushed, forced)
 
-        count = len(self.command)
-        if count <= CHUNK:
+        count = len(command)
+        if count <= CHUNK or self._device is not None:
             self.state = advance(slice(count))
         else:
             pieces = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
             arms = on_all_cores(advance, pieces)
             self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
+
+
+def _tensors(device: str, preset: str) -> Callable[[Any], Any]:
+    """Return what puts an array on a device of torch."""
+    if not preset_named(preset).equilibrium:
+        told = f'preset {preset!r} simulates one arm after the other, and on no device'
+        raise MusculoskeletalError(f'{told}; given: {device!r}. Legal there: default')
+    # Only here: a node that simulates one arm does without torch.
+    import torch
+
+    from musculoskeletal_ae.mae.training import check_device
+
+    check_device(device)
+
+    def put(array: Any) -> Any:
+        is_tensor = isinstance(array, torch.Tensor)
+        return array.to(device) if is_tensor else torch.tensor(array, device=device)
+
+    return put
 
 
 def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:
