@@ -37,6 +37,11 @@ def swinging(robot, mae):
 
 
 @pytest.fixture
+def seldom(monkeypatch):
+    monkeypatch.setattr(zeroing, 'AGAIN', 5.0)  # a guess takes long, and fewer find zeros no sooner
+
+
+@pytest.fixture
 def moment(robot, mae):
     return swinging(robot, mae)
 
@@ -57,6 +62,7 @@ def test_joint_sensors_tell_the_zeros(robot, mae, moment):
     np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=1e-3)
 
 
+@pytest.mark.usefixtures('seldom')
 def test_lengths_and_tensions_tell_them_without(robot, mae, moment):
     found = run(Zeroing(robot, mae), moment, 90.0, sees=False)
     assert found.done and found.moving < 60.0
@@ -112,7 +118,7 @@ def test_while_zeros_are_unknown_nothing_is_judged_but_a_muscle_without_tension(
 
 @pytest.mark.parametrize('sees', [True, False])
 def test_what_an_isolated_muscle_reads_is_in_nobody_s_way(monkeypatch, robot, mae, moment, sees):
-    monkeypatch.setattr(zeroing, 'AGAIN', 10.0)  # guessing more often takes long
+    monkeypatch.setattr(zeroing, 'AGAIN', 10.0)  # without a muscle it takes longer still
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -126,6 +132,7 @@ def test_what_an_isolated_muscle_reads_is_in_nobody_s_way(monkeypatch, robot, ma
     np.testing.assert_allclose(found.zeros.offset[others], OFFSET[others], atol=4e-3)
 
 
+@pytest.mark.usefixtures('seldom')
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_an_arm_that_carries_nothing_is_no_division_by_zero(mae):
     robot = Robot.load('arm26')
