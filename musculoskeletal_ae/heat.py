@@ -5,18 +5,13 @@ A motor that warms its housing, which the surroundings cool (arXiv 2407.08055):
 
     C₁ ċ₁ = k T² − (c₁ − c₂)/R₁,   C₂ ċ₂ = (c₁ − c₂)/R₁ − (c₂ − c_a)/R₂
 
-The housing's temperature c₂ is measured, the winding's c₁ is not. Only quotients of the constants
-tell in either: κ = k/C₂, τ₁ = R₁C₁, τ₂ = R₂C₂, r = R₁/R₂ and c_a. All but r are learned while the
-arm moves, by an extended Kalman filter of c₁ − c₂, c₂, the logarithms of κ, τ₁ and τ₂, and c_a,
-each a random walk. From T² to c₂ the model is a gain and two poles, three numbers for four: one of
-them has to come from elsewhere. With r it is the one in proportion to which c₁ − c₂ is off.
+The housing's temperature c₂ is measured, the winding's c₁ is not. While the arm moves, an extended
+Kalman filter learns c₁ − c₂, c₂, the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a, each
+a random walk; r = R₁/R₂ cannot be learned (doc/design.md says why).
 
 The highest tension of a muscle is the one that, held for a time from now on, brings its winding to
-the highest temperature. Held there, it falls slowly to what can be held for good, so that control
-that plans within it leaves a muscle that warms to those that are cool.
-
-A constant that leaves what it was, once that was known, says that the module has changed: its motor
-drags, its housing is covered, or its tension sensor is wrong.
+the highest temperature. A constant that leaves what it was, once that was known, says that the
+module has changed: its motor drags, its housing is covered, or its tension sensor is wrong.
 """
 
 from __future__ import annotations

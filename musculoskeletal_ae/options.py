@@ -1,21 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command lines of all tools: one parser, the arguments they share, and how they end.
 
-A tool writes only what is its own:
-
-    def main(argv: list[str] | None = None) -> int:
-        parser = Parser('train', 'Trains the autoencoder and writes a checkpoint.')
-        parser.add_robot()
-        parser.add_out('FILE.safetensors')
-        parser.add_seed('of the training data and the weights')
-        parser.add_argument('--jobs', type=whole(1, 256), help='processes')
-        args = parser.parse_args(argv)
-        return exit_status(lambda: train(args))
-
-A wrong option is one line that names the option, the value and what is legal, and status 2; so is
-`parser.error('--hold-out goes with --from-bag')`. What the package refuses (a robot, a file) is one
-line and status 1. Help shows defaults by itself. Types raise `ArgumentTypeError`, before which
-argparse puts the option.
+A tool writes only what is its own, as `tools/import_robot.py` does. A wrong option is one line that
+names the option, the value and what is legal, and status 2; so is `parser.error('--hold-out goes
+with --from-bag')`. What the package refuses (a robot, a file) is one line and status 1. Help shows
+defaults by itself. Types raise `ArgumentTypeError`, before which argparse puts the option.
 """
 
 from __future__ import annotations

@@ -39,8 +39,11 @@ class BagWriter:
         """
         self.directory = Path(directory)
         self._name = f'{self.directory.resolve().name}_0.mcap'
-        if not _is_utf8(self._name):
-            raise BagError(self.directory, 'the name is not UTF-8', 'choose another name')
+        try:
+            self._name.encode()
+        except UnicodeEncodeError as error:  # Python's stand-ins for other bytes
+            problem = 'the name is not UTF-8'
+            raise BagError(self.directory, problem, 'choose another name') from error
         self.topics: dict[str, metadata.Topic] = {}
         self._numbers: dict[str, int] = {}  # of topics
         self._schemas: dict[str, int] = {}
@@ -146,13 +149,6 @@ class BagWriter:
         except OSError as error:
             problem = f'cannot be written: {error.strerror or error}'
             raise BagError(self.directory, problem, 'name another place') from error
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        return bool(name.encode())
-    except UnicodeEncodeError:  # Python's stand-ins for other bytes
-        return False
 
 
 def recover(

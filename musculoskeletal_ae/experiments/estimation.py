@@ -248,28 +248,14 @@ def baselines(study: Study, rows: Rows) -> Plot:
     """Draw the errors of older estimators beside the autoencoder's."""
     numbers = [row.numbers for row in rows.values()]
     names = [f'autoencoder, preset {study.preset}', *numbers[0]['baselines']]
+    groups = {}
+    for when, colour in plots.WHEN.items():
+        ours = [each[f'{when}_held_out_rad'] for each in numbers]
+        older = [[row[f'{when}_rad'] for row in each['baselines'].values()] for each in numbers]
+        groups[f'{when} learning'] = colour, np.column_stack([ours, older])
     figure, (panel,) = plots.new_figure(9.0, 0.62 * len(names) + 1.3)
-    place = np.arange(len(names))
-    for when, shift in (('before', -0.2), ('after', 0.2)):
-        every = np.array(
-            [
-                [each[f'{when}_held_out_rad']]
-                + [each['baselines'][name][f'{when}_rad'] for name in names[1:]]
-                for each in numbers
-            ]
-        )
-        mean = every.mean(axis=0)
-        panel.barh(place + shift, mean, 0.38, color=plots.WHEN[when], label=f'{when} learning')
-        for at, number, furthest in zip(place + shift, mean, every.max(axis=0), strict=True):
-            style = {'xytext': (6, 0), 'textcoords': 'offset points', 'va': 'center'}
-            panel.annotate(f'{number:.3f}', (furthest, at), fontsize=9, **style)
-        for each in every:
-            panel.plot(each, place + shift, '.', color=plots.TRUE, ms=4)
-    panel.set_yticks(place, names)
-    panel.invert_yaxis()
-    panel.margins(x=0.12)
     title = 'estimators on the same data'
-    plots.tidy(panel, 'mean error [rad], held-out motion', '', title, legend='below')
+    plots.bars(panel, names, groups, 'mean error [rad], held-out motion', title)
     return figure, (
         'Joint angle error of the autoencoder and of older estimators on the held-out motion. '
         'Learning: from the same samples at rest; "whole stream": from all messages at 10 Hz. '

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -60,6 +60,28 @@ def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
     # Shorter windows at the ends.
     count = np.convolve(np.ones(len(y)), kernel, mode='same')
     axes.plot(x[::step], (np.convolve(y, kernel, mode='same') / count)[::step], **style)
+
+
+def bars(
+    panel: Any, names: Sequence[str], groups: Mapping[str, tuple[str, Any]], xlabel: str, title: str
+) -> None:
+    """Draw means over N individuals as bars with their numbers, and a dot for each individual.
+
+    Groups, by their label, are colours and values (N, K) of the K names; NaN: there is none.
+    """
+    place, height = np.arange(len(names)), 0.8 / len(groups)
+    for g, (label, (colour, values)) in enumerate(groups.items()):
+        at, means = place + (g - 0.5 * (len(groups) - 1)) * height, np.mean(values, axis=0)
+        panel.barh(at, means, 0.95 * height, color=colour, label=label)
+        panel.plot(np.transpose(values), at, '.', color=TRUE, ms=4)
+        for y, mean, furthest in zip(at, means, np.nan_to_num(np.max(values, axis=0))):
+            text = 'none' if np.isnan(mean) else f'{mean:.3f}'
+            style = {'textcoords': 'offset points', 'va': 'center', 'fontsize': 9}
+            panel.annotate(text, (furthest, y), (6, 0), **style)
+    panel.set_yticks(place, names)
+    panel.invert_yaxis()
+    panel.margins(x=0.12)
+    tidy(panel, xlabel, '', title, legend='below' if len(groups) > 1 else '')
 
 
 def pictures(

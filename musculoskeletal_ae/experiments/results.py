@@ -18,17 +18,18 @@ import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from msgspec import Struct
 from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
-from musculoskeletal_ae.experiments.table import NOTHING, ROWS, Cells, individuals, markdown
+from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.robot.robot import Robot
 
 #: result.json of every experiment that was run, by name
@@ -42,6 +43,7 @@ BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
 KEPT = Path('doc/results')
 BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 TEMPLATE = 'report.html.jinja'  # beside this file
+NOTHING = '–'
 
 
 def measure(args: Namespace) -> None:
@@ -140,6 +142,56 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return result
 
 
+class Cells(NamedTuple):
+    """One line of the table as text."""
+
+    quantity: str
+    printed: str
+    paper: str
+    default: str
+    bound: str
+    aim: str
+    verdict: str  # 'met', by how much the aim is missed, or '' without aim or number
+
+
+class Row(Struct, frozen=True):
+    """One quantity of an experiment; keys are paths into its result.json, parts joined by dots."""
+
+    quantity: str  # with its unit
+    default: str  # key of the value with the preset of the run
+    printed: str = NOTHING  # in the paper, on Musashi
+    paper: str = ''  # key of the value with preset paper
+    bound: str = ''  # key of what nothing can beat
+    aim: float | None = None  # highest value aimed at; lowest, if `more_is_better`
+    digits: int = 3
+    more_is_better: bool = False
+    worst: bool = False  # show the worst individual instead of the mean
+
+    def number(self, result: Mapping[str, Any], key: str) -> float | None:
+        """Return what was measured, or None."""
+        if not self.worst:
+            return _flat(result).get(key)
+        every = [_flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
+        known = [number for number in every if number is not None]
+        return (min if self.more_is_better else max)(known, default=None)
+
+    def cells(self, result: Mapping[str, Any]) -> Cells:
+        """Return the line for a result.json."""
+        numbers = [self.number(result, key) for key in (self.paper, self.default, self.bound)]
+        paper, default, bound = (NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers)
+        number, aim, verdict = numbers[1], NOTHING, ''
+        if self.aim is not None:
+            aim = f'{"≥" if self.more_is_better else "≤"} {self.aim:g}' if self.aim else '0'
+            if number is not None:
+                missed = self.aim - number if self.more_is_better else number - self.aim
+                verdict = 'met' if missed <= 0.0 else f'missed by {missed:.{self.digits}f}'
+        return Cells(self.quantity, self.printed, paper, default, bound, aim, verdict)
+
+
+#: by experiment
+ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[Row, ...]])
+
+
 def table(results: Results) -> list[Cells]:
     """Return the lines of the results table, of the experiments that were run."""
     return [
@@ -150,12 +202,29 @@ def table(results: Results) -> list[Cells]:
     ]
 
 
+def individuals(seeds: Sequence[int]) -> str:
+    """Return whose numbers these are, such as 'individual 0'."""
+    return f'individual{"s" * (len(seeds) > 1)} {", ".join(map(str, seeds))}'
+
+
 def readme_table(results: Results) -> str:
     """Return what stands between the markers of a page."""
     if not results:
         return '\n\nNothing measured yet: `experiment all --readme doc/experiments.md`.\n\n'
-    lost = ''.join(f'\n\nFailed: {line}' for line in failures(results))
-    return f'\n\n{markdown(next(iter(results.values()))["about"], table(results))}{lost}\n\n'
+    about = next(iter(results.values()))['about']
+    text = (
+        f'\n\n{about["robot"]}, emulated {individuals(about["seeds"])}, '
+        f'{about["minutes"]:g} minutes of exploration; {NOTHING}: not printed, or nothing to '
+        'compare. Bound: least squares on the true body (estimate), the least ‖T‖ that can hold '
+        'the posture where the arm came to rest (control), the true body without friction '
+        '(simulator).\n\n'
+        '| | paper, on Musashi | preset `paper` | preset `default` | bound | aim |\n'
+        '|---|---|---|---|---|---|'
+    )
+    for each in table(results):
+        text += f'\n| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
+        text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
+    return ''.join([text, *(f'\n\nFailed: {line}' for line in failures(results)), '\n\n'])
 
 
 def failures(results: Results) -> list[str]:

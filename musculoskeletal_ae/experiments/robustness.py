@@ -208,33 +208,28 @@ ESTIMATES = {
 
 def robustness(_: Study, rows: Rows) -> Plot:
     """Draw the errors of all estimators on both bodies."""
-    figure, (panel,) = plots.new_figure(11.0, 4.6)
-    for n, (reality, colour) in enumerate(zip(REALITIES, plots.WHEN.values(), strict=True)):
-        said = [row.numbers[reality] for row in rows.values()]
-        values = [
-            np.mean([np.nan if each[key] is None else each[key] for each in said])
-            for key in ESTIMATES
-        ]
-        at = np.arange(len(values)) + 0.4 * (n - 0.5)
-        bars = panel.bar(at, values, 0.36, color=colour, label=f'reality: {reality}')
-        labels = ['none' if np.isnan(value) else f'{value:.3f}' for value in values]
-        panel.bar_label(bars, labels, fontsize=8)
-    panel.set_xticks(range(len(ESTIMATES)), ESTIMATES.values(), rotation=15, ha='right')
-    plots.tidy(panel, '', 'mean error, held-out motion [rad]', legend='above')
-    return figure, 'Errors on the motion never used for learning, means over individuals.'
+    figure, (panel,) = plots.new_figure(9.0, 5.6)
+    groups = {}
+    for reality, colour in zip(REALITIES, plots.WHEN.values(), strict=True):
+        said = [[row.numbers[reality][key] for key in ESTIMATES] for row in rows.values()]
+        groups[f'reality: {reality}'] = colour, np.array(said, dtype=float)  # None: NaN
+    plots.bars(panel, [*ESTIMATES.values()], groups, 'mean error [rad], held-out motion', '')
+    return figure, (
+        'Errors on the motion never used for learning, means over individuals; dots: each.'
+    )
 
 
 def ablation(_: Study, rows: Rows) -> Plot:
     """Draw what learning is left with where the foreign body lacks some effects."""
     seed, (numbers, _traces) = first(rows)
-    figure, (panel,) = plots.new_figure(11.0, 4.6)
+    figure, (panel,) = plots.new_figure(9.0, 4.6)
     without = numbers.get('ablation_rad', {})
-    names = sorted(without, key=without.__getitem__)
-    bars = panel.barh(names, [without[name] for name in names], color=plots.AFTER)
-    panel.bar_label(bars, fmt='%.3f', fontsize=9, label_type='center', color='white')
+    names = sorted(without, key=without.__getitem__, reverse=True)
+    groups = {'without': (plots.AFTER, [[without[name] for name in names]])}
     whole = numbers[FOREIGN]['after_rad']
-    panel.axvline(whole, color=plots.MARK, ls=':', label=f'with all effects: {whole:.3f} rad')
-    plots.tidy(panel, 'mean error after learning [rad]', 'without', legend='above')
+    panel.axvline(whole, color=plots.MARK, ls=':')
+    title = f'without (dotted: with all effects, {whole:.3f} rad)'
+    plots.bars(panel, names, groups, 'mean error after learning [rad]', title)
     return figure, (
         f'The foreign body with some effects left out, individual {seed}: the shorter the bar, the '
         'more those effects matter.'

@@ -105,16 +105,11 @@ BARS = {
 
 def sensors(_: Study, rows: Rows) -> Plot:
     """Draw the error that is left with less and less sensors."""
-    figure, (panel,) = plots.new_figure(9.0, 4.2)
-    values = np.array([[row.numbers[key] for key in BARS] for row in rows.values()])
-    means = values.mean(axis=0)
-    panel.bar(range(len(BARS)), means, 0.6, color=plots.AFTER)
-    for place, (mean, top) in enumerate(zip(means, values.max(axis=0))):
-        panel.annotate(f'{mean:.3f}', (place, top), (0, 5), textcoords='offset points', ha='center')
-    for each in values:
-        panel.plot(range(len(BARS)), each, 'o', color=plots.MARK, ms=3)
-    panel.set_xticks(range(len(BARS)), BARS.values(), rotation=15)
-    plots.tidy(panel, '', 'mean error, held-out motion [rad]')
+    figure, (panel,) = plots.new_figure(9.0, 3.6)
+    values = [[row.numbers[key] for key in BARS] for row in rows.values()]
+    groups = {'learned': (plots.AFTER, values)}
+    title = 'what the learner sees of the joints'
+    plots.bars(panel, [*BARS.values()], groups, 'mean error [rad], held-out motion', title)
     return figure, (
         'Error on the motion never used for learning, by what the learner sees of the joints: '
         f'means over individuals {", ".join(map(str, rows))}; dots: each.'

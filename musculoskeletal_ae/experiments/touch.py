@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
 from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
@@ -67,14 +67,6 @@ class FeelingLoop(ClosedLoop):
         self.arm.set_wrench(np.concatenate([force, np.zeros(3)]))
 
 
-class Push(NamedTuple):
-    """A push of the resting arm."""
-
-    true: Array  # [N], (3,)
-    felt: Array  # [N], (3,)
-    free: bool  # whether no joint reached its stop
-
-
 def measure(study: Study, seed: int) -> Measured:
     """Push an individual that has learned, at rest, in motion and afloat."""
     robot, rng = study.robot, np.random.default_rng([seed, TOUCH_STREAM])
@@ -84,19 +76,17 @@ def measure(study: Study, seed: int) -> Measured:
     def count(whole: float) -> int:
         return max(1, round(share * whole))
 
-    pushes = list[Push]()
+    pushes = []
     for _ in range(count(POSTURES)):
         loop.rest(_holdable(robot, rng))
-        for _ in range(2):
-            pushes.append(_pushed(loop, _force(robot, rng, LEAST, MOST)))
+        pushes += [_pushed(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
     hits, delays = _collisions(loop, rng, count(COLLISIONS))
     soon = delays <= SOON + 1e-9
     loop.arm.reset()
     seconds = share * HEALTHY / len(study.seeds)
     contacts = _healthy(loop, seconds)
     drift, moved = zip(*(_afloat(study, seed, rng) for _ in range(count(FLOATS))))
-    true, felt = np.array([p.true for p in pushes]), np.array([p.felt for p in pushes])
-    free = np.array([p.free for p in pushes])
+    true, felt, free = columns(pushes)
     size, angle = _errors(true, felt)
     numbers: dict[str, Any] = {
         'wrench_error': float(size.mean()),
@@ -141,7 +131,8 @@ def _holdable(robot: Robot, rng: np.random.Generator) -> Array:
     return theta
 
 
-def _pushed(loop: FeelingLoop, force: Array) -> Push:
+def _pushed(loop: FeelingLoop, force: Array) -> tuple[Array, Array, bool]:
+    """Push the resting hand; return the force, the felt one [N], and if no joint met its stop."""
     robot, felt, free = loop.arm.robot, list[Array](), True
     loop.push(force)
     for _ in range(round(PUSH / SAMPLE_TIME)):
@@ -150,7 +141,7 @@ def _pushed(loop: FeelingLoop, force: Array) -> Push:
         free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
     loop.push(np.zeros(3))
     loop.feel_during(MOVED)
-    return Push(force, np.mean(felt[-round(JUDGED / SAMPLE_TIME) :], axis=0), free)
+    return force, np.mean(felt[-round(JUDGED / SAMPLE_TIME) :], axis=0), free
 
 
 def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Array:
@@ -201,8 +192,9 @@ def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, f
 def forces(_: Study, rows: Rows) -> Plot:
     """Draw sizes and directions of all pushes."""
     parts = [row.traces for row in rows.values()]
-    true, felt = (np.concatenate([part[key] for part in parts]) for key in ('true', 'felt'))
-    free = np.concatenate([part['free'] for part in parts])
+    true, felt, free = (
+        np.concatenate([part[key] for part in parts]) for key in ('true', 'felt', 'free')
+    )
     sizes, angle = np.linalg.norm(true, axis=1), _errors(true, felt)[1]
     figure, (left, right) = plots.new_figure(9.0, 3.6, columns=2)
     for which, colour, name in (

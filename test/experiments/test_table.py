@@ -16,8 +16,8 @@ from musculoskeletal_ae.experiments.results import (
     readme_table,
     update_readme,
 )
+from musculoskeletal_ae.experiments.results import ROWS as TABLE
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.experiments.table import ROWS as TABLE
 
 REPOSITORY = Path(__file__).parents[2]
 ROWS = [(name, row) for name, rows in TABLE.items() for row in rows]
