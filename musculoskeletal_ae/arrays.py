@@ -24,7 +24,8 @@ Ints = NDArray[np.int_]
 
 def median_of_rows(rows: Array) -> Array:
     """Return what `numpy.median` does of (N, ...), by rows, NaN where one is, ten times faster."""
-    ordered, half = np.sort(rows, axis=0), len(rows) // 2
+    ordered, half = rows.copy(), len(rows) // 2
+    ordered.sort(axis=0)
     middle = ordered[half] if len(rows) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
     return np.where(np.isnan(ordered[-1]), np.nan, middle)
 

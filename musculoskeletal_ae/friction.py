@@ -21,11 +21,15 @@ REVERSAL = 0.0004  # [m] b, of sliding that turns friction round
 NOISE = 0.00013
 LATEST = 0.07
 SPIKE = 0.0002  # [m] by which a reading may lie beyond the last two
+# With a float numpy takes longer, for few muscles, than with an array of no dimension.
+ONE, A, B, KEPT, OFF, PLAY, FAR = map(
+    np.array, (1.0, LATEST, 2.0 - LATEST, 1.0 - LATEST, LATEST / NOISE, NOISE, SPIKE)
+)
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
     """Return s (..., M) after wires have slid by `moved` [m] in a `way`, 1: wound in, (..., M)."""
-    after: Array = way + (direction - way) * np.exp(-np.abs(moved) / REVERSAL)
+    after: Array = way + (direction - way) * np.exp(np.abs(moved) * (-1.0 / REVERSAL))
     return after
 
 
@@ -55,16 +59,18 @@ class FrictionDirection:
         if self._length is None:
             self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
-        least, most = np.minimum(*self._read) - SPIKE, np.maximum(*self._read) + SPIKE
-        self._read = self._read[1], length
-        off = np.minimum(np.maximum(length, least), most) - self._mean
-        self._off = self._off + LATEST * (off - self._off)
-        sliding = (self._off / NOISE) ** 4
-        gain = (LATEST + sliding) / (1.0 + sliding)
-        self._mean = self._mean + gain * off
-        before, play = self._length, NOISE * np.sqrt(gain / (2.0 - gain))
-        self._length = np.minimum(np.maximum(before, self._mean - play), self._mean + play)
-        moved = self._length - before
+        before, last = self._read
+        likely = np.maximum(length, np.minimum(before, last) - FAR)
+        off = np.minimum(likely, np.maximum(before, last) + FAR) - self._mean
+        self._read = last, length
+        self._off = KEPT * self._off + OFF * off  # ē / NOISE
+        sliding = np.square(np.square(self._off))
+        share = sliding + A  # g (1 + k)
+        self._mean = self._mean + share / (sliding + ONE) * off
+        play = PLAY * np.sqrt(share / (sliding + B))
+        least, most = self._mean - play, self._mean + play
+        moved = np.minimum(np.maximum(self._length, least), most) - self._length
+        self._length = self._length + moved
         self._direction = slid(self._direction, -np.sign(moved), moved)
         return self._direction
 

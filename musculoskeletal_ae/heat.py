@@ -105,14 +105,13 @@ class Heat:
         What is not finite is not known.
         """
         known, measured = np.isfinite(housing), self._state[1]
-        strange = known & ((np.abs(housing - measured) > JUMP) | ~self._known)
-        self._state[1] = np.where(strange, housing, measured)
-        changed = strange | (known != self._known)
-        if changed.any():
+        changed = known & (np.abs(housing - measured) > JUMP) | (known != self._known)
+        if np.count_nonzero(changed):
+            self._state[1] = np.where(known & changed, housing, measured)
             self._spoilt |= changed
-            self._limits = {}
-        self._known = known
-        self._sums += tension * tension, np.where(known, housing, 0.0)
+            self._limits, self._known = {}, known
+        self._sums[0] += tension * tension
+        self._sums[1] += housing  # where one is unknown, the sum tells nothing either
         self._messages, self._passed = self._messages + 1, self._passed + dt
         if self._passed < EVERY:
             return

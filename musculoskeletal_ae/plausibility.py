@@ -80,7 +80,11 @@ class Plausibility:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._longest = longest_lengths(robot)
+        most, longest = robot.description.tension.max, longest_lengths(robot)
+        cold, hot, self._unknown = (np.full_like(longest, t) for t in (*TEMPERATURES, np.nan))
+        #: possible T, l and temperatures, (3, M)
+        self._low = np.array([TOO_SLACK * most, -longest, cold])
+        self._high = np.array([TOO_TENSE * most, longest, hot])
         self.muscles, self.estimates = Doubt(), Doubt()
         self._before: Array | None = None  # the last lengths that were believed
         self._came: Array = np.zeros(robot.muscle_count)  # the last ones, whatever they were
@@ -97,9 +101,7 @@ class Plausibility:
         A MessageError says that no muscle of this arm can say that; isolated ones may say anything.
         """
         wound = np.where(tension < SLACK * self._robot.tension.bias, WOUND, 0.0)
-        used = self._robot.used
-        known = None if length is None else length * used
-        error = self.levels(tension * used, known, np.where(used, temperature, np.nan), wound)
+        error = self.levels(tension, length, temperature, wound)
         if error is None and length is not None:
             error = self._step(length, now)
         self.muscles.note(error, now)
@@ -112,9 +114,9 @@ class Plausibility:
         """Return what is wrong with a joint further beyond its limits than a share of its range."""
         low, high = self._robot.lower, self._robot.upper
         beyond = outside_limits(self._robot, theta)
-        if not beyond.max() > share:
-            return None
         j = int(beyond.argmax())
+        if not beyond[j] > share:
+            return None
         told = f'{self._robot.joints[j]} {theta[j]:.3g} {self._robot.units[j].theta}'
         limits = f'limits {low[j]:.2f} to {high[j]:.2f}'
         return MessageError('θ far outside the joint limits', f'{told}, {limits}')
@@ -126,29 +128,29 @@ class Plausibility:
         temperature: Array | None = None,
         wound: Array | float = 0.0,
     ) -> MessageError | None:
-        """Return what is wrong with a value that no sensor of this arm measures, or None.
+        """Return what is wrong with a value that no sensor of a used muscle measures, or None.
 
         wound: By how much a wire may be wound in beyond what the joints allow [m].
         """
-        most, muscles = self._robot.tension.max, self._robot.muscles
-        for reason, unit, value, (low, high) in (
-            (TENSION, 'N', tension, (TOO_SLACK * most, TOO_TENSE * most)),
-            (LENGTH, 'm', length, (-self._longest - wound, self._longest)),
-            (TEMPERATURE, '°C', temperature, TEMPERATURES),
-        ):
-            if value is not None and (beyond := (value < low) | (value > high)).any():
-                m = int(beyond.argmax())
-                ends = (np.broadcast_to(end, len(muscles))[m] for end in (low, high))
-                told = '{} {:.3g} {}, possible {:.3g} to {:.3g}'
-                return MessageError(reason, told.format(muscles[m], value[m], unit, *ends))
-        return None
+        given = (self._unknown if part is None else part for part in (tension, length, temperature))
+        values = np.array([*given]) * self._robot.used
+        low = self._low.copy()
+        low[1] -= wound
+        beyond = (values < low) | (values > self._high)
+        if not np.count_nonzero(beyond):
+            return None
+        q, m = np.argwhere(beyond)[0]
+        reason, unit = ((TENSION, 'N'), (LENGTH, 'm'), (TEMPERATURE, '°C'))[q]
+        told = f'{self._robot.muscles[m]} {values[q, m]:.3g} {unit}'
+        ends = f'possible {low[q, m]:.3g} to {self._high[q, m]:.3g}'
+        return MessageError(reason, f'{told}, {ends}')
 
     def _step(self, length: Array, now: float) -> MessageError | None:
         allowed = SLIP + SPEED * min(max(now - self._came_at, 0.0), HOLE)
         before, came = self._before, self._came
         self._came, self._came_at = length, now
         used = self._robot.used
-        if before is None or (step := np.abs(length - before) * used).max() <= allowed:
+        if before is None or (step := np.abs(length - before) * used)[step.argmax()] <= allowed:
             self._before, self._settled_since = length, math.inf
             return None
         if self._settled_since == math.inf:  # later others may have moved as far

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from inspect import iscoroutinefunction
 from typing import Any
 
@@ -49,30 +48,30 @@ class Reception:
             if late and publishers() == 1:
                 self.rejected[f'{topic}: repeated or reordered'] += 1
                 return False
-            self.turns[topic] += number < last
+            if number < last:
+                self.turns[topic] += 1
             before, last = sent, number
             return True
 
         def receive(message: Any, info: dict[str, Any]) -> None:
             if is_new(info):
-                with self._counting(topic):
+                try:
                     callback(message)
+                except MusculoskeletalError as error:
+                    self.reject(topic, error.reason, str(error))
+                else:
+                    self._received[topic] += 1
 
         async def receive_in_pieces(message: Any, info: dict[str, Any]) -> None:
             if is_new(info):
-                with self._counting(topic):
+                try:
                     await callback(message)
+                except MusculoskeletalError as error:
+                    self.reject(topic, error.reason, str(error))
+                else:
+                    self._received[topic] += 1
 
         return receive_in_pieces if iscoroutinefunction(callback) else receive
-
-    @contextmanager
-    def _counting(self, topic: str) -> Iterator[None]:
-        try:
-            yield
-        except MusculoskeletalError as error:
-            self.reject(topic, error.reason, str(error))
-        else:
-            self._received[topic] += 1
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a message or request; say whether it is the first for this reason."""

@@ -65,7 +65,7 @@ def read_array(
     values = np.array(message.data, dtype=float)
     finite = np.isfinite(values)
     shape = (rows, columns) if rows > 1 else columns
-    if finite.all():
+    if np.count_nonzero(finite) == count:
         return values.reshape(shape)
     left_out = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
     values[left_out], finite[left_out] = unknown, True
@@ -130,7 +130,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
     # As nearly all messages are; the other way says what is wrong, and takes its time.
     if [*message.name] == [*joints] and len(message.position) == count and others <= {0, count}:
         theta = np.array(message.position, dtype=float)
-        if np.isfinite(theta).all():
+        if np.count_nonzero(np.isfinite(theta)) == count:
             return theta
     values = read_joints(message, joints, foreign_allowed=True, some=some)
     return np.array([values[name][0] if name in values else np.nan for name in joints])

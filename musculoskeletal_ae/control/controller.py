@@ -401,7 +401,7 @@ class Controller:
 
     def _slack(self, command: Command | None) -> Command | None:
         """Return a command that gives isolated muscles all the length, or no tension."""
-        if command is None or self.robot.used.all():
+        if command is None or not self.robot.isolated:
             return command
         nothing = self.safety.longest if command.kind == LENGTH else 0.0
         return Command(command.kind, np.where(self.robot.used, command.value, nothing))
@@ -415,8 +415,12 @@ class Controller:
         """
         if self.settings.method != 'stiffness' or self.posture.exploring:
             limits = self.robot.tension
-            most = limits.limit + FED_BACK * (limits.max - limits.limit)
-            most = np.where(self.watch.strained, EASED * limits.limit, most)
+            most, strained = (
+                limits.limit + FED_BACK * (limits.max - limits.limit),
+                self.watch.strained,
+            )
+            if np.count_nonzero(strained):
+                most = np.where(strained, EASED * limits.limit, most)
             length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))
         return Command(LENGTH, length)
 

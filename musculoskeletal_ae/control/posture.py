@@ -70,7 +70,7 @@ def another_plan(tension: Array, before: Array, limit: Array) -> bool:
     out would be lost.
     """
     hangs_on_it = tension > np.minimum(before, limit) - REPLAN
-    return bool((hangs_on_it & (np.abs(limit - before) > REPLAN)).any())
+    return bool(np.count_nonzero(hangs_on_it & (np.abs(limit - before) > REPLAN)))
 
 
 class Pull(NamedTuple):

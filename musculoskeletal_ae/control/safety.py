@@ -72,7 +72,7 @@ class SafetyFilter:
         self.passing = False  # whether the stop may end by itself
         self.command: Command | None = None  # the last one that left
         self._held = 0.0
-        self._readings: deque[Muscles] = deque(maxlen=3)
+        self._readings: deque[Array] = deque(maxlen=3)  # (3, M) each
         #: medians of the last three messages
         self.now: Muscles | None = None
         postures = robot.random_postures(200, np.random.default_rng(0))
@@ -88,7 +88,7 @@ class SafetyFilter:
 
     def shift(self, less: Array) -> None:
         """Take lengths that are less [m] (M,) from now on: the same muscles, another zero."""
-        self._readings = deque((m._replace(length=m.length - less) for m in self._readings), 3)
+        self._readings = deque((np.array([m[0] - less, *m[1:]]) for m in self._readings), 3)
         if self.now is not None:
             self.now = self.now._replace(length=self.now.length - less)
         if self.command is not None and self.command.kind == LENGTH:
@@ -96,7 +96,7 @@ class SafetyFilter:
 
     def muscles(self, muscles: Muscles) -> Muscles:
         """Take new muscle_states; return the medians of the last three, isolated ones without T."""
-        self._readings.append(muscles)
+        self._readings.append(np.array(muscles))
         median = Muscles(*median_of_rows(np.array(self._readings)))
         self.now = median._replace(tension=median.tension * self._robot.used)
         return self.now
@@ -122,7 +122,7 @@ class SafetyFilter:
             return None
         if not self.cause:
             limited = self._limited(desired, muscles, limit, dt)
-            if np.isfinite(limited.value).all():
+            if np.count_nonzero(np.isfinite(limited.value)) == len(limited.value):
                 self.command = limited
                 return limited
             self.stop('the computed command is not finite')
@@ -149,7 +149,7 @@ class SafetyFilter:
             if kind == LENGTH:
                 before = Command(kind, np.minimum(before.value, self._longest))
         change = self.most_change(kind, dt)
-        value = before.value + np.clip(value - before.value, -change, change)
+        value = np.maximum(np.minimum(value, before.value + change), before.value - change)
         if kind == TENSION:
             return Command(kind, np.clip(value, robot.tension.bias, limit))
         least = np.minimum(muscles.length, self._longest) + msc_compensation(robot, limit)
@@ -183,8 +183,8 @@ class SafetyFilter:
         """Return the next command [m] of the suspect, after `value`."""
         if self._wound_from is None:
             self._wound_from = value
-        newest = self._readings[-1]  # with the tensions of isolated muscles
-        length, tension = newest.length[muscle], newest.tension[muscle]
+        # With the tensions of isolated muscles.
+        length, tension, _ = self._readings[-1][:, muscle]
         rise = tension - self._robot.description.tension.bias[muscle]
         if max(rise, self._robot.stiffness[muscle] * (length - value)) > WIND:
             return value

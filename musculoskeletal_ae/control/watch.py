@@ -152,18 +152,18 @@ class Watch:
     def _overload(self, now: float) -> str:
         longest = self.settings.overload_time, OVERLOAD_MOMENT
         for since, allowed, most in zip(self._tense_since, longest, self._overloads):
-            if now - self._asleep - since.min() > allowed:
-                m = int(since.argmin())
+            m = int(since.argmin())
+            if now - self._asleep - since[m] > allowed:
                 name = self._robot.muscles[m]
                 return f'{name}: tension above {most[m]:g} N for {allowed:g} s'
         return ''
 
     def _overheat(self) -> str:
         now, robot = np.fmax(self.heat.core, -np.inf), self._robot  # NaN is not known
-        highest = self.settings.temperature_limit
-        hot = now.max() > highest + (0.0 if self._overheated else OVERHEATED)
-        exhausted = (self.limit <= robot.tension.bias)[robot.used]
-        self._overheated = bool(hot or (exhausted.all() and exhausted.any()))
-        name = robot.muscles[int(now.argmax())]
-        told = f'overheated: {name} {now.max():.0f} °C, limit {highest:g} °C'
-        return told if self._overheated else ''
+        highest, m = self.settings.temperature_limit, int(now.argmax())
+        hot = now[m] > highest + (0.0 if self._overheated else OVERHEATED)
+        able = np.count_nonzero(robot.used & (self.limit > robot.tension.bias))
+        self._overheated = bool(hot or (not able and robot.used.any()))
+        if not self._overheated:
+            return ''
+        return f'overheated: {robot.muscles[m]} {now[m]:.0f} °C, limit {highest:g} °C'

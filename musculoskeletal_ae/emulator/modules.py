@@ -171,7 +171,7 @@ def noisy(
 ) -> Array:
     """Return a value as a sensor reads it."""
     read: Array = value + rng.normal(0.0, noise, value.shape)
-    return np.round(read / resolution) * resolution
+    return np.rint(read / resolution) * resolution
 
 
 class Arm(ABC):

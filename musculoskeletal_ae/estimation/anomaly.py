@@ -30,6 +30,7 @@ Preset `paper` decides on A alone, against the checkpoint's threshold of A.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +38,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLACK, outside_limits
 from musculoskeletal_ae.presets import preset_named
@@ -120,30 +121,38 @@ class AnomalyDetector:
         It came dt [s] after the message before.
         """
         error = residuals(state, end_tension, length, self._robot.isolated)
-        size, distance, share = float(anomaly(error)), float('nan'), error
+        muscles, distance, share = len(tension), math.nan, error
+        pull, shift = error[:muscles], error[muscles:]
+        size = math.sqrt(pull @ pull) + math.sqrt(shift @ shift)
         if self._statistics is not None:
             centred = error - self._statistics.mean
             white = self._whiten @ centred
-            distance = float(np.sqrt(white @ white))
+            distance = math.sqrt(white @ white)
             share = centred / self._spread
-        muscles = len(tension)
-        score = share[:muscles] ** 2 + share[muscles:] ** 2
-        dead = self._dead(state.theta, tension, length, dt)
+        square = share * share
+        score = square[:muscles] + square[muscles:]
+        demand = None
+        if self._length_command is not None:
+            demand = self._robot.demanded(length, self._length_command)
+        dead = self._dead(state.theta, tension, length, demand, dt)
         if dead is not None and self.whitened:
             return Verdict(size, distance, dead, 'no tension where the command demands it')
-        jammed = self._jam(tension, length, dt)
+        jammed = self._jam(tension, length, demand, dt)
         if jammed is not None and self.whitened and self.judges:
             return Verdict(size, distance, jammed, 'its winch stands, whatever is commanded')
         # A muscle without tension is the one, whatever the others' residuals make of it.
         slack = self._robot.used & (tension < SLACK * self._robot.tension.bias)
-        suspect = int(np.argmax(np.where(slack, score + score.sum() + 1.0, score)))
-        waits = bool((slack & self._winds_slack & (share[muscles:] < 0.0)).any() and self.whitened)
-        cause = ''
+        count, waits, cause = int(np.count_nonzero(slack)), False, ''
+        if count:
+            score = np.where(slack, score + score.sum() + 1.0, score)
+            winds = slack & self._winds_slack & (share[muscles:] < 0.0)
+            waits = bool(winds.any()) and self.whitened
+        suspect = int(score.argmax())
         if self.judges:
-            cause = self._beyond_threshold(size, distance, state.theta, tension, slack, waits)
+            cause = self._beyond_threshold(size, distance, state.theta, tension, count, waits)
         # Where one is cut, another may be slack for a moment.
-        if cause and self._beyond == IN_A_ROW and self.calibrated and slack.sum() != 1:
-            among = slack if slack.any() else self._robot.used
+        if cause and self._beyond == IN_A_ROW and self.calibrated and count != 1:
+            among = slack if count else self._robot.used
             suspect = self._unlikeliest(end_tension, length, among)
         return Verdict(size, distance, suspect, cause)
 
@@ -164,7 +173,7 @@ class AnomalyDetector:
         return self._farthest * float(np.clip(max(self.unfamiliar(theta), tense), 1.0, WIDEST))
 
     def _beyond_threshold(
-        self, anomaly: float, distance: float, theta: Array, tension: Array, slack: Bools,
+        self, anomaly: float, distance: float, theta: Array, tension: Array, slack: int,
         waits: bool,
     ) -> str:  # fmt: skip
         limit, value, what, where = self.settings.anomaly_threshold, anomaly, 'A', ''
@@ -174,7 +183,7 @@ class AnomalyDetector:
             limit = self._farthest
             if self.whitened:
                 value, what = distance, 'd'
-            if value > limit and not slack.any() and (wider := self.limit(theta, tension)) > limit:
+            if value > limit and not slack and (wider := self.limit(theta, tension)) > limit:
                 limit, where = wider, ', wider in an unfamiliar posture or beyond tension.limit,'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
@@ -191,16 +200,14 @@ class AnomalyDetector:
             distance[muscle] = less.anomaly.distances(error[None])[0]
         return int(distance.argmin())
 
-    def _jam(self, tension: Array, length: Array, dt: float) -> int | None:
-        if self._length_command is None:
+    def _jam(self, tension: Array, length: Array, demand: Array | None, dt: float) -> int | None:
+        if demand is None:
             self._jammed[:] = 0.0
             return None
-        demand = np.minimum(
-            self._robot.demanded(length, self._length_command), self._robot.tension.max
-        )
+        demand = np.minimum(demand, self._robot.tension.max)
         far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
         told = far & self._robot.used
-        if not told.any():
+        if not np.count_nonzero(told):
             self._stands, self._jammed[:] = length, 0.0
             return None
         stands = told & (np.abs(length - self._stands) < STANDS)
@@ -208,10 +215,11 @@ class AnomalyDetector:
         self._jammed = np.where(stands, self._jammed + dt, 0.0)
         return int(self._jammed.argmax()) if self._jammed.max() >= JAM_TIME else None
 
-    def _dead(self, theta: Array, tension: Array, length: Array, dt: float) -> int | None:
-        bias, demand = self._robot.tension.bias, self._tension_command
-        if self._length_command is not None:
-            demand = self._robot.demanded(length, self._length_command)
+    def _dead(
+        self, theta: Array, tension: Array, length: Array, demand: Array | None, dt: float
+    ) -> int | None:
+        bias = self._robot.tension.bias
+        demand = self._tension_command if demand is None else demand
         if demand is None:
             # Nobody commands an arm whose estimate makes no sense: then modules hold T_bias.
             lost = outside_limits(self._robot, theta).max() > ESTIMATE_OUTSIDE
@@ -221,7 +229,7 @@ class AnomalyDetector:
                 return None
             demand = np.full(len(tension), bias)
         torn = (tension < SLACK * demand) & (demand >= bias) & self._robot.used
-        if not (torn.any() or self._torn.any()):
+        if not (np.count_nonzero(torn) or np.count_nonzero(self._torn)):
             self._winds_slack[:] = False
             return None
         begins = torn & (self._torn == 0.0)

@@ -214,7 +214,10 @@ class Estimator:
         """Return the muscle of a sensor that says the same though the others say that it moves."""
         robot, read, before = self._robot, np.array([length, tension]), self._read
         self._read = read
-        self._same = np.where(read == before, self._same + dt, 0.0)
+        self._same = (self._same + dt) * (read == before)
+        if self._same.max() < STILL_TIME or not self.detector.calibrated:
+            self._moved = None
+            return None
         # One without tension has another rule; one that is paid out may keep T_bias to the bit.
         bias = robot.tension.bias
         judged = robot.used & (tension > SLACK * bias)
@@ -222,7 +225,7 @@ class Estimator:
             self._same[0], self._same[1] * (np.abs(tension - bias) > SLACK * bias)
         )
         muscle = int(since.argmax())
-        if since[muscle] < STILL_TIME or not (self.detector.calibrated and self.detector.judges):
+        if since[muscle] < STILL_TIME or not self.detector.judges:
             self._moved = None
             return None
         less, low, high = self._moved or (mae, np.inf, -np.inf)
@@ -364,7 +367,7 @@ class Estimator:
                 limit = self.detector.limit(self._theta, self._read[1])
                 values[f'{letter} limit'] = f'{limit:.3g}'
         if (touch := self._touch) is not None:
-            force = f'{np.linalg.norm(touch.force):.0f} N at the hand'
+            force = f'{np.linalg.norm(touch.force()):.0f} N at the hand'
             known = force if touch.contact else 'none'
             values['contact'] = known if self._external.calibrated else 'not calibrated'
             values['contacts'] = str(self._contacts)

@@ -16,7 +16,9 @@ nothing of torques away from it, which are the stop's own; one towards it is at 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +44,8 @@ class Touch(NamedTuple):
     """What one message says of the outside."""
 
     torque: Array  # τ_ext [N·m], (D,); 0 where a stop bears the joint
-    force: Array  # F on the end effector's origin, axes of the root link [N], (3,)
+    #: F on the end effector's origin, axes of the root link [N], (3,), made where it is asked for
+    force: Callable[[], Array]
     distance: float  # d; NaN without statistics
     contact: bool
 
@@ -54,6 +57,7 @@ class ExternalTorque:
         self._robot = robot
         self._middle = 0.5 * (robot.lower + robot.upper)
         self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP * robot.kinematics.radian
+        self._near = TURNED * robot.kinematics.radian
         self.reset()
 
     def use(self, mae: Mae) -> None:
@@ -74,16 +78,16 @@ class ExternalTorque:
     def step(self, theta: Array, end_tension: Array, dt: float) -> Touch:
         """Take estimated θ [rad] (D,) and T_end [N] (M,), dt [s] after those before."""
         kinematics, joints = self._robot.kinematics, len(theta)
-        turned = np.abs(theta - self._turned) / kinematics.radian
-        if not turned.max() <= TURNED:  # not a number, too
+        near = np.abs(theta - self._turned) <= self._near
+        if np.count_nonzero(near) < joints:  # not a number, too
             self._jacobian, self._turned = self._mae.muscle_jacobian(theta, end_tension), theta
         now: Array = np.concatenate((theta, end_tension @ self._jacobian))
         if self._value is None:
             self._value, self._rate = now, np.zeros_like(now)
         # Implicit Euler: stable however late a message is.
         share = BANDWIDTH * dt
-        rate = self._rate + BANDWIDTH * share * (now - self._value)
-        rate /= 1.0 + share + share**2
+        less = 1.0 / (1.0 + share + share**2)
+        rate = less * self._rate + less * BANDWIDTH * share * (now - self._value)
         acceleration = (rate - self._rate)[:joints] / max(dt, 1e-6)
         self._value, self._rate = self._value + dt * rate, rate
         smooth, self.velocity = self._value[:joints], rate[:joints]
@@ -92,16 +96,19 @@ class ExternalTorque:
         out = smooth - self._middle
         free = (np.abs(out) < self._reach) | (torque * out > 0.0)
         torque *= free
-        if not math.isfinite(torque.sum()):
+        if not math.isfinite(torque @ torque):
             self.reset()
-            return Touch(np.zeros(joints), np.zeros(3), math.nan, False)
-        jacobian = kinematics.end_effector_jacobian(smooth)[:3]
-        weighted = jacobian * (self._weight * free)
-        square = weighted @ jacobian.T + SMALL
-        force: Array = np.linalg.inv(square) @ (weighted @ torque)
+            return Touch(np.zeros(joints), lambda: np.zeros(3), math.nan, False)
         distance = math.sqrt(self._weight @ (torque * torque)) if self.calibrated else math.nan
         self._beyond = self._beyond + 1 if distance > CONTACT else 0
+        force = partial(self._force, smooth, torque, self._weight * free)
         return Touch(torque, force, distance, self._beyond >= IN_A_ROW)
+
+    def _force(self, theta: Array, torque: Array, weight: Array) -> Array:
+        jacobian = self._robot.kinematics.end_effector_jacobian(theta)[:3]
+        weighted = jacobian * weight
+        force: Array = np.linalg.inv(weighted @ jacobian.T + SMALL) @ (weighted @ torque)
+        return force
 
 
 # -- what a healthy arm leaves --------------------------------------------------------------------

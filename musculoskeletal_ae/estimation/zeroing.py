@@ -68,7 +68,7 @@ class Zeros(NamedTuple):
     @property
     def known(self) -> bool:
         """Whether lengths can be relied on."""
-        return bool(self.deviation.max() < KNOWN)
+        return bool(self.deviation[self.deviation.argmax()] < KNOWN)
 
     @staticmethod
     def unknown(muscles: int) -> Zeros:

@@ -136,7 +136,7 @@ def _pushed(loop: FeelingLoop, force: Array) -> tuple[Array, Array, bool]:
     robot, felt, free = loop.arm.robot, list[Array](), True
     loop.push(force)
     for _ in range(round(PUSH / SAMPLE_TIME)):
-        felt.append(loop.feel().force)
+        felt.append(loop.feel().force())
         theta = loop.arm.theta
         free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
     loop.push(np.zeros(3))

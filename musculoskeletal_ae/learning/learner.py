@@ -152,8 +152,8 @@ class Learner:
         self._rests.gravity = (
             np.where(heard[:, None], self._gravity, np.nan).ravel() if heard.any() else NOTHING
         )
-        used = self._used
-        tension, length = tension * used, length * used
+        if self.isolated:
+            tension, length = tension * self._used, length * self._used
         self._gate_time += dt
         self.gate.message(tension, length, self._gate_time)
         if self._mae is not None and not self._rests.anomaly:
@@ -161,7 +161,7 @@ class Learner:
         before = self._healthy.time
         rests = self._rests.step(tension, length, dt, theta)
         if self._healthy.time > before:
-            self._spoiled |= ~used
+            self._spoiled |= ~self._used
         for rest in rests:
             self._healthy.rest(rest)
             if self.samples.is_new(rest):

@@ -42,8 +42,8 @@ class RestDetector:
         """Start with an empty window; `radian` is that of `SampleStore`."""
         self.settings, self.blind, self._radian = settings, blind, radian
         self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
-        # Rows from `_first` on are l of the window's readings: no new array while an arm moves.
-        self._lengths, self._first = np.empty((0, 1)), 0
+        # Rows from `_first` on are (l, θ) of the window's readings: no new array for every message.
+        self._rows, self._first = np.empty((0, 1)), 0
         self.reset()
 
     def reset(self) -> None:
@@ -85,11 +85,12 @@ class RestDetector:
     def _append(self, reading: Sample) -> None:
         held = min(len(self._window), MOST - 1)  # of which one goes when the window is full
         self._first += len(self._window) - held
-        if self._first + held == len(self._lengths):
-            kept = self._lengths[self._first :]
-            self._lengths, self._first = np.empty((2 * held + 100, len(reading.length))), 0
-            self._lengths[:held] = kept
-        self._lengths[self._first + held] = reading.length
+        row = np.concatenate((reading.length, reading.theta))
+        if self._first + held == len(self._rows):
+            kept = self._rows[self._first :]
+            self._rows, self._first = np.empty((2 * held + 100, len(row))), 0
+            self._rows[:held] = kept
+        self._rows[self._first + held] = row
         self._window.append((self._time, reading))
 
     def _is_still(self) -> bool:
@@ -98,16 +99,16 @@ class RestDetector:
             return False
         cut = bisect_right(self._window, self._time - half, key=itemgetter(0))
         middle, end = self._first + cut, self._first + len(self._window)
-        lengths = [self._lengths[self._first : middle], self._lengths[middle:end]]
-        if not _unmoved(lengths, self.settings.rest_length_rate * half):
+        halves = self._rows[self._first : middle], self._rows[middle:end]
+        muscles = len(self._window[0][1].length)
+        if not _unmoved([h[:, :muscles] for h in halves], self.settings.rest_length_rate * half):
             return False
-        window = [reading for _, reading in self._window]
-        halves = window[:cut], window[cut:]
-        angles = [np.array([r.theta for r in part if _measured(r)]) for part in halves]
+        angles = [part[:, muscles:] for part in halves]
+        angles = [part[~np.isnan(part).all(axis=1)] for part in angles]
         if min(map(len, angles)) < LEAST_READINGS:
             return self.blind
         known = [np.isfinite(part) for part in angles]
-        enough = np.min([part.sum(axis=0) for part in known], axis=0) >= LEAST_READINGS
+        enough = np.minimum(*(part.sum(axis=0) for part in known)) >= LEAST_READINGS
         if not enough.any():
             return self.blind
         rate = self.settings.rest_joint_rate * half * self._radian
@@ -134,12 +135,12 @@ def _mean(values: Array) -> Array:
 
 def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
     first, second = halves
-    difference = np.abs(second.mean(axis=0) - first.mean(axis=0))
+    difference = np.abs(second.sum(axis=0) / len(second) - first.sum(axis=0) / len(first))
     if (difference <= allowed).all():
         return True
     # Taken from neighbours' differences, which a slow drift hardly enters.
     error = sum(
-        np.square(np.diff(half, axis=0)).mean(axis=0) / (2.0 * len(half))
+        np.square(half[1:] - half[:-1]).sum(axis=0) / (2.0 * len(half) * (len(half) - 1))
         for half in halves
         if len(half) > 1
     )

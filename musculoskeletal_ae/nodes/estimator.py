@@ -217,7 +217,7 @@ class Estimator(Shell):
         if (touch := estimate.touch) is not None and is_heard(self.wrench):
             wrench = WrenchStamped()
             wrench.header.stamp, wrench.header.frame_id = clock.to_msg(), self.root_frame
-            wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force.tolist())))
+            wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force().tolist())))
             self.wrench.publish(wrench)
         self._tell_anomaly()
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -29,13 +30,17 @@ LATCHED = QoSProfile(
 
 def array_message(values: Array, *labels: str) -> Float64MultiArray:
     """Return a multi-array of values (…) with one label per dimension."""
-    sizes = values.shape
+    layout = _layout(values.shape, labels)
+    return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+
+
+@cache
+def _layout(sizes: tuple[int, ...], labels: tuple[str, ...]) -> MultiArrayLayout:
     dimensions = [
         MultiArrayDimension(label=label, size=size, stride=math.prod(sizes[i:]))
         for i, (label, size) in enumerate(zip(labels, sizes, strict=True))
     ]
-    layout = MultiArrayLayout(dim=dimensions)
-    return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+    return MultiArrayLayout(dim=dimensions)
 
 
 def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointState:

@@ -241,7 +241,7 @@ class Kinematics:
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
         """Return M(θ) θ̈ + h(θ, θ̇), the joint torque of a motion [N·m], shape (D,)."""
-        rates = (self.ratio[1:] * part[self.theta_index[1:]] for part in (velocity, acceleration))
+        rates = self.ratio[1:] * np.array([velocity, acceleration])[:, self.theta_index[1:]]
         return self.of_theta(pin.rnea(self.model, self.data, self.tree_angles(theta), *rates))
 
     def gravity_gradient(self, theta: Array) -> Array:
