@@ -21,10 +21,6 @@ REVERSAL = 0.0004  # [m] b, of sliding that turns friction round
 NOISE = 0.00013
 LATEST = 0.07
 SPIKE = 0.0002  # [m] by which a reading may lie beyond the last two
-# With a float numpy takes longer, for few muscles, than with an array of no dimension.
-ONE, A, B, KEPT, OFF, PLAY, FAR = map(
-    np.array, (1.0, LATEST, 2.0 - LATEST, 1.0 - LATEST, LATEST / NOISE, NOISE, SPIKE)
-)
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
@@ -60,14 +56,14 @@ class FrictionDirection:
             self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
         before, last = self._read
-        likely = np.maximum(length, np.minimum(before, last) - FAR)
-        off = np.minimum(likely, np.maximum(before, last) + FAR) - self._mean
+        likely = np.maximum(length, np.minimum(before, last) - SPIKE)
+        off = np.minimum(likely, np.maximum(before, last) + SPIKE) - self._mean
         self._read = last, length
-        self._off = KEPT * self._off + OFF * off  # ē / NOISE
+        self._off = self._off + LATEST * (off / NOISE - self._off)  # ē / NOISE
         sliding = np.square(np.square(self._off))
-        share = sliding + A  # g (1 + k)
-        self._mean = self._mean + share / (sliding + ONE) * off
-        play = PLAY * np.sqrt(share / (sliding + B))
+        share = sliding + LATEST  # g (1 + k)
+        self._mean = self._mean + share / (1.0 + sliding) * off
+        play = NOISE * np.sqrt(share / (sliding + 2.0 - LATEST))
         least, most = self._mean - play, self._mean + play
         moved = np.minimum(np.maximum(self._length, least), most) - self._length
         self._length = self._length + moved

@@ -414,11 +414,8 @@ class Controller:
         arm.
         """
         if self.settings.method != 'stiffness' or self.posture.exploring:
-            limits = self.robot.tension
-            most, strained = (
-                limits.limit + FED_BACK * (limits.max - limits.limit),
-                self.watch.strained,
-            )
+            limits, strained = self.robot.tension, self.watch.strained
+            most = limits.limit + FED_BACK * (limits.max - limits.limit)
             if np.count_nonzero(strained):
                 most = np.where(strained, EASED * limits.limit, most)
             length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))

@@ -31,12 +31,11 @@ def residuals(
 
     That of isolated muscles is 0.
     """
-    error = np.stack(
-        [TENSION_SCALE * (restored.tension - tension), LENGTH_SCALE * (restored.length - length)],
-        axis=-2,
-    )
-    error[..., list(isolated)] = 0.0
-    return error.reshape(*error.shape[:-2], -1)
+    pull = TENSION_SCALE * (restored.tension - tension)
+    shift = LENGTH_SCALE * (restored.length - length)
+    if isolated:
+        pull[..., list(isolated)] = shift[..., list(isolated)] = 0.0
+    return np.concatenate((pull, shift), axis=-1)
 
 
 def anomaly(error: Array) -> Array:
