@@ -10,6 +10,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import mechanics
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import Arm, joint_gear
+from musculoskeletal_ae.emulator.wrapping import Placed
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -28,18 +29,12 @@ class EmulatedArm(Arm):
         self._gear = joint_gear(robot.kinematics)[1:]
         self._model.armature = ARMATURE * self._gear
         self._data = self._model.createData()
-        frame = self._model.frames[robot.kinematics.end_effector_frame]
-        self._effector_joint = int(frame.parentJoint)
-        self._effector: Array = np.array(frame.placement.translation)
-        self._bare_inertia = self._model.inertias[self._effector_joint].copy()
         self._body = self._constants()
+        self._bare_inertia = self._model.inertias[self._body.effector_joint].copy()
         true, zero = self.individual, self.individual.length_at_zero
         span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - zero
         self._wound = self._modules(span, true.elastic.elongation(zero, robot.tension.max))
-        points, joints = true.routes.point.shape, len(true.tree.parent)
-        ends = len(true.routes.first), 3
-        shapes = (joints, 3, 3), (joints, 3), (joints, 3), points, robot.muscle_count, ends, ends, 3
-        self._scratch = mechanics.Scratch(*map(np.zeros, shapes))
+        self._placed = Placed.empty(true.routes, robot.muscle_count)
         self._joint = mechanics.JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self._angles, self._rates = self._joint.q, self._joint.velocity
         self.reset()
@@ -53,9 +48,11 @@ class EmulatedArm(Arm):
         firmness = self._gear.copy()
         load = true.load / mechanics.STOP_LOAD
         firmness[self._order] = np.maximum(firmness[self._order], load)
+        joint, hand = robot.kinematics.placement(robot.description.end_effector)
         return mechanics.Body(
             unit.force, unit.rate, unit.wire_stretch, true.length_at_zero, true.cable_friction,
             true.tension_gain, true.tension_bias, friction, lower, upper, self._gear, firmness,
+            joint, np.array(hand.translation),
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:
@@ -66,14 +63,13 @@ class EmulatedArm(Arm):
     def set_payload(self, mass: float) -> None:
         """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
-        placed = load.se3Action(pin.SE3(np.eye(3), self._effector))
-        self._model.inertias[self._effector_joint] = self._bare_inertia + placed
+        placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
+        self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
 
     def _step(self) -> None:
         mechanics.muscle_step(
-            self.individual.tree, self.individual.routes, self._body, self._wound, self._muscle,
-            self._joint, self._scratch, self._kind, self._command, self._wrench, self._effector,
-            self._effector_joint, self._acceleration(),
+            self.individual.routes, self._placed, self._body, self._wound, self._muscle,
+            self._joint, self._kind, self._command, self._wrench, self._acceleration(),
         )  # fmt: skip
 
     def _acceleration(self) -> Array:
@@ -97,4 +93,4 @@ class EmulatedArm(Arm):
 
     def route_points(self) -> Array:
         """True route points in the root link's frame [m], shape (P, 3)."""
-        return self._scratch.world.copy()
+        return self._placed.world.copy()

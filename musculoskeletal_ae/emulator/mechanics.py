@@ -17,23 +17,15 @@ from collections import namedtuple
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.modules import (
-    STEP,
-    Command,
-    Modules,
-    MuscleState,
-    heat,
-    rubbed,
-    wind,
-)
+from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
 from musculoskeletal_ae.emulator.wrapping import (
-    Tree,
+    Placed,
     WrappedRoutes,
     add_pull,
     add_torque,
-    place_points,
-    route_segment,
-    tree_poses,
+    place,
+    point_of,
 )
 
 SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
@@ -45,18 +37,15 @@ STOP_LOAD = 40.0  # [N·m] of weight and muscles at T_bias; stops of a joint wit
 
 
 #: Constants of one individual, as the compiled step wants them: elastic units, wires and sensors of
-#: M muscles, friction and stops of the J−1 joints of the tree; gear and firmness are what viscous
-#: friction and stops are multiplied by.
+#: M muscles; friction and stops of the J−1 joints of the tree, where gear and firmness are what
+#: viscous friction and stops are multiplied by; joint of the end effector and place in it [m].
 Body = namedtuple(
     'Body',
     'force rate wire_stretch length_at_zero cable_friction sensor_gain sensor_offset '
-    'joint_friction lower upper gear firmness',
+    'joint_friction lower upper gear firmness effector_joint effector',
 )
 #: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
 JointState = namedtuple('JointState', 'q velocity sticking torque')
-#: Work arrays, so that a step allocates nothing: poses of the joints; route points and lengths;
-#: unit pulls at the ends of each segment, (S, 3); a point.
-Scratch = namedtuple('Scratch', 'rotation translation axis world absolute leave arrive point')
 
 
 @njit(cache=True)
@@ -83,94 +72,59 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def muscle_step(
-    tree: Tree, routes: WrappedRoutes, body: Body, modules: Modules, muscle: MuscleState,
-    joint: JointState, scratch: Scratch, kind: int, command: Command, wrench: Array,
-    effector: Array, effector_joint: int, acceleration: Array,
+    routes: WrappedRoutes, placed: Placed, body: Body, constants: Modules, muscle: MuscleState,
+    joint: JointState, kind: int, command: Command, wrench: Array, acceleration: Array,
 ) -> None:  # fmt: skip
     """Move joints and motors by one STEP and leave the generalised torque in joint.torque.
 
     `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `wrench` the force and torque on the end
-    effector, axes of the root link, (6,), which stands at `effector` [m] in its joint's frame;
-    `acceleration` q̈ from the rigid-body dynamics, (J−1,).
+    effector, axes of the root link, (6,); `acceleration` q̈ from the rigid-body dynamics, (J−1,).
     """
     for i in range(joint.q.shape[0]):
         joint.velocity[i] += STEP * acceleration[i]
         joint.q[i] += STEP * joint.velocity[i]
-    tree_poses(tree, joint.q, scratch.rotation, scratch.translation, scratch.axis)
-    place_points(routes, scratch.rotation, scratch.translation, scratch.world)
-    world = scratch.world
-    scratch.absolute[:] = 0.0
-    translation, leave, arrive = scratch.translation, scratch.leave, scratch.arrive
-    for s in range(routes.first.shape[0]):
-        scratch.absolute[routes.muscle[s]] += route_segment(
-            routes, s, scratch.rotation, translation, world, leave[s], arrive[s]
-        )
-    _wires_and_modules(body, modules, muscle, kind, command, scratch.absolute)
+    place(routes, joint.q, placed)
+    _wires_and_modules(body, constants, muscle, kind, command, placed.absolute)
     joint.torque[:] = 0.0
-    _friction_and_stops(body, joint)
-    for s in range(routes.first.shape[0]):
-        add_pull(
-            tree, routes, s, translation, scratch.axis, world, leave[s], arrive[s],
-            muscle.end_tension[routes.muscle[s]], joint.torque,
-        )  # fmt: skip
-    _external_wrench(tree, joint, scratch, wrench, effector, effector_joint)
-
-
-@njit(cache=True)
-def _wires_and_modules(
-    body: Body, modules: Modules, muscle: MuscleState, kind: int, command: Command, absolute: Array
-) -> None:
-    for m in range(absolute.shape[0]):
-        route = absolute[m] - body.length_at_zero[m]
-        reading = muscle.length[m] + command.length_error[m] + command.zero[m]
-        pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
-        slid = wind(modules, muscle, kind, command, m, reading, pull)
-        muscle.sliding[m] = rubbed(muscle.sliding[m], slid, SLIDING_DISTANCE)
-        if muscle.ruptured[m] > 0.0:
-            muscle.end_tension[m] = 0.0
-        else:
-            muscle.end_tension[m] = tension_from_elongation(
-                route - muscle.length[m] - command.slack[m],
-                body.force[m],
-                body.rate[m],
-                body.wire_stretch[m] * absolute[m],
-            )
-        muscle.tension[m] = muscle.end_tension[m] * math.exp(
-            body.cable_friction[m] * muscle.sliding[m]
-        )
-        heat(modules, muscle, command, m)
-
-
-@njit(cache=True)
-def _friction_and_stops(body: Body, joint: JointState) -> None:
     for i in range(joint.q.shape[0]):
         turned = STEP * joint.velocity[i] * math.sqrt(body.gear[i])
-        joint.sticking[i] = rubbed(joint.sticking[i], turned, STICKING_ANGLE)
+        joint.sticking[i] = modules.rubbed(joint.sticking[i], turned, STICKING_ANGLE)
         joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
         joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])
         beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])
         if beyond != 0.0:
             stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
             joint.torque[i] -= body.firmness[i] * stop
+    for s in range(routes.first.shape[0]):
+        add_pull(routes, s, placed, muscle.end_tension[routes.muscle[s]], joint.torque)
+    hand = point_of(placed, body.effector_joint, body.effector)
+    add_torque(routes.tree, placed, body.effector_joint, hand, wrench[:3], 1.0, joint.torque)
+    i = body.effector_joint
+    while i > 0:
+        if not routes.tree.prismatic[i]:
+            for r in range(3):
+                joint.torque[i - 1] += placed.axis[i, r] * wrench[3 + r]
+        i = routes.tree.parent[i]
 
 
 @njit(cache=True)
-def _external_wrench(
-    tree: Tree, joint: JointState, scratch: Scratch, wrench: Array, effector: Array,
-    effector_joint: int,
+def _wires_and_modules(
+    body: Body, constants: Modules, muscle: MuscleState, kind: int, command: Command,
+    absolute: Array,
 ) -> None:  # fmt: skip
-    point = scratch.point
-    for r in range(3):
-        point[r] = scratch.translation[effector_joint, r]
-        for k in range(3):
-            point[r] += scratch.rotation[effector_joint, r, k] * effector[k]
-    add_torque(
-        tree, scratch.translation, scratch.axis, effector_joint, point, wrench[:3], 1.0,
-        joint.torque,
-    )  # fmt: skip
-    i = effector_joint
-    while i > 0:
-        if not tree.prismatic[i]:
-            for r in range(3):
-                joint.torque[i - 1] += scratch.axis[i, r] * wrench[3 + r]
-        i = tree.parent[i]
+    for m in range(absolute.shape[0]):
+        reading = muscle.length[m] + command.length_error[m] + command.zero[m]
+        pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
+        slid = modules.wind(constants, muscle, kind, command, m, reading, pull)
+        muscle.sliding[m] = modules.rubbed(muscle.sliding[m], slid, SLIDING_DISTANCE)
+        muscle.end_tension[m] = 0.0
+        if muscle.ruptured[m] == 0.0:
+            muscle.end_tension[m] = tension_from_elongation(
+                absolute[m] - body.length_at_zero[m] - muscle.length[m] - command.slack[m],
+                body.force[m],
+                body.rate[m],
+                body.wire_stretch[m] * absolute[m],
+            )
+        friction = math.exp(body.cable_friction[m] * muscle.sliding[m])
+        muscle.tension[m] = muscle.end_tension[m] * friction
+        modules.heat(constants, muscle, command, m)
