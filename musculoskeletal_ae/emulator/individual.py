@@ -15,7 +15,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
-from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
+from musculoskeletal_ae.robot.jumps import REDRAWN, jumping
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -96,15 +96,15 @@ class Individual:
         One jumps, by centimetres, where it would slip over the end of what it wraps round: nobody
         lays it there.
         """
-        nominal, limits = robot.routes, (robot.lower, robot.upper)
-        smooth = jumps(nominal.absolute_lengths, *limits)[0] <= JUMP
+        nominal = robot.routes
+        smooth = ~jumping(nominal.absolute_lengths, robot)
         for drawn in again:
-            jumping = smooth & (jumps(self.absolute_lengths, *limits)[0] > JUMP)
-            if not jumping.any():
+            wrong = smooth & jumping(self.absolute_lengths, robot)
+            if not wrong.any():
                 return
-            places = jumping[nominal.muscle]
-            ends = np.unique(np.concatenate([nominal.first[places], nominal.second[places]]))
-            off[ends] = drawn[ends]
+            places = wrong[nominal.muscle]
+            for ends in (nominal.first[places], nominal.second[places]):
+                off[ends] = drawn[ends]
             self.routes = routes(off)
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:

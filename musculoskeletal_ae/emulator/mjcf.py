@@ -139,9 +139,7 @@ def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
     poses = kin.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
     for muscle, route in zip(robot.muscles, robot.description.routes):
-        placed = [
-            (joint, at.act(item.xyz)) for item in route for joint, at in [kin.placement(item.link)]
-        ]
+        placed = [kin.attach(item.link, item.xyz) for item in route]
         for (joint, place), (other, end) in pairwise(placed):
             end = turn[joint].T @ (turn[other] @ end + origin[other] - origin[joint])
             line = (end - place) / max(float(np.linalg.norm(end - place)), 1e-9)
