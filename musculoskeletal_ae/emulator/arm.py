@@ -19,17 +19,10 @@ import pinocchio as pin
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator import modules, wrapping
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
-from musculoskeletal_ae.emulator.wrapping import (
-    Placed,
-    WrappedRoutes,
-    add_pull,
-    add_torque,
-    place,
-    point_of,
-)
+from musculoskeletal_ae.emulator.wrapping import Placed, WrappedRoutes
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -89,7 +82,7 @@ def muscle_step(
     for i in range(joint.q.shape[0]):
         joint.velocity[i] += STEP * acceleration[i]
         joint.q[i] += STEP * joint.velocity[i]
-    place(routes, joint.q, placed)
+    wrapping.place(routes, joint.q, placed)
     _wires_and_modules(body, constants, muscle, kind, command, placed.absolute)
     joint.torque[:] = 0.0
     for i in range(joint.q.shape[0]):
@@ -102,15 +95,15 @@ def muscle_step(
             stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
             joint.torque[i] -= body.firmness[i] * stop
     for s in range(routes.first.shape[0]):
-        add_pull(routes, s, placed, muscle.end_tension[routes.muscle[s]], joint.torque)
-    hand = point_of(placed, body.effector_joint, body.effector)
-    add_torque(routes.tree, placed, body.effector_joint, hand, wrench[:3], 1.0, joint.torque)
-    i = body.effector_joint
+        wrapping.add_pull(routes, s, placed, muscle.end_tension[routes.muscle[s]], joint.torque)
+    tree, torque, i = routes.tree, joint.torque, body.effector_joint
+    hand = wrapping.point_of(placed, i, body.effector)
+    wrapping.add_torque(tree, placed, i, hand, wrench[:3], 1.0, torque)
     while i > 0:
-        if not routes.tree.prismatic[i]:
+        if not tree.prismatic[i]:
             for r in range(3):
-                joint.torque[i - 1] += placed.axis[i, r] * wrench[3 + r]
-        i = routes.tree.parent[i]
+                torque[i - 1] += placed.axis[i, r] * wrench[3 + r]
+        i = tree.parent[i]
 
 
 @njit(cache=True)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One individual arm: how the true body that `seed` picks differs from its geometric model.
 
-Attachments are off by millimetres, wires wrap round bone heads that the straight-line model does
-not know, elastic units and wires have their own constants, cables and joints rub, sensors have
-bias. Masses and link lengths are the model's (paper, Introduction: assumed correct).
+In what, `Spread` says. Masses and link lengths are the model's (paper, Introduction: assumed
+correct).
 """
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -77,7 +76,10 @@ def parse_xml(file: Path, text: str) -> ET.Element:
         if '<!DOCTYPE' in text or '<!ENTITY' in text:
             raise ValueError('no DOCTYPE is allowed here')
         root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
-        if max(_levels(root)) > DEEPEST:
+        level, depth = [root], 0
+        while level:
+            level, depth = [child for element in level for child in element], depth + 1
+        if depth > DEEPEST:
             raise ValueError(f'more than {DEEPEST} levels')
         # A default namespace, which the URDF parser does not look at.
         if space := root.tag.rpartition('}')[0]:
@@ -97,15 +99,6 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
             ratio, offset = (float(mimic.get(*d)) for d in (('multiplier', '1'), ('offset', '0')))
             mimics[joint.get('name', '')] = Coupling(mimic.get('joint', ''), ratio, offset)
     return mimics
-
-
-def _levels(root: ET.Element) -> Iterator[int]:
-    """Walk the elements and say how deep each is, without recursion."""
-    waiting = [(root, 1)]
-    while waiting:
-        element, level = waiting.pop()
-        yield level
-        waiting += [(child, level + 1) for child in element]
 
 
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
