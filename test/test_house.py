@@ -53,7 +53,7 @@ def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
 
 
 def test_the_second_body_shares_nothing_with_the_first_or_the_learner() -> None:
-    first = r'emulator\.(arm|individual|mechanics|wrapping)'
+    first = r'emulator\.(arm|individual|wrapping)'
     model = r'(learning|estimation|mae)\b|robot\.(routes|series_elastic|wrapping)'
     for name in ('effects', 'foreign', 'mjcf', 'wires'):
         file = PACKAGE / 'emulator' / f'{name}.py'

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the messages of a driver say about it while nothing is commanded.
 
-Rows and units show in what values are possible at all. Where θ is known (joint sensors, or a stated
-posture), l must be what the geometric model says there, up to what bodies differ from their models:
-its sign, unit, zero and place in the array show, best while the arm is moved by hand.
+By what values are possible at all and, where θ is known, by l beside the geometric model's
+(doc/design.md, The driver's contract).
 """
 
 from __future__ import annotations
@@ -103,9 +102,8 @@ class Listening:
             known = np.flatnonzero(np.isfinite(theta).all(axis=1))
             if len(known):
                 few = np.linspace(0, len(known) - 1, min(len(known), MOST_SAMPLES)).astype(int)
-                self._judge_lengths(
-                    verdict, theta[known[few]], *states[known[few], :2].swapaxes(0, 1)
-                )
+                length, tension = states[known[few], :2].swapaxes(0, 1)
+                self._judge_lengths(verdict, theta[known[few]], length, tension)
             else:
                 lacking = np.isnan(theta).all(axis=0)
                 which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'

@@ -6,8 +6,7 @@ target steps inwards until the MSC law
 
     T = min(T_max, T_bias + max(0, K (l − l_target)))
 
-at the l that is read asks for a low tension; back; and beyond l, where T must stay at T_bias. The
-law is judged by what l and T were read, so that it does not matter how far the arm gives way.
+at the l that is read asks for a low tension; back; and beyond l, where T must stay at T_bias.
 
 K makes tension of what l is off by. Where that is more than TENSION_TOLERANCE, from 50 kN/m on, it
 is what is tolerated, and all tensions that are asked for or noticed grow by the same factor.
@@ -84,9 +83,8 @@ class Winding:
             most = robot.tension.max[m]
             told = f'muscle {robot.muscles[m]!r} is asked for {least:g} N at least to be judged'
             if most < least:
-                raise MusculoskeletalError(
-                    f'{told}, its tension.max is {most:g} N: it is not wound'
-                )
+                told = f'{told}, its tension.max is {most:g} N'
+                raise MusculoskeletalError(f'{told}: it is not wound')
             if self._highest[m] < least:
                 raise MusculoskeletalError(f'{told}, not {self._highest[m]:g} N')
         self.trying = ''  # what is going on, for people

@@ -1,23 +1,136 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The emulated arm: an individual body with muscle modules and sensors, stepped without ROS."""
+"""The first body: rigid bodies by pinocchio, muscles and friction compiled by numba.
+
+Each muscle is a massless wire between a motor and an elastic unit at its far end:
+
+    far end    L_e(l_abs, T_end) = f(θ) − l           elastic unit and wire, what pulls the bones
+    friction   T = T_end exp(μ s),  |s| ≤ 1           s follows the wire's sliding (Dahl)
+
+Joint friction is Dahl's as well, so that the arm rests where it rubs, without creeping.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import namedtuple
+
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator import mechanics
+from musculoskeletal_ae.emulator import modules, wrapping
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.modules import Arm, joint_gear
+from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
+from musculoskeletal_ae.emulator.wrapping import Placed, WrappedRoutes
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
+SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
+# Joints.
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
+STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up; of a pinion
+VISCOUS = 0.5  # [N·m·s/rad]
+STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
+STOP_LOAD = 40.0  # [N·m] of weight and muscles at T_bias; stops of a joint with more are firmer
 
 
-class EmulatedArm(Arm):
-    """Rigid bodies by pinocchio, muscles by `mechanics`, modules and faults by `modules`."""
+#: Constants of one individual, as the compiled step wants them: elastic units, wires and sensors of
+#: M muscles; friction and stops of the J−1 joints of the tree, where gear and firmness are what
+#: viscous friction and stops are multiplied by; joint of the end effector and place in it [m].
+Body = namedtuple(
+    'Body',
+    'force rate wire_stretch length_at_zero cable_friction sensor_gain sensor_offset '
+    'joint_friction lower upper gear firmness effector_joint effector',
+)
+#: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
+JointState = namedtuple('JointState', 'q velocity sticking torque')
+
+
+@njit(cache=True)
+def tension_from_elongation(elongation: float, force: float, rate: float, stretch: float) -> float:
+    """Return T with ln(1 + T/force)/rate + stretch·T = elongation; 0 for a slack wire.
+
+    Newton in u = ln(1 + T/force), where the equation is convex and u = rate·elongation lies
+    beyond the root, so that it converges from there without overshooting.
+    """
+    if elongation <= 0.0:
+        return 0.0
+    # A cut-off far beyond any tension of a module keeps exp() finite.
+    u = min(rate * elongation, 6.0)
+    for _ in range(20):
+        grown = math.exp(u)
+        step = (u / rate + stretch * force * (grown - 1.0) - elongation) / (
+            1.0 / rate + stretch * force * grown
+        )
+        u -= step
+        if abs(step) < 1e-9:
+            break
+    return force * (math.exp(u) - 1.0)
+
+
+@njit(cache=True)
+def muscle_step(
+    routes: WrappedRoutes, placed: Placed, body: Body, constants: Modules, muscle: MuscleState,
+    joint: JointState, kind: int, command: Command, wrench: Array, acceleration: Array,
+) -> None:  # fmt: skip
+    """Move joints and motors by one STEP and leave the generalised torque in joint.torque.
+
+    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `wrench` the force and torque on the end
+    effector, axes of the root link, (6,); `acceleration` q̈ from the rigid-body dynamics, (J−1,).
+    """
+    for i in range(joint.q.shape[0]):
+        joint.velocity[i] += STEP * acceleration[i]
+        joint.q[i] += STEP * joint.velocity[i]
+    wrapping.place(routes, joint.q, placed)
+    _wires_and_modules(body, constants, muscle, kind, command, placed.absolute)
+    joint.torque[:] = 0.0
+    for i in range(joint.q.shape[0]):
+        turned = STEP * joint.velocity[i] * math.sqrt(body.gear[i])
+        joint.sticking[i] = modules.rubbed(joint.sticking[i], turned, STICKING_ANGLE)
+        joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
+        joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])
+        beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])
+        if beyond != 0.0:
+            stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
+            joint.torque[i] -= body.firmness[i] * stop
+    for s in range(routes.first.shape[0]):
+        wrapping.add_pull(routes, s, placed, muscle.end_tension[routes.muscle[s]], joint.torque)
+    tree, torque, i = routes.tree, joint.torque, body.effector_joint
+    hand = wrapping.point_of(placed, i, body.effector)
+    wrapping.add_torque(tree, placed, i, hand, wrench[:3], 1.0, torque)
+    while i > 0:
+        if not tree.prismatic[i]:
+            for r in range(3):
+                torque[i - 1] += placed.axis[i, r] * wrench[3 + r]
+        i = tree.parent[i]
+
+
+@njit(cache=True)
+def _wires_and_modules(
+    body: Body, constants: Modules, muscle: MuscleState, kind: int, command: Command,
+    absolute: Array,
+) -> None:  # fmt: skip
+    for m in range(absolute.shape[0]):
+        reading = muscle.length[m] + command.length_error[m] + command.zero[m]
+        pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
+        slid = modules.wind(constants, muscle, kind, command, m, reading, pull)
+        muscle.sliding[m] = modules.rubbed(muscle.sliding[m], slid, SLIDING_DISTANCE)
+        muscle.end_tension[m] = 0.0
+        if muscle.ruptured[m] == 0.0:
+            muscle.end_tension[m] = tension_from_elongation(
+                absolute[m] - body.length_at_zero[m] - muscle.length[m] - command.slack[m],
+                body.force[m],
+                body.rate[m],
+                body.wire_stretch[m] * absolute[m],
+            )
+        friction = math.exp(body.cable_friction[m] * muscle.sliding[m])
+        muscle.tension[m] = muscle.end_tension[m] * friction
+        modules.heat(constants, muscle, command, m)
+
+
+class EmulatedArm(modules.Arm):
+    """An individual of the first body."""
 
     def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
         """Build an individual of a robot at rest, modules safe; `seed` is of its noise, too."""
@@ -25,37 +138,33 @@ class EmulatedArm(Arm):
         super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.order
         self._model = pin.Model(robot.kinematics.model)
-        self._gear = joint_gear(robot.kinematics)[1:]
+        self._gear = modules.joint_gear(robot.kinematics)[1:]
         self._model.armature = ARMATURE * self._gear
         self._data = self._model.createData()
-        frame = self._model.frames[robot.kinematics.end_effector_frame]
-        self._effector_joint = int(frame.parentJoint)
-        self._effector: Array = np.array(frame.placement.translation)
-        self._bare_inertia = self._model.inertias[self._effector_joint].copy()
         self._body = self._constants()
+        self._bare_inertia = self._model.inertias[self._body.effector_joint].copy()
         true, zero = self.individual, self.individual.length_at_zero
         span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - zero
         self._wound = self._modules(span, true.elastic.elongation(zero, robot.tension.max))
-        points, joints = true.routes.point.shape, len(true.tree.parent)
-        ends = len(true.routes.first), 3
-        shapes = (joints, 3, 3), (joints, 3), (joints, 3), points, robot.muscle_count, ends, ends, 3
-        self._scratch = mechanics.Scratch(*map(np.zeros, shapes))
-        self._joint = mechanics.JointState(*(np.zeros(self._model.nv) for _ in range(4)))
+        self._placed = Placed.empty(true.routes, robot.muscle_count)
+        self._joint = JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self._angles, self._rates = self._joint.q, self._joint.velocity
         self.reset()
 
-    def _constants(self) -> mechanics.Body:
+    def _constants(self) -> Body:
         robot, true, unit = self.robot, self.individual, self.individual.elastic
         # Joints that follow others have no friction and no stops of their own.
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
         friction[self._order] = true.joint_friction
         lower[self._order], upper[self._order] = robot.lower, robot.upper
         firmness = self._gear.copy()
-        load = true.load / mechanics.STOP_LOAD
+        load = true.load / STOP_LOAD
         firmness[self._order] = np.maximum(firmness[self._order], load)
-        return mechanics.Body(
+        joint, hand = robot.kinematics.placement(robot.description.end_effector)
+        return Body(
             unit.force, unit.rate, unit.wire_stretch, true.length_at_zero, true.cable_friction,
             true.tension_gain, true.tension_bias, friction, lower, upper, self._gear, firmness,
+            joint, np.array(hand.translation),
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:
@@ -66,28 +175,23 @@ class EmulatedArm(Arm):
     def set_payload(self, mass: float) -> None:
         """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
-        placed = load.se3Action(pin.SE3(np.eye(3), self._effector))
-        self._model.inertias[self._effector_joint] = self._bare_inertia + placed
+        placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
+        self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
 
     def _step(self) -> None:
-        mechanics.muscle_step(
-            self.individual.tree, self.individual.routes, self._body, self._wound, self._muscle,
-            self._joint, self._scratch, self._kind, self._command, self._wrench, self._effector,
-            self._effector_joint, self._acceleration(),
-        )  # fmt: skip
-
-    def _acceleration(self) -> Array:
-        """Return q̈ of the tree; of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h)."""
         model, data, joint = self._model, self._data, self._joint
         gear = self.robot.kinematics.transmission
         if gear is None:
-            free: Array = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
-            return free
-        inertia = joint_space_inertia(model, data, joint.q)
-        bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
-        # Pinocchio's M holds the armature already.
-        coupled = np.linalg.solve(gear.T @ inertia @ gear, gear.T @ (joint.torque - bias))
-        return gear @ coupled
+            acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
+        else:  # of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h); M holds the armature already
+            inertia = joint_space_inertia(model, data, joint.q)
+            bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
+            free = gear.T @ (joint.torque - bias)
+            acceleration = gear @ np.linalg.solve(gear.T @ inertia @ gear, free)
+        muscle_step(
+            self.individual.routes, self._placed, self._body, self._wound, self._muscle,
+            joint, self._kind, self._command, self._wrench, acceleration,
+        )  # fmt: skip
 
     def _sensed(self) -> tuple[Array, Array, Array, Array]:
         muscle, true = self._muscle, self.individual
@@ -97,4 +201,4 @@ class EmulatedArm(Arm):
 
     def route_points(self) -> Array:
         """True route points in the root link's frame [m], shape (P, 3)."""
-        return self._scratch.world.copy()
+        return self._placed.world.copy()

@@ -36,9 +36,7 @@ class Effects:
     hysteresis: float = 0.2  # width of the loop, share of the elongation
     creep: float = 0.05  # per decade of time, share of the elongation
     # Wires
-    recovery: float = (
-        0.45  # share of the stretch that comes late: 3/4 in 40 minutes, the rest in 12 h
-    )
+    recovery: float = 0.45  # share of the stretch that comes late: most in 40 min, all in 12 h
     bedding: float = 0.005  # how much longer a wire gets in its first hours [m]
     knot: float = 0.0034  # slip of one knot, once [m]
     guide_friction: float = 0.4  # relative loss along the route in a posture at mid-range

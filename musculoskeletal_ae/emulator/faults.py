@@ -139,12 +139,10 @@ class Faults:
             self.stuck[fault.which] = 1.0 - fault.size / SPEED_LIMIT
         for fault in self._of('stuck_motor'):
             self.stuck[fault.which] = 1.0
-        for fault in self._of('slack'):
-            self.slack[fault.which] = fault.size
-        for fault in self._of('unzeroed'):
-            self.zero[fault.which] = fault.size * self._forgotten[fault.which]
-        for fault in self._of('overheat'):
-            self.hot[fault.which] = fault.size
+        for kind, sizes in (('slack', self.slack), ('unzeroed', self.zero), ('overheat', self.hot)):
+            for fault in self._of(kind):
+                sizes[fault.which] = fault.size
+        self.zero *= self._forgotten
 
     def _of(self, *names: str) -> list[Fault]:
         return [fault for fault in self._faults if fault.kind in names]

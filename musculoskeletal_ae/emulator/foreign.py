@@ -19,23 +19,13 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator import mjcf
+from musculoskeletal_ae.emulator import mjcf, wires
 from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
-from musculoskeletal_ae.emulator.wires import (
-    TIMES,
-    Guides,
-    Memory,
-    Springs,
-    guides_step,
-    make_wires,
-    read,
-    wires_step,
-)
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
+from musculoskeletal_ae.robot.jumps import REDRAWN, jumping
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -61,32 +51,28 @@ class ForeignBody:
         self.tree = np.array([model.joint(name).id for name in names])
         self.tendons = np.array([model.tendon(name).id for name in robot.muscles])
         self.length_at_zero = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
-        self.elastic = Springs(robot, self.length_at_zero, draw)
+        self.elastic = wires.Springs(robot, self.length_at_zero, draw)
         self.tension_gain: Array = 1.0 + draw.normal('tension_gain', count)
         self.tension_bias: Array = draw.normal('tension_zero', count)
         self.length_bias: Array = np.zeros(count)
 
-    def look(self, data: Any, theta: Array) -> None:
-        """Put the bones of some MjData at θ [rad] (D,) and find lengths and moment arms."""
+    def look(self, data: Any, theta: Array) -> Any:
+        """Return some MjData with bones at θ [rad] (D,), lengths and moment arms."""
         data.qpos[self.tree] = self._robot.kinematics.tree_angles(theta)
         mujoco.mj_fwdPosition(self._model, data)
+        return data
 
     def absolute_lengths(self, theta: Array) -> Array:
         """Return the lengths of the routes [m], θ (N, D) gives (N, M)."""
-        lengths = np.empty((len(theta), len(self.tendons)))
-        for row, angles in zip(lengths, theta, strict=True):
-            self.look(self._data, angles)
-            row[:] = self._data.ten_length[self.tendons]
-        return lengths
+        return np.stack([self.look(self._data, row).ten_length[self.tendons] for row in theta])
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return G [m/rad], θ (N, D) gives (N, M, D)."""
-        model, data = self._model, self._data
+        model = self._model
         jacobian = np.empty((len(theta), model.ntendon, model.nv))
+        rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
         for dense, angles in zip(jacobian, theta, strict=True):
-            self.look(data, angles)
-            rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
-            mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
+            mujoco.mju_sparse2dense(dense, self.look(self._data, angles).ten_J, *rows)
         return self._robot.kinematics.of_theta(jacobian[:, self.tendons][:, :, self.tree])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
@@ -106,14 +92,12 @@ def _directory(robot: Robot, draw: Draw) -> Any:
     if not any(isinstance(item, Wrap) for route in robot.description.routes for item in route):
         return model
 
-    def jump(model: Any) -> Bools:
-        body = ForeignBody(robot, model, draw)
-        return jumps(body.absolute_lengths, robot.lower, robot.upper)[0] > JUMP
+    def slipping(model: Any) -> Bools:
+        return jumping(ForeignBody(robot, model, draw).absolute_lengths, robot)
 
-    exact = mjcf.from_directory(robot, Draw(0, NONE), again).compile()
-    smooth = ~jump(exact)
-    while again.max() < REDRAWN and (jumping := jump(model) & smooth).any():
-        again += jumping
+    smooth = ~slipping(mjcf.from_directory(robot, Draw(0, NONE), again).compile())
+    while again.max() < REDRAWN and (wrong := slipping(model) & smooth).any():
+        again += wrong
         model = mjcf.from_directory(robot, draw, again).compile()
     return model
 
@@ -173,19 +157,19 @@ class ForeignArm(Arm):
         self._hand = model.body(mjcf.HAND).id
         self._guides = self._make_guides()
         muscles = robot.muscle_count
-        self._memory = Memory(*(np.zeros(muscles) for _ in Memory._fields))
-        self._memory = self._memory._replace(slow=np.zeros((muscles, len(TIMES))))
+        self._memory = wires.Memory(*(np.zeros(muscles) for _ in wires.Memory._fields))
+        self._memory = self._memory._replace(slow=np.zeros((muscles, len(wires.TIMES))))
         still = np.zeros(muscles)
         body.look(data, 0.5 * (robot.lower + robot.upper))
         self._root = self._root_pose() if file else pin.SE3.Identity()
-        guides_step(self._guides, still, self._memory.bend, 0.0)
+        wires.guides_step(self._guides, still, self._memory.bend, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
         theta = robot.random_postures(500, np.random.default_rng(0))
         span = body.absolute_lengths(theta) - at_zero
         if file:
             routes = _other_routes(robot, file, span - robot.muscle_lengths(theta, still))
             self.warnings = *routes, *_other_limits(robot, file, model)
-        self.wires = make_wires(robot, body.elastic, at_zero, span, bend, draw)
+        self.wires = wires.make_wires(robot, body.elastic, at_zero, span, bend, draw)
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
         self._draw_sensors()
         self._time, self._steps = 0.0, 0
@@ -219,7 +203,7 @@ class ForeignArm(Arm):
         theta = 0.5 * (robot.lower + robot.upper)
         return there * robot.kinematics.link_pose(theta, link).inverse()
 
-    def _make_guides(self) -> Guides:
+    def _make_guides(self) -> wires.Guides:
         model, data, tendons, sites = self._model, self._data, self.individual.tendons, []
         for t in tendons:
             path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
@@ -228,7 +212,7 @@ class ForeignArm(Arm):
         place, give = model.site_pos, self._draw.about('give', model.nsite)
         runs = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.ravel(), data.ten_wrapadr
         site = np.concatenate(sites), model.site_bodyid, data.xmat.reshape(-1, 9)
-        return Guides(tendons, *runs, data.ten_wrapnum, *site, place, place.copy(), give)
+        return wires.Guides(tendons, *runs, data.ten_wrapnum, *site, place, place.copy(), give)
 
     def _draw_sensors(self) -> None:
         """Draw what is wrong with joint sensors and messages, and when wires slip."""
@@ -256,7 +240,7 @@ class ForeignArm(Arm):
         super().reset(theta)
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):
-            read(self.wires, self._muscle, self._memory, self._command, m)
+            wires.read(self.wires, self._muscle, self._memory, self._command, m)
         self._history[:] = self._now()
         self._last: Readings | None = None
 
@@ -296,8 +280,10 @@ class ForeignArm(Arm):
             mujoco.mj_step1(model, data)
         self._steps += 1
         if self._steps % GUIDES_EVERY == 0:
-            guides_step(self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP)
-        wires_step(
+            wires.guides_step(
+                self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP
+            )
+        wires.wires_step(
             self.wires, self._wound, muscle, self._memory, self._kind, self._command,
             data.ten_length[self.individual.tendons], self._pull,
         )  # fmt: skip

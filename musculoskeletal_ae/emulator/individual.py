@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One individual arm: how the true body that `seed` picks differs from its geometric model.
 
-Attachments are off by millimetres, wires wrap round bone heads that the straight-line model does
-not know, elastic units and wires have their own constants, cables and joints rub, sensors have
-bias. Masses and link lengths are the model's (paper, Introduction: assumed correct).
+In what, `Spread` says. Masses and link lengths are the model's (paper, Introduction: assumed
+correct).
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.wrapping import Tree, WrappedRoutes, wrapped_lengths
-from musculoskeletal_ae.robot.jumps import JUMP, REDRAWN, jumps
+from musculoskeletal_ae.emulator.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
+from musculoskeletal_ae.robot.jumps import REDRAWN, jumping
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -52,13 +51,11 @@ class Individual:
         """Draw individual `seed`, by the calibrated spread or another."""
         spread = spread or Spread()
         rng = np.random.default_rng([seed, 0xB0D1])
-        muscles = robot.muscle_count
-        kin = robot.kinematics
+        muscles, kin, nominal = robot.muscle_count, robot.kinematics, robot.routes
         self._kinematics, self._muscles = kin, muscles
         # In one order of memory: code is compiled for each.
         placements = np.ascontiguousarray(kin.placement_rotation), kin.placement_translation
-        self.tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
-        nominal = robot.routes
+        tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
         off = rng.normal(0.0, spread.attachment, nominal.point.shape)
         thickness = rng.uniform(0.8, 1.2, len(nominal.first))
 
@@ -67,7 +64,7 @@ class Individual:
             point = nominal.point + off
             objects = _objects(robot, point, spread.wrap, seed, thickness)
             segments = nominal.first, nominal.second, nominal.muscle
-            return WrappedRoutes(nominal.joint, point, *segments, objects)
+            return WrappedRoutes(tree, nominal.joint, point, *segments, objects)
 
         self.routes = routes(off)
         if nominal.objects is not None:
@@ -98,20 +95,20 @@ class Individual:
         One jumps, by centimetres, where it would slip over the end of what it wraps round: nobody
         lays it there.
         """
-        nominal, limits = robot.routes, (robot.lower, robot.upper)
-        smooth = jumps(nominal.absolute_lengths, *limits)[0] <= JUMP
+        nominal = robot.routes
+        smooth = ~jumping(nominal.absolute_lengths, robot)
         for drawn in again:
-            jumping = smooth & (jumps(self.absolute_lengths, *limits)[0] > JUMP)
-            if not jumping.any():
+            wrong = smooth & jumping(self.absolute_lengths, robot)
+            if not wrong.any():
                 return
-            places = jumping[nominal.muscle]
-            ends = np.unique(np.concatenate([nominal.first[places], nominal.second[places]]))
-            off[ends] = drawn[ends]
+            places = wrong[nominal.muscle]
+            for ends in (nominal.first[places], nominal.second[places]):
+                off[ends] = drawn[ends]
             self.routes = routes(off)
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
         q = np.ascontiguousarray(self._kinematics.tree_angles(theta))
-        return wrapped_lengths(self.tree, self.routes, self._muscles, q)
+        return wrapped_lengths(self.routes, q, Placed.empty(self.routes, self._muscles))
 
     def absolute_lengths(self, theta: Array) -> Array:
         """Return the true route lengths [m], θ (N, D) gives (N, M)."""
@@ -163,14 +160,12 @@ def _objects(
             continue
         between = kin.hangs_on[routes.joint[ends[0]]] ^ kin.hangs_on[routes.joint[ends[1]]]
         best = np.inf
-        for joint in range(1, len(kin.parent)):
-            if kin.prismatic[joint] or not between[joint]:
-                continue
+        for joint in np.flatnonzero(between & ~kin.prismatic):
             start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start
             share = -np.sum(start * line, axis=1) / np.sum(line * line, axis=1)
-            share = np.clip(share, 0.0, 1.0)
-            distance = np.linalg.norm(start + share[:, None] * line, axis=1)
+            nearest = start + np.clip(share, 0.0, 1.0)[:, None] * line
+            distance = np.linalg.norm(nearest, axis=1)
             if np.median(distance) < best:
                 best = float(np.median(distance))
                 least = min(np.linalg.norm(e, axis=1).min() for e in (start, end))

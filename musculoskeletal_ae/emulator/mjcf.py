@@ -139,9 +139,7 @@ def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
     poses = kin.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
     for muscle, route in zip(robot.muscles, robot.description.routes):
-        placed = [
-            (joint, at.act(item.xyz)) for item in route for joint, at in [kin.placement(item.link)]
-        ]
+        placed = [kin.attach(item.link, item.xyz) for item in route]
         for (joint, place), (other, end) in pairwise(placed):
             end = turn[joint].T @ (turn[other] @ end + origin[other] - origin[joint])
             line = (end - place) / max(float(np.linalg.norm(end - place)), 1e-9)
@@ -263,18 +261,15 @@ def from_file(robot: Robot, file: Path) -> Any:
     gone = {joint.name for joint in held if joint.name}
     ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]
     ties = [tie for tie in ties if not gone.isdisjoint([tie.name1, tie.name2])]
+    bound = [t for t in spec.tendons if t not in tendons]
+    bound = [t for t in bound if not gone.isdisjoint(wrap.target.name for wrap in t.path)]
     moved = list[tuple[Any, dict[str, Array]]]()
     if ties:
         with _loading(file):
             whole = spec.compile()
         moved = _moved_by(whole, spec, held)
-    for tie in ties:
-        spec.delete(tie)
-    for tie in [tendon for tendon in spec.tendons if tendon not in tendons]:
-        if not gone.isdisjoint(wrap.target.name for wrap in tie.path):
-            spec.delete(tie)
-    for joint in held:
-        spec.delete(joint)
+    for thing in [*ties, *bound, *held]:
+        spec.delete(thing)
     for joint in spec.joints:  # limits of what the file's own actuators do
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     _add_hand(spec.body(hand), pin.SE3.Identity())

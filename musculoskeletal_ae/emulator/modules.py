@@ -100,21 +100,6 @@ class MuscleState(NamedTuple):
 
 
 @njit(cache=True)
-def module_reference(
-    kind: int, command: float, length: float, before: float, modules: Modules, m: int
-) -> float:
-    """Return T_ref [N] of module m that reads `length` [m] and had T_ref `before`."""
-    if kind == FOLLOW_LENGTH:
-        desired = modules.tension_bias[m] + max(0.0, modules.stiffness[m] * (length - command))
-    elif kind == FOLLOW_TENSION:
-        desired = max(0.0, command)
-    else:
-        change = STEP * RELEASE_RATE
-        desired = before + min(change, max(-change, modules.tension_bias[m] - before))
-    return min(modules.tension_max[m], desired)
-
-
-@njit(cache=True)
 def rubbed(state: float, moved: float, distance: float) -> float:
     """Return Dahl's state of friction in [−1, 1] after `moved`; `distance` turns it round."""
     direction = 1.0 if moved > 0.0 else -1.0
@@ -127,10 +112,15 @@ def wind(
     reading: float, pull: float,
 ) -> float:  # fmt: skip
     """Let motor m act on what its sensors read [m], [N]; return how much it wound in [m]."""
-    before = muscle.length[m]
-    muscle.reference[m] = module_reference(
-        kind, command.value[m], reading, muscle.reference[m], modules, m
-    )
+    before, last, bias = muscle.length[m], muscle.reference[m], modules.tension_bias[m]
+    if kind == FOLLOW_LENGTH:
+        desired = bias + max(0.0, modules.stiffness[m] * (reading - command.value[m]))
+    elif kind == FOLLOW_TENSION:
+        desired = max(0.0, command.value[m])
+    else:
+        change = STEP * RELEASE_RATE
+        desired = last + min(change, max(-change, bias - last))
+    muscle.reference[m] = min(modules.tension_max[m], desired)
     speed = -MOTOR_GAIN * (muscle.reference[m] - pull)
     if muscle.ruptured[m] > 0.0:
         speed = -SPEED_LIMIT

@@ -18,17 +18,9 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import (
-    AMBIENT,
-    STEP,
-    Command,
-    Modules,
-    MuscleState,
-    heat,
-    rubbed,
-    wind,
-)
+from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, Modules, MuscleState
 from musculoskeletal_ae.robot.robot import Robot
 
 # Chosen, where effects.py has no size.
@@ -176,7 +168,7 @@ def read(wires: Wires, muscle: MuscleState, memory: Memory, command: Command, m:
 
 @njit(cache=True)
 def wires_step(
-    wires: Wires, modules: Modules, muscle: MuscleState, memory: Memory, kind: int,
+    wires: Wires, constants: Modules, muscle: MuscleState, memory: Memory, kind: int,
     command: Command, absolute: Array, control: Array,
 ) -> None:  # fmt: skip
     """Move the motors by one STEP and leave what the wires pull in `control` [N] (M,), negative.
@@ -185,8 +177,8 @@ def wires_step(
     """
     for m in range(absolute.shape[0]):
         read(wires, muscle, memory, command, m)
-        slid = wind(modules, muscle, kind, command, m, memory.reading[m], memory.cell[m])
-        muscle.sliding[m] = rubbed(muscle.sliding[m], slid, SLIDING)
+        slid = modules.wind(constants, muscle, kind, command, m, memory.reading[m], memory.cell[m])
+        muscle.sliding[m] = modules.rubbed(muscle.sliding[m], slid, SLIDING)
         rest = memory.rest[m] + STEP / STICKING * (1.0 - memory.rest[m])
         memory.rest[m] = rest * math.exp(-abs(slid) / BREAKING)
         beyond = wires.side[m] * (absolute[m] - wires.ridge[m])
@@ -196,7 +188,7 @@ def wires_step(
         x = absolute[m] - wires.length_at_zero[m] - muscle.length[m] - slack
         grown = x - memory.elongation[m]
         memory.elongation[m] = x
-        memory.loop[m] = rubbed(memory.loop[m], grown, LOOP)
+        memory.loop[m] = modules.rubbed(memory.loop[m], grown, LOOP)
         end = law(wires, m, x / (1.0 - 0.5 * wires.hysteresis[m] * memory.loop[m]))
         if muscle.ruptured[m] > 0.0:
             end = 0.0
@@ -206,7 +198,7 @@ def wires_step(
         for i in range(TIMES.shape[0]):
             full = wires.creep[m] * max(0.0, x) if i < 4 else LATE[i - 4] * wires.late[m] * end
             memory.slow[m, i] += STEP / TIMES[i] * (full - memory.slow[m, i])
-        heat(modules, muscle, command, m)
+        modules.heat(constants, muscle, command, m)
         control[m] = -end
 
 
@@ -221,14 +213,12 @@ def guides_step(guides: Guides, tension: Array, bend: Array, duration: float) ->
         for p in range(first, last + 1):
             load[:] = 0.0
             both = True
-            for other in (p - 1, p + 1):
-                there = first <= other <= last
-                if there:
-                    for r in range(3):
-                        line[r] = guides.point[other, r] - guides.point[p, r]
+            for other in (max(p - 1, first), min(p + 1, last)):  # beyond an end: the same point
+                for r in range(3):
+                    line[r] = guides.point[other, r] - guides.point[p, r]
                 size = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
-                both &= there and size > 0.0
-                if there and size > 0.0:
+                both &= size > 0.0
+                if size > 0.0:
                     load += line / size
             if both:
                 # Two unit vectors that make the angle π − φ add up to one of length 2 sin(φ / 2).

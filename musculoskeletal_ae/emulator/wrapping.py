@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segment
+from musculoskeletal_ae.robot.wrapping import Vector, WrapObjects, turned, wrapped_segment
 
 
 class Tree(NamedTuple):
@@ -31,6 +31,7 @@ class Tree(NamedTuple):
 class WrappedRoutes(NamedTuple):
     """True routes: points on joints of the tree, segments between them."""
 
+    tree: Tree
     point_joint: Ints  # tree joint that carries each point, (P,)
     point: Array  # in that joint's frame [m], (P, 3)
     first: Ints  # points where each segment starts
@@ -39,10 +40,52 @@ class WrappedRoutes(NamedTuple):
     objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
 
 
+class Placed(NamedTuple):
+    """Where joints, route points and wires are, in the root link's frame; `place` fills it."""
+
+    rotation: Array  # of joints, (J, 3, 3)
+    translation: Array  # [m], (J, 3)
+    axis: Array  # (J, 3)
+    world: Array  # route points [m], (P, 3)
+    absolute: Array  # lengths of the routes [m], (M,)
+    leave: Array  # unit pulls at the start of each segment, (S, 3)
+    arrive: Array  # and at its end
+
+    @classmethod
+    def empty(cls, routes: WrappedRoutes, muscles: int) -> Placed:
+        """Return room for the places of an arm of M muscles."""
+        joints, points, segments = map(len, (routes.tree.parent, routes.point, routes.first))
+        poses, ends = ((joints, 3, 3), (joints, 3), (joints, 3)), (segments, 3)
+        placed = cls(*(np.zeros(shape) for shape in (*poses, (points, 3), muscles, ends, ends)))
+        placed.rotation[0] = np.eye(3)
+        return placed
+
+
 @njit(cache=True)
-def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: Array) -> None:
-    """Fill rotation (J, 3, 3), translation (J, 3), axis (J, 3) of all joints for q (J−1,)."""
-    rotation[0], translation[0], placed = np.eye(3), 0.0, np.zeros(3)
+def _multiply(a: Array, b: Array, product: Array) -> None:
+    """Fill the product of two matrices, all (3, 3)."""
+    for r in range(3):
+        for c in range(3):
+            product[r, c] = 0.0
+            for k in range(3):
+                product[r, c] += a[r, k] * b[k, c]
+
+
+@njit(cache=True)
+def point_of(placed: Placed, joint: int, point: Array) -> Vector:
+    """Return a point [m] (3,) of a joint's frame in the root link's."""
+    r, t = placed.rotation[joint], placed.translation[joint]
+    return (
+        t[0] + r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2],
+        t[1] + r[1, 0] * point[0] + r[1, 1] * point[1] + r[1, 2] * point[2],
+        t[2] + r[2, 0] * point[0] + r[2, 1] * point[1] + r[2, 2] * point[2],
+    )
+
+
+@njit(cache=True)
+def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
+    """Find all places for q (J−1,)."""
+    tree, fixed = routes.tree, np.zeros((3, 3))
     for i in range(1, tree.parent.shape[0]):
         up = tree.parent[i]
         ux, uy, uz = tree.axis[i]
@@ -57,97 +100,63 @@ def tree_poses(tree: Tree, q: Array, rotation: Array, translation: Array, axis: 
                 (uz * ux * rest - uy * sine, uz * uy * rest + ux * sine, cosine + uz * uz * rest),
             )
         )
-        for r in range(3):
-            translation[i, r] = translation[up, r]
-            axis[i, r] = 0.0
-            for k in range(3):
-                translation[i, r] += rotation[up, r, k] * tree.translation[i, k]
-                placed[k] = 0.0
-                for j in range(3):
-                    placed[k] += rotation[up, r, j] * tree.rotation[i, j, k]
-                axis[i, r] += placed[k] * tree.axis[i, k]
-            for c in range(3):
-                rotation[i, r, c] = 0.0
-                for k in range(3):
-                    rotation[i, r, c] += placed[k] * turn[k, c]
+        _multiply(placed.rotation[up], tree.rotation[i], fixed)
+        _multiply(fixed, turn, placed.rotation[i])
+        placed.axis[i] = turned(fixed, tree.axis[i])
+        placed.translation[i] = point_of(placed, up, tree.translation[i])
         if tree.prismatic[i]:
-            for r in range(3):
-                translation[i, r] += axis[i, r] * q[i - 1]
-
-
-@njit(cache=True)
-def place_points(routes: WrappedRoutes, rotation: Array, translation: Array, world: Array) -> None:
-    """Fill world (P, 3) with the route points in the root link's frame."""
+            placed.translation[i] += placed.axis[i] * q[i - 1]
     for p in range(routes.point.shape[0]):
-        j = routes.point_joint[p]
-        for r in range(3):
-            world[p, r] = translation[j, r]
-            for k in range(3):
-                world[p, r] += rotation[j, r, k] * routes.point[p, k]
+        placed.world[p] = point_of(placed, routes.point_joint[p], routes.point[p])
+    placed.absolute[:] = 0.0
+    for s in range(routes.first.shape[0]):
+        placed.absolute[routes.muscle[s]] += wrapped_segment(
+            routes.objects, s, placed.rotation, placed.translation,
+            placed.world[routes.first[s]], placed.world[routes.second[s]],
+            placed.leave[s], placed.arrive[s],
+        )  # fmt: skip
 
 
 @njit(cache=True)
-def wrapped_lengths(
-    tree: Tree, routes: WrappedRoutes, muscles: int, q: Array
-) -> tuple[Array, Array]:
+def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Array, Array]:
     """Return absolute lengths [m] (N, M) and their Jacobian [m/rad] (N, M, J−1) for q (N, J−1)."""
-    count, joints = q.shape[0], tree.parent.shape[0]
-    rotation, translation = np.zeros((joints, 3, 3)), np.zeros((joints, 3))
-    axis = np.zeros((joints, 3))
-    world = np.zeros((routes.point.shape[0], 3))
-    leave, arrive = np.zeros(3), np.zeros(3)
-    lengths = np.zeros((count, muscles))
-    jacobian = np.zeros((count, muscles, joints - 1))
-    for n in range(count):
-        tree_poses(tree, q[n], rotation, translation, axis)
-        place_points(routes, rotation, translation, world)
+    lengths = np.zeros((q.shape[0], placed.absolute.shape[0]))
+    jacobian = np.zeros((*lengths.shape, q.shape[1]))
+    for n in range(q.shape[0]):
+        place(routes, q[n], placed)
+        lengths[n] = placed.absolute
         for s in range(routes.first.shape[0]):
-            m = routes.muscle[s]
-            lengths[n, m] += route_segment(routes, s, rotation, translation, world, leave, arrive)
-            add_pull(tree, routes, s, translation, axis, world, leave, arrive, -1.0, jacobian[n, m])
+            add_pull(routes, s, placed, -1.0, jacobian[n, routes.muscle[s]])
     return lengths, jacobian
 
 
 @njit(cache=True)
-def route_segment(
-    routes: WrappedRoutes, s: int, rotation: Array, translation: Array, world: Array,
-    leave: Array, arrive: Array,
-) -> float:  # fmt: skip
-    """Return the length of segment s, placed by `place_points`, and fill the unit pulls."""
-    start, end = world[routes.first[s]], world[routes.second[s]]
-    return wrapped_segment(routes.objects, s, rotation, translation, start, end, leave, arrive)
-
-
-@njit(cache=True)
-def add_pull(
-    tree: Tree, routes: WrappedRoutes, s: int, translation: Array, axis: Array, world: Array,
-    leave: Array, arrive: Array, pull: float, torque: Array,
-) -> None:  # fmt: skip
+def add_pull(routes: WrappedRoutes, s: int, placed: Placed, pull: float, torque: Array) -> None:
     """Add what a tension `pull` in segment s does to the joints to torque (J−1,)."""
-    i, k = routes.first[s], routes.second[s]
-    add_torque(tree, translation, axis, routes.point_joint[i], world[i], leave, pull, torque)
-    add_torque(tree, translation, axis, routes.point_joint[k], world[k], arrive, pull, torque)
-    if routes.objects.radius[s] > 0.0:
+    tree, objects = routes.tree, routes.objects
+    ends = (routes.first[s], placed.leave[s]), (routes.second[s], placed.arrive[s])
+    for p, away in ends:
+        add_torque(tree, placed, routes.point_joint[p], placed.world[p], away, pull, torque)
+    if objects.radius[s] > 0.0:
         # The wire presses on the object in the lines of its straight parts.
-        joint = routes.objects.joint[s]
-        add_torque(tree, translation, axis, joint, world[i], leave, -pull, torque)
-        add_torque(tree, translation, axis, joint, world[k], arrive, -pull, torque)
+        for p, away in ends:
+            add_torque(tree, placed, objects.joint[s], placed.world[p], away, -pull, torque)
 
 
 @njit(cache=True)
 def add_torque(
-    tree: Tree, translation: Array, axis: Array, joint: int, point: Array, force: Array,
-    scale: float, torque: Array,
+    tree: Tree, placed: Placed, joint: int, point: Vector, force: Array, scale: float,
+    torque: Array,
 ) -> None:  # fmt: skip
     """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
     while joint > 0:
-        ax, ay, az = axis[joint]
+        ax, ay, az = placed.axis[joint]
         if tree.prismatic[joint]:
             torque[joint - 1] += scale * (ax * force[0] + ay * force[1] + az * force[2])
         else:
-            x = point[0] - translation[joint, 0]
-            y = point[1] - translation[joint, 1]
-            z = point[2] - translation[joint, 2]
+            x = point[0] - placed.translation[joint, 0]
+            y = point[1] - placed.translation[joint, 1]
+            z = point[2] - placed.translation[joint, 2]
             torque[joint - 1] += scale * (
                 ax * (y * force[2] - z * force[1])
                 + ay * (z * force[0] - x * force[2])

@@ -42,9 +42,9 @@ from musculoskeletal_ae.control.posture import RAMP_SHARE
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.emulator.arm import VISCOUS
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.mechanics import VISCOUS
 from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.experiments import plots, touch

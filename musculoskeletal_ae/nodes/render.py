@@ -18,18 +18,10 @@ from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 
-def _lines(message: MarkerArray) -> list[Line]:
-    """Return the line strips of a marker array."""
-    return [
-        Line(
-            marker.ns,
-            np.array([[p.x, p.y, p.z] for p in marker.points]),
-            marker.scale.x,
-            (marker.color.r, marker.color.g, marker.color.b),
-        )
-        for marker in message.markers
-        if marker.type == Marker.LINE_STRIP and marker.action == Marker.ADD and marker.points
-    ]
+def _line(strip: Marker) -> Line:
+    """Return a line strip of a marker array."""
+    points, colour = np.array([[p.x, p.y, p.z] for p in strip.points]), strip.color
+    return Line(strip.ns, points, strip.scale.x, (colour.r, colour.g, colour.b))
 
 
 def _render(options: Namespace, arguments: list[str]) -> int:
@@ -38,12 +30,12 @@ def _render(options: Namespace, arguments: list[str]) -> int:
     received: list[MarkerArray] = []
     node.create_subscription(MarkerArray, options.topic, received.append, SENSOR)
     Spinner(node).spin_until(lambda: received, options.timeout)
-    lines = _lines(received[0]) if received else []
+    kind = Marker.LINE_STRIP, Marker.ADD
+    markers = received[0].markers if received else []
+    lines = [_line(m) for m in markers if (m.type, m.action) == kind and m.points]
     if not lines:
-        raise MusculoskeletalError(
-            f'no markers on {options.topic} within {options.timeout:g} s; is the node running, '
-            'and in this namespace (--ros-args -r __ns:=/NAME)?'
-        )
+        told = f'no markers on {options.topic} within {options.timeout:g} s; is the node running'
+        raise MusculoskeletalError(f'{told}, and in this namespace (--ros-args -r __ns:=/NAME)?')
     save_picture(lines, options.out)
     print(options.out)
     return 0
@@ -52,10 +44,9 @@ def _render(options: Namespace, arguments: list[str]) -> int:
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
-    parser.add_argument('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
-    parser.add_argument(
-        '--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]'
-    )
+    add = parser.add_argument
+    add('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
+    add('--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]')
     return parser.parse_args(arguments)
 
 

@@ -54,14 +54,10 @@ class Replay(Node):
         self.length = (self._stop - self._start) / 1e9  # [s]
         self._before = (self._start - bag.start) / 1e9  # [s] of the bag
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
-        self._publisher = {
-            recorded: self.create_publisher(
-                message_class(bag.topics[recorded].type),
-                name,
-                LATCHED if recorded in latched else reliable,
-            )
-            for recorded, name in names.items()
-        }
+        self._publisher: dict[str, Publisher] = {}
+        for recorded, name in names.items():
+            kind, qos = bag.topics[recorded].type, LATCHED if recorded in latched else reliable
+            self._publisher[recorded] = self.create_publisher(message_class(kind), name, qos)
         self._recorded_time = None
         if options.clock:
             self._recorded_time = self.create_publisher(Clock, '/clock', QoSProfile(depth=1))
@@ -90,12 +86,6 @@ class Replay(Node):
 
     def play(self, progress: tqdm, again: bool) -> None:
         """Publish everything, from start to stop; again and again until the process is ended."""
-        self._lap(progress)
-        while again:
-            self._wait(self._stop + LAP_GAP, progress)
-            self._lap(progress)
-
-    def _lap(self, progress: tqdm) -> None:
         progress.reset()
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
@@ -108,6 +98,10 @@ class Replay(Node):
                 self._timeline.catch_up(message.log_time, time.monotonic())
                 self._tick()
                 self._publisher[message.topic].publish(message.data)
+            if again and self._sought is None:
+                self._wait(self._stop + LAP_GAP, progress)
+                progress.reset()
+                self._sought = self._start if self._sought is None else self._sought
 
     def acknowledge(self) -> None:
         """Give reliable readers time to get the last messages."""

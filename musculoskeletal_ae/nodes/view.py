@@ -95,15 +95,17 @@ class View(Node):
 
     def _subscribe(self) -> None:
         robot, joints = self.robot, self.robot.joints
+
+        def muscles(message: Any) -> Array:
+            size = len(QUANTITIES), robot.muscle_count
+            return read_array(message, *size, self._isolated(), math.nan)
+
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
             for arm, topic in ARM_TOPICS.items()
         ]
         table += [
-            ('muscles', Float64MultiArray, 'muscle_states', NEWEST,
-             lambda m: read_array(
-                 m, len(QUANTITIES), robot.muscle_count, self._isolated(), math.nan
-             )),
+            ('muscles', Float64MultiArray, 'muscle_states', NEWEST, muscles),
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),

@@ -9,20 +9,9 @@ tension; and the moment arms
 
 the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
 So that all joints have one unit, one that slides is taken as if a pinion of radius RACK turned it:
-where a wire lies along it, r is RACK.
-
-An arm is sound when at least 95 % of the postures are held, at least 95 % have a smallest stiffness
-eigenvalue of at least 5 N·m/rad (a posture that is not held counts as not stiff; where it is
-negative, the arm is unstable), every joint moves some mass, and no moment arm is at fault. Beside
-it, not judged: the one-sided stiffness, in which muscles at the bias tension count as slack.
-
-Of an arm whose joints carry less than 2.5 N·m, by weight and muscles at the bias tension, less
-stiffness is required in proportion: a tenth more or less of that load is to turn no joint by more
-than 0.05 rad. And a moment arm matters from 3 mm on, or from a tenth of its joint's longest.
-
-An optional third file of a robot directory, `moment_arms.csv`, declares the action the designer
-meant (columns muscle, joint, sign), so that a route on the wrong side of a joint is found even
-where the arm could still hold itself.
+where a wire lies along it, r is RACK. What a sound arm is, doc/design.md says ("An arm must be
+holdable"). Beside it, not judged: the one-sided stiffness, in which muscles at the bias tension
+count as slack.
 """
 
 from __future__ import annotations
@@ -36,20 +25,21 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
-from musculoskeletal_ae.files import read_csv
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.description import RobotDescription, Wrap, shown
 from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
-from musculoskeletal_ae.robot.tension import TensionProgramme
+from musculoskeletal_ae.robot.tension import least_tension
 
 DESIRED_SHARE = 0.3  # of T_limit: 60 N where that is 200 N
 REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad], and …
-REQUIRED_BY_LOAD = 2.0  # [1/rad] times the largest load of a joint, where that is less
+REQUIRED_BY_LOAD = 2.0  # [1/rad] times the largest load of a joint, where that is less: a tenth
+# more or less of that load is to turn no joint by more than 0.05 rad
 LEAST_INERTIA = 1e-12  # [kg·m²]; less is rounding. Emulated modules add inertia of their own.
 SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
 MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N; or …
@@ -61,6 +51,8 @@ LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
 WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
+#: message and remedy by kind; what stands after a comma tells variants of one kind apart
+FINDINGS = read_table(__file__, 'findings.yaml', dict[str, tuple[str, str]])
 
 
 class Finding(NamedTuple):
@@ -140,18 +132,16 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 def judge(setting: Setting) -> RobotCheck:
     """Measure and judge a robot in given postures; errors as for `check_robot`."""
     robot, theta, jacobian, hessian, torque = setting
-    bias, arms = robot.tension.bias, -jacobian
+    bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
     load = float(robot.joint_load(torque, jacobian).max())
     required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * load)
     longest = np.abs(arms).max(axis=(0, 1))
     matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
     for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
-        programme = TensionProgramme(at, weight, bias, robot.tension.limit)
-        try:
-            tension[n] = programme.nearest(DESIRED_SHARE * robot.tension.limit)
-        except InfeasibleError:
-            missing[n] = programme.compromise().missing_torque
+        found = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
+        missing[n] = found.missing_torque
+        tension[n] = np.nan if missing[n].any() else found.tension
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
@@ -240,24 +230,26 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     return actions
 
 
+def _finding(key: str, **seen: object) -> Finding:
+    """Return one of the FINDINGS, with what its texts name."""
+    message, remedy = (text.format(**seen) for text in FINDINGS[key])
+    return Finding(key.partition(',')[0], message, remedy)
+
+
 def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Declared actions that too many postures contradict."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
-        arm = moment_arms[:, muscle, joint]
+        arm, told = moment_arms[:, muscle, joint], words(robot, joint)
         against = np.mean(arm * sign <= 0.0)
-        expected, actual = ('+', '-') if sign > 0 else ('-', '+')
+        expected, actual = '+-' if sign > 0 else '-+'
         if not arm.any():
             actual = '0, it does not cross the joint,'
         if against > TOLERATED_SHARE:
-            told = words(robot, joint)
-            median = f'{told.scale * np.median(arm):+.1f} {told.unit}'
-            yield Finding(
-                'wrong_sign',
-                f'muscle {robot.muscles[muscle]!r} has a {told.name} of wrong sign at joint '
-                f'{robot.joints[joint]!r}: expected {expected}, found {actual} in '
-                f'{100 * against:.0f} % of postures (median {median})',
-                f'lead its route {told.other} the joint axis, or correct {DECLARATION_FILE}',
-            )
+            yield _finding(
+                'wrong_sign', muscle=robot.muscles[muscle], joint=robot.joints[joint], told=told,
+                expected=expected, actual=actual, against=100 * against,
+                median=told.scale * np.median(arm), file=DECLARATION_FILE,
+            )  # fmt: skip
 
 
 def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
@@ -280,29 +272,17 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
             f'{robot.muscles[m]} ({told.scale * median[m, joint]:+.{decimals}f} {told.unit})'
             for m in np.flatnonzero(longest[:, joint] > matters[joint])
         )
-        yield Finding(
-            'one_way_joint',
-            f'joint {robot.joints[joint]!r} has no muscle that pulls in direction '
-            f'{missing}; muscles that act on it: {acting or "none"}',
-            f'a wire only pulls: lead a muscle {told.other} its axis'
-            if acting
-            else 'lead muscles past its axis, or leave it out: by import_robot --joints, or as '
-            'type="fixed" in robot.urdf',
-        )
+        seen = {'joint': robot.joints[joint], 'missing': missing, 'acting': acting, 'told': told}
+        yield _finding('one_way_joint' if acting else 'one_way_joint, idle', **seen)
 
 
 def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
     along = ', along one that slides' * bool(robot.kinematics.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
-            arm, told = arms.max(), words(robot, int(arms.argmax()))
-            yield Finding(
-                'useless_muscle',
-                f'muscle {muscle!r} never matters: '
-                f'its {told.long}est {told.name} is {told.scale * arm:.1f} {told.unit}',
-                f'lead it at least {1e3 * matters.max():.2g} mm past the axis of a joint{along}, '
-                'or remove it',
-            )
+            told, least = words(robot, int(arms.argmax())), 1e3 * matters.max()
+            seen = {'arm': told.scale * arms.max(), 'least': least, 'along': along}
+            yield _finding('useless_muscle', muscle=muscle, told=told, **seen)
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
@@ -320,33 +300,22 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Muscles whose main action changes sign over the range."""
     for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
-            yield Finding(
-                'flipping_muscle',
-                f'muscle {robot.muscles[m]!r} changes the sign of its main action, '
-                f'at joint {robot.joints[joint]!r}, in {100 * against:.0f} % of postures',
-                f'lead it {words(robot, joint).better} the axis of that joint',
-            )
+            names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
+            told = words(robot, joint)
+            yield _finding('flipping_muscle', **names, against=100 * against, told=told)
 
 
 def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Numbers that look like millimetres or degrees."""
-    longest = np.abs(moment_arms).max(axis=0)
-    for m, j in np.argwhere((longest > LONGEST_ARM) & ~robot.kinematics.slides).tolist():
-        yield Finding(
-            'other_units',
-            f'muscle {robot.muscles[m]!r} has a moment arm of {longest[m, j]:.3g} m at joint '
-            f'{robot.joints[j]!r}',
-            'give all points in metres, not millimetres',
-        )
-    slides = robot.kinematics.slides.astype(int)
-    for j in np.flatnonzero(robot.upper - robot.lower > np.array(WIDEST)[slides]).tolist():
-        unit, wrong = (('rad', 'radians, not degrees'), ('m', 'metres, not millimetres'))[slides[j]]
-        yield Finding(
-            'other_units',
-            f'joint {robot.joints[j]!r} has limits of {robot.lower[j]:g} to {robot.upper[j]:g} '
-            f'{unit}',
-            f'give them in {wrong}',
-        )
+    longest, slides = np.abs(moment_arms).max(axis=0), robot.kinematics.slides
+    for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
+        names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
+        yield _finding('other_units, arm', **names, arm=longest[m, j])
+    for j, (low, high) in enumerate(zip(robot.lower, robot.upper)):
+        if high - low > WIDEST[int(slides[j])]:
+            wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
+            told = {'low': low, 'high': high, 'unit': robot.units[j].theta, 'wrong': wrong}
+            yield _finding('other_units, limits', joint=robot.joints[j], **told)
 
 
 def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
@@ -358,13 +327,7 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     small = np.flatnonzero((longest > MATTERS_LEAST) & (longest < SHORT)).tolist()
     if small:
         each = ', '.join(f'{robot.joints[j]} ({1e3 * longest[j]:.1f} mm)' for j in small)
-        yield Finding(
-            'small_joints',
-            f'the longest moment arms are short, at {each}, and the emulator and the learner suit '
-            'arms of human size: route points of emulated individuals are 8.5 mm off, and their '
-            'modules are heavier than such joints',
-            'what is emulated and learned of these joints says little of the real ones',
-        )
+        yield _finding('small_joints', joints=each)
 
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
@@ -372,12 +335,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
     for m, size, theta in jumping_muscles(robot):
         turns = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in turns)
-        yield Finding(
-            'jumping_muscle',
-            f'the length of muscle {robot.muscles[m]!r} jumps by {1e3 * size:.1f} mm where '
-            f'its wire slips to the other side of what it wraps round, at {place}',
-            'move its side, or a point beside it, until the wire stays on one side everywhere',
-        )
+        yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
 
 
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
@@ -391,12 +349,7 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
     ]
     touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > TOUCHED
     if idle := [told for told, touches in zip(described, touched, strict=True) if not touches]:
-        yield Finding(
-            'idle_object',
-            f'wires touch in no posture what they should wrap round: {", ".join(idle)}',
-            'give its place and radius in metres, and let it hold no point of the wire inside it; '
-            'or remove it',
-        )
+        yield _finding('idle_object', objects=', '.join(idle))
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
@@ -404,11 +357,7 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
     for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):
         told = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
-        yield Finding(
-            'no_inertia',
-            f'joint {robot.joints[j]!r} moves no mass ({told})',
-            'give the links it carries an <inertial> in robot.urdf',
-        )
+        yield _finding('no_inertia', joint=robot.joints[j], moved=told)
 
 
 def _holding_faults(
@@ -419,40 +368,32 @@ def _holding_faults(
     `softest` is of the postures that are held but not stiff.
     """
     held, stiff = np.isfinite(stiffness), stiffness >= least
-    required, worst = f'required {100 * REQUIRED_SHARE:.0f} %', -1
+    required, worst = 100 * REQUIRED_SHARE, -1
     if held.mean() < REQUIRED_SHARE:
         lack = np.abs(missing[~held])
         most = lack.argmax(axis=1)
         counts = Counter(sorted(most.tolist())).most_common()
         own, units = lack / robot.kinematics.radian, robot.units
-        force = 'torque' + ' or force' * bool(robot.kinematics.slides.any())
         each = {k: figure(own[most == k, k].max(), 2) for k, _ in counts}
         where = ', '.join(
             f'{robot.joints[k]} in {count} (up to {each[k]} {units[k].torque})'
             for k, count in counts
         )
         worst = counts[0][0]
-        yield Finding(
-            'not_held',
-            f'the arm is not held: {100 * held.mean():.1f} % of postures hold their own '
-            f'weight with T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N, '
-            f'{required}; of the {len(lack)} others {force} lacks most at {where}',
-            joint=worst,
-        )
+        yield _finding(
+            'not_held', held=100 * held.mean(), bias=shown(robot.tension.bias),
+            limit=shown(robot.tension.limit), required=required, others=len(lack),
+            force='torque' + ' or force' * bool(robot.kinematics.slides.any()), where=where,
+        )._replace(joint=worst)  # fmt: skip
     if stiff.mean() < REQUIRED_SHARE:
         counts = Counter(sorted(softest.tolist())).most_common()
-        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts)
+        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts) or 'none'
         told = 'not stiff'
         if (unstable := stiffness < 0.0).any():
             told = f'unstable in {100 * unstable.mean():.1f} % of postures, with an eigenvalue of '
-            told += (
-                f'its stiffness down to {figure(stiffness[unstable].min())} N·m/rad, and not stiff'
-            )
-        yield Finding(
-            'not_stiff',
-            f'the arm is {told}: {100 * stiff.mean():.1f} % of postures have a smallest '
-            f'stiffness eigenvalue >= {required_stiffness(robot, least)}, {required} '
-            '(a posture that is not held counts as not stiff); softest joint of the held ones, '
-            f'in postures: {where or "none"}',
-            joint=counts[0][0] if counts else worst,
-        )
+            lowest = figure(stiffness[unstable].min())
+            told += f'its stiffness down to {lowest} N·m/rad, and not stiff'
+        yield _finding(
+            'not_stiff', told=told, stiff=100 * stiff.mean(),
+            least=required_stiffness(robot, least), required=required, where=where,
+        )._replace(joint=counts[0][0] if counts else worst)  # fmt: skip

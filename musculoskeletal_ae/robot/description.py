@@ -183,13 +183,11 @@ def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
     names = [item.name() for item in entry.items(1, 'names')]
     for name in entry.unique(names):
         joint = _one_axis_joint(entry, name, model)
-        lower = model.lowerPositionLimit[joint.idx_q]
-        upper = model.upperPositionLimit[joint.idx_q]
+        limits = model.lowerPositionLimit, model.upperPositionLimit
+        lower, upper = (limit[joint.idx_q] for limit in limits)
         if not -math.inf < lower < upper < math.inf:
-            raise entry.fail(
-                f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf; '
-                'expected finite lower < upper'
-            )
+            told = f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf'
+            raise entry.fail(f'{told}; expected finite lower < upper')
     return tuple(names)
 
 
@@ -320,11 +318,7 @@ def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
 
 
 def _read_end_effectors(
-    top: Entry,
-    model: pin.Model,
-    joints: tuple[str, ...],
-    couplings: Iterable[str],
-    order: Iterable[str],
+    top: Entry, model: pin.Model, joints: Iterable[str], couplings: Iterable[str], order: list[str]
 ) -> tuple[str, ...]:
     one, several = top.get('end_effector'), top.get('end_effectors')
     moved, links = _joints_above(model, {*joints, *couplings}), _joints_above(model, {*joints})
@@ -361,7 +355,7 @@ def _fixed_above(model: pin.Model) -> dict[str, int]:
 
 def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
     """Return how many of these joints move each link."""
-    depth = [0]
-    for i in range(1, model.njoints):
-        depth.append(depth[model.parents[i]] + (model.names[i] in names))
-    return {str(link.name): depth[link.parentJoint] for link in body_frames(model)}
+    return {
+        str(link.name): sum(model.names[i] in names for i in model.supports[link.parentJoint])
+        for link in body_frames(model)
+    }

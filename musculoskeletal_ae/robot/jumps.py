@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
 LINES, STEPS = 60, 400  # between postures, that lengths are followed along
@@ -40,6 +40,11 @@ def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tupl
     bends = np.abs(np.diff(along, 2, axis=1)).reshape(LINES * (STEPS - 2), -1)
     where = bends.argmax(axis=0)
     return bends.max(axis=0), theta[:, 1:-1].reshape(-1, joints)[where]
+
+
+def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
+    """Return which of such lengths jump within a robot's limits, (M,)."""
+    return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
 def jumping_muscles(robot: Robot) -> list[Jump]:

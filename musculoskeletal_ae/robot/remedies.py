@@ -16,14 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.robot.checks import (
-    REQUIRED_SHARE,
-    Finding,
-    RobotCheck,
-    Setting,
-    judge,
-    words,
-)
+from musculoskeletal_ae.robot import checks
+from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
 from musculoskeletal_ae.robot.description import shown
 
 HELPS = 0.01  # of the postures; a change that wins less is not named
@@ -87,7 +81,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
     if what == 'moment arms':
         scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
         hessian = scale[:, None] * setting.hessian * scale
-        told = words(robot, joint)
+        told = checks.words(robot, joint)
         text = f'{told.name}s at {robot.joints[joint]} {factor:g} times as {told.long}'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
     if what == 'limits':  # and the postures with them

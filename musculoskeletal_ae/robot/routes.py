@@ -73,20 +73,16 @@ class Routes:
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
 
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
-        segment, wraps = -1, list[tuple[int, Wrap]]()
-        for route in routes:
-            for item, after in pairwise(route):
-                # A segment is counted where it begins, at a point.
-                segment += isinstance(item, RoutePoint)
-                if isinstance(after, Wrap):
-                    wraps.append((segment, after))
+        steps = [step for route in routes for step in pairwise(route)]
+        # A segment is counted where it begins, at a point.
+        segment = np.cumsum([isinstance(item, RoutePoint) for item, _ in steps]) - 1
+        wraps = {s: end for s, (_, end) in zip(segment, steps) if isinstance(end, Wrap)}
         if not wraps:
             return np.zeros(0, dtype=int), None
         # Only here, so that an arm of straight lines does not wait for numba.
         from musculoskeletal_ae.robot.wrapping import place_objects
 
-        objects = place_objects(self._kinematics, [wrap for _, wrap in wraps])
-        return np.array([segment for segment, _ in wraps]), objects
+        return np.array([*wraps]), place_objects(self._kinematics, [*wraps.values()])
 
     def _wrapped(self, poses: JointPoses, points: Array) -> tuple[Array, Array, Array]:
         """Return lengths (N, W) and pulls (N, W, 3) of the segments that may wrap."""

@@ -4,8 +4,7 @@
     min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
 
 over x: each via point p is moved by d_p, less than the reach r. The penalty is zero where stiffness
-and moment arms are what the check requires in all but a few postures. In the end points that need
-not move are put back, those that moved least first.
+and moment arms are what the check requires in all but a few postures.
 """
 
 from __future__ import annotations

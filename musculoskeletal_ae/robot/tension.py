@@ -59,9 +59,8 @@ class TensionProgramme:
             return quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)[0]
         except ValueError as error:
             torque = ', '.join(f'{value:.2f}' for value in self._torque.tolist())
-            raise InfeasibleError(
-                f'no tension within its limits produces the torque ({torque}) N·m'
-            ) from error
+            told = f'no tension within its limits produces the torque ({torque}) N·m'
+            raise InfeasibleError(told) from error
 
     def nearest(self, desired: Array | float) -> Array:
         """Return the hard form: of all tensions the nearest to desired ones [N]."""

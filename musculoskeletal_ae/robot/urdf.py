@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -23,7 +22,6 @@ from musculoskeletal_ae.robot.kinematics import Coupling
 # MuJoCo's and pinocchio's parser goes down 500 levels.
 MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
 LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
-AXES = ('x', 'y', 'z')
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
 ONE_AXIS = *LIMITED, 'continuous'
@@ -78,7 +76,10 @@ def parse_xml(file: Path, text: str) -> ET.Element:
         if '<!DOCTYPE' in text or '<!ENTITY' in text:
             raise ValueError('no DOCTYPE is allowed here')
         root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
-        if max(_levels(root)) > DEEPEST:
+        level, depth = [root], 0
+        while level:
+            level, depth = [child for element in level for child in element], depth + 1
+        if depth > DEEPEST:
             raise ValueError(f'more than {DEEPEST} levels')
         # A default namespace, which the URDF parser does not look at.
         if space := root.tag.rpartition('}')[0]:
@@ -100,15 +101,6 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
     return mimics
 
 
-def _levels(root: ET.Element) -> Iterator[int]:
-    """Walk the elements and say how deep each is, without recursion."""
-    waiting = [(root, 1)]
-    while waiting:
-        element, level = waiting.pop()
-        yield level
-        waiting += [(child, level + 1) for child in element]
-
-
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Refuse what is no tree; the parser says why on stderr only, and takes a link's last joint."""
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
@@ -124,10 +116,8 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
                 link = '' if (found := part.find(end)) is None else found.get('link', '')
                 if link not in links or (end == 'child' and link in held):
                     told = f'{link!r} has a joint above it already' if link in held else repr(link)
-                    raise RobotDescriptionError(
-                        f'{where}: {end}: expected a link of this file, each below one joint, '
-                        f'got {told}'
-                    )
+                    expected = 'expected a link of this file, each below one joint'
+                    raise RobotDescriptionError(f'{where}: {end}: {expected}, got {told}')
             held.add(link)
     if len(roots := sorted(map(str, links - held))) != 1:
         told = ', '.join(roots) or 'none'
@@ -149,8 +139,7 @@ def _check_joint(where: str, joint: ET.Element) -> None:
 
 def _check(part: str, element: ET.Element) -> None:
     for attribute, count in NUMBERS.get(element.tag, {}).items():
-        text = element.get(attribute)
-        if text is None:
+        if (text := element.get(attribute)) is None:
             continue
         try:
             # Python reads 1_000 and other alphabets' digits, the URDF parser does not.
@@ -158,19 +147,15 @@ def _check(part: str, element: ET.Element) -> None:
         except ValueError:
             values = []
         expected = 'a finite number' if count == 1 else f'{count} finite numbers'
-        wrong = len(values) != count or not all(map(math.isfinite, values))
-        if (
-            not wrong
-            and attribute not in ('effort', 'velocity')
-            and max(map(abs, values)) > LARGEST
-        ):
-            wrong, expected = True, f'{expected} of at most {LARGEST:g}'
-        if not wrong and element.tag == 'mass' and values[0] < 0.0:
-            wrong, expected = True, 'a mass >= 0 kg'
-        if wrong:
-            raise RobotDescriptionError(
-                f'{part}: {element.tag} {attribute}: expected {expected}, got {text!r}'
-            )
+        right = len(values) == count and all(map(math.isfinite, values))
+        if right and attribute not in ('effort', 'velocity'):
+            expected += f' of at most {LARGEST:g}'
+            right = max(map(abs, values)) <= LARGEST
+        if right and element.tag == 'mass':
+            expected, right = 'a mass >= 0 kg', values[0] >= 0.0
+        if not right:
+            told = f'expected {expected}, got {text!r}'
+            raise RobotDescriptionError(f'{part}: {element.tag} {attribute}: {told}')
     if element.tag == 'inertial':
         for tag in ('mass', 'inertia'):
             given = set() if (found := element.find(tag)) is None else set(found.keys())
@@ -178,11 +163,9 @@ def _check(part: str, element: ET.Element) -> None:
                 told = f'{", ".join(sorted(lacking))}; links without mass have no <inertial>'
                 raise RobotDescriptionError(f'{part}: {tag}: expected {told}')
     if element.tag == 'inertia':
-        inertia = [
-            [float(element.get('i' + ''.join(sorted(a + b)), 0.0)) for b in AXES] for a in AXES
-        ]
+        names = [['ixx', 'ixy', 'ixz'], ['ixy', 'iyy', 'iyz'], ['ixz', 'iyz', 'izz']]
+        inertia = [[float(element.get(name, 0.0)) for name in row] for row in names]
         least, *_, most = np.linalg.eigvalsh(inertia)
         if least < -1e-9 * max(most, 1e-9):
-            raise RobotDescriptionError(
-                f'{part}: inertia: expected principal moments >= 0, got {least:g} kg·m²'
-            )
+            told = f'expected principal moments >= 0, got {least:g} kg·m²'
+            raise RobotDescriptionError(f'{part}: inertia: {told}')

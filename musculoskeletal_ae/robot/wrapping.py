@@ -165,7 +165,8 @@ def _beside(a: Vector) -> Vector:
 
 
 @njit(cache=True)
-def _placed(rotation: Array, vector: Array) -> Vector:
+def turned(rotation: Array, vector: Array) -> Vector:
+    """Return a vector (3,), turned by a matrix (3, 3)."""
     return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
 
 
@@ -186,8 +187,8 @@ def wrapped_segment(
         arrive[k] = -leave[k]
     if radius <= 0.0:
         return straight
-    axis, side = _placed(rotation[j], objects.axis[s]), _placed(rotation[j], objects.side[s])
-    centre, sided = _placed(rotation[j], objects.centre[s]), not math.isnan(side[0])
+    axis, side = turned(rotation[j], objects.axis[s]), turned(rotation[j], objects.side[s])
+    centre, sided = turned(rotation[j], objects.centre[s]), not math.isnan(side[0])
     a = _minus(_minus(start, translation[j]), centre)
     b = _minus(_minus(end, translation[j]), centre)
     if _dot(axis, axis) > 0.5:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from robots import write_robot
 
 from emulator.commands import to_mid_range
-from musculoskeletal_ae.emulator import mechanics, modules
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator.arm import EmulatedArm, tension_from_elongation
 from musculoskeletal_ae.emulator.effects import NONE
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -46,7 +46,7 @@ def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, st
     elastic = SeriesElastic(np.array([force]), np.array([rate]), np.array([stretch]))
     elongation = elastic.elongation(np.array([1.0]), np.array([tension]))[0]
     if rate * elongation < 6.0:  # the cut-off of the compiled inverse
-        found = mechanics.tension_from_elongation(elongation, force, rate, stretch)
+        found = tension_from_elongation(elongation, force, rate, stretch)
         assert found == pytest.approx(tension, rel=1e-6, abs=1e-6)
 
 
