@@ -104,7 +104,7 @@ def _silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     t = np.tanh(u)
     t += 1.0
     u *= t
-    slope: Singles = 2.0 - t
+    slope: Singles = np.subtract(2.0, t)
     slope *= u
     slope += t
     return u, slope
