@@ -24,9 +24,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.control.methods import first_command, msc_compensation, stiffness_command
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.network import Network, from_mae
+from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -227,31 +227,6 @@ def eager_proposed_paper(
     return command
 
 
-class EagerLengths:
-    """Lengths and their pullback by torch's autograd, for the same simulation step."""
-
-    def __init__(self, mae: Mae) -> None:
-        """Take the weights of a network."""
-        self._network, self.lengths, self.friction = from_mae(mae), mae.lengths, mae.friction
-        self._scale = torch.tensor(scale_vector(len(mae.joints), len(mae.muscles)))
-        self._joints, self._muscles = len(mae.joints), len(mae.muscles)
-
-    def lengths_with_pullback(
-        self, theta: Array, tension: Array
-    ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return what `Mae.lengths_with_pullback` does."""
-        angles = torch.tensor(theta, requires_grad=True)
-        given = torch.cat((angles, torch.tensor(tension), torch.zeros(tension.shape)), dim=1)
-        mask = torch.zeros(len(theta), dtype=torch.long)
-        restored = self._network((given * self._scale).float(), mask) / self._scale
-        length = restored[:, self._joints + self._muscles :]
-
-        def pullback(gradient: Array) -> Array:
-            return torch.autograd.grad(length, angles, torch.tensor(gradient))[0].numpy()
-
-        return length.detach().numpy().astype(float), pullback
-
-
 def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
     """Return a step of the simulator (preset default), one arm and many, and a new network."""
     mae = initial_mae(robot, preset, steps=200).mae
@@ -266,7 +241,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         # The last one's angles are there when all of them are.
         return lambda: simulated.step(0.01).theta[-1].tolist()
 
-    eager, work = EagerLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
+    eager, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     many = f'the same, each of {MANY} in one batch'
     there = [
         Row(f'the same, each of {arms} on {device}', step(arms, mae, device), None, arms)

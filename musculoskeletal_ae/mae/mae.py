@@ -23,11 +23,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints, Singles, library
+from musculoskeletal_ae.arrays import Array, Ints, Singles
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask, State, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
@@ -61,7 +61,7 @@ class BlockDiagonal:
         if self._into is not None:
             x = x[..., self._into]
         parts = [x[..., into] @ block for into, block in self._blocks]
-        result: Singles = library(x).concatenate(parts, axis=-1)
+        result: Singles = np.concatenate(parts, axis=-1)
         return result if self._out is None else result[..., self._out]
 
     @cached_property
@@ -72,43 +72,42 @@ class BlockDiagonal:
 
 
 class Activation(NamedTuple):
-    """An activation h(u), and (h, dh/du) together, of u = gain · x; both may overwrite u.
+    """An activation h(u), u = gain · x, and (h, dh/du) at u + bias; both may overwrite u."""
 
-    Both are given the library of u first.
-    """
-
-    value: Callable[[Any, Singles], Singles]
-    with_slope: Callable[[Any, Singles], tuple[Singles, Singles]]
+    value: Callable[[Singles], Singles]
+    with_slope: Callable[[Singles, Singles], tuple[Singles, Singles]]
     gain: float
 
 
-def _tanh(xp: Any, u: Singles) -> Singles:
-    h: Singles = xp.tanh(u, out=u)
-    return h
+def _tanh(u: Singles) -> Singles:
+    return np.tanh(u, out=u)
 
 
-def _tanh_slope(xp: Any, u: Singles) -> tuple[Singles, Singles]:
-    h = _tanh(xp, u)
-    return h, 1.0 - h * h
+def _tanh_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
+    u += bias
+    h = _tanh(u)
+    slope: Singles = 1.0 - h * h
+    return h, slope
 
 
-def _silu(xp: Any, u: Singles) -> Singles:
+def _silu(u: Singles) -> Singles:
     # x σ(x) = u t with u = x/2 and t = 1 + tanh u: does not overflow, in one temporary array.
-    result: Singles = xp.tanh(u)
+    result: Singles = np.tanh(u)
     result += 1.0
     result *= u
     return result
 
 
-def _silu_slope(xp: Any, u: Singles) -> tuple[Singles, Singles]:
+def _silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     # h = u t and dh/du = t + h (2 − t), in three arrays: a batch then stays in the cache.
-    t = xp.tanh(u)
+    u += bias
+    t = np.tanh(u)
     t += 1.0
     u *= t
-    h, slope = u, 2.0 - t
-    slope *= h
+    slope: Singles = np.subtract(2.0, t)
+    slope *= u
     slope += t
-    return h, slope
+    return u, slope
 
 
 ACTIVATIONS = {
@@ -129,43 +128,40 @@ class Stack(NamedTuple):
 
     def __call__(self, given: Array) -> Array:
         """Return the output (..., out) for an input (..., in)."""
-        xp = library(given)
-        x = xp.asarray(given, dtype=xp.float32)
+        x = given.astype(np.float32)
         for weight, bias in self.layers[:-1]:
             x = x @ weight
             x += bias
-            x = self.activation.value(xp, x)
+            x = self.activation.value(x)
         weight, bias = self.layers[-1]
-        return xp.asarray(x @ weight + bias, dtype=xp.float64)
+        return (x @ weight + bias).astype(np.float64)
 
     def with_pullback(self, given: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return the output and the function that maps a gradient by it to one by the input."""
-        xp = library(given)
-        x, slopes = xp.asarray(given, dtype=xp.float32), []
+        x, slopes = given.astype(np.float32), []
         for weight, bias in self.layers[:-1]:
-            x = x @ weight
-            x += bias
-            x, slope = self.activation.with_slope(xp, x)
+            x, slope = self.activation.with_slope(x @ weight, bias)
             slopes.append(slope)
         last, last_bias = self.layers[-1]
 
         def pullback(by_output: Array) -> Array:
-            gradient = xp.asarray(by_output, dtype=xp.float32) @ last.T
+            gradient = by_output.astype(np.float32) @ last.T
             for (weight, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient *= slope
                 gradient = gradient @ weight.T
-            return xp.asarray(gradient, dtype=xp.float64)
+            return gradient.astype(np.float64)
 
-        return xp.asarray(x @ last + last_bias, dtype=xp.float64), pullback
+        return (x @ last + last_bias).astype(np.float64), pullback
 
     def tangent(self, given: Array, directions: Array) -> tuple[Array, Array]:
         """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
         x, tangent = given.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
-            x, tangent = x @ weight + bias, tangent @ weight
+            x, tangent = x @ weight, tangent @ weight
             if i < len(self.layers) - 1:
-                x, slope = self.activation.with_slope(np, x)
+                x, slope = self.activation.with_slope(x, bias)
                 tangent = tangent * slope[..., None, :]
+        x += bias
         return x.astype(np.float64), tangent.astype(np.float64)
 
 
@@ -374,15 +370,24 @@ class Mae:
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return l [m] (..., M) at (θ, T) through ①, and the function that maps dL/dl to dL/dθ.
+        """Return l [m] (N, M) at (θ, T) through ①, and the function that maps dL/dl to dL/dθ.
 
         The pullback of T is Gᵀ T, at the price of one more evaluation instead of D.
         """
-        x = library(theta).concatenate((theta, tension), axis=-1)
-        z, to_input = self._enter[Mask.THETA_TENSION].with_pullback(x)
-        length, to_latent = self._leave_length.with_pullback(z)
+        enter, leave = self._compiled
+        z, to_input = enter.with_pullback(np.concatenate((theta, tension), axis=-1))
+        length, to_latent = leave.with_pullback(z)
         joints = len(self.joints)
         return length, lambda gradient: to_input(to_latent(gradient))[..., :joints]
+
+    @cached_property
+    def _compiled(self) -> tuple[Stack, Stack]:
+        # Only here: who estimates or controls does without numba.
+        from musculoskeletal_ae.mae.compiled import WITH_SLOPE
+
+        enter, leave = self._enter[Mask.THETA_TENSION], self._leave_length
+        activation = enter.activation._replace(with_slope=WITH_SLOPE[self.activation])
+        return enter._replace(activation=activation), leave._replace(activation=activation)
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""

@@ -9,8 +9,9 @@ enters the first layer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.mae import Layer, Mae
-from musculoskeletal_ae.mae.units import Mask, visible
+from musculoskeletal_ae.mae.units import Mask, scale_vector, visible
 from musculoskeletal_ae.presets import PRESETS, NetworkSettings
 from musculoskeletal_ae.robot.groups import Group
 
@@ -149,6 +150,33 @@ def from_mae(mae: Mae) -> Network:
                 layer.weight.copy_(torch.tensor(weight))
                 layer.bias.copy_(torch.tensor(bias))
     return network
+
+
+class TorchLengths:
+    """What the simulator asks of a network, by torch on any of its devices."""
+
+    def __init__(self, mae: Mae, device: str = 'cpu') -> None:
+        """Take the weights of a network."""
+        self._network, self._tensor = from_mae(mae).to(device), partial(torch.tensor, device=device)
+        self.lengths, self.friction = mae.lengths, mae.friction
+        self._scale = self._tensor(scale_vector(len(mae.joints), len(mae.muscles)))
+        self._muscles = len(mae.muscles)
+
+    def lengths_with_pullback(
+        self, theta: Array, tension: Array
+    ) -> tuple[Array, Callable[[Array], Array]]:
+        """Return what `Mae.lengths_with_pullback` does."""
+        angles, pulls = self._tensor(theta, requires_grad=True), self._tensor(tension)
+        given = torch.cat((angles, pulls, torch.zeros_like(pulls)), dim=1)
+        mask = torch.zeros(len(theta), dtype=torch.long, device=given.device)
+        restored = self._network((given * self._scale).float(), mask) / self._scale
+        length = restored[:, -self._muscles :]
+
+        def pullback(gradient: Array) -> Array:
+            by_angles = torch.autograd.grad(length, angles, self._tensor(gradient))[0]
+            return by_angles.numpy(force=True)
+
+        return length.numpy(force=True).astype(float), pullback
 
 
 def _linear(layers: nn.Module) -> list[nn.Linear]:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array, library
+from musculoskeletal_ae.arrays import Array
 
 REVOLUTE = ('JointModelRX', 'JointModelRY', 'JointModelRZ', 'JointModelRevoluteUnaligned')
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
@@ -156,15 +156,15 @@ class Kinematics:
         self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
         self.local_axis = np.zeros((count, 3))
         # Pose in the parent = placement + a(θ) · first + b(θ) · second.
-        self._placement = np.stack([m.homogeneous for m in self.model.jointPlacements])
-        self._first, self._second = np.zeros((2, count, 4, 4))
+        self.placements = np.stack([m.homogeneous for m in self.model.jointPlacements])
+        self.first, self.second = np.zeros((2, count, 4, 4))
         for i, turn in enumerate(self.placement_rotation[1:], 1):
             axis = joint_axis(self.model.joints[i])
             self.local_axis[i], cross = axis, pin.skew(axis)
             if self.prismatic[i]:
-                self._first[i, :3, 3] = turn @ axis
+                self.first[i, :3, 3] = turn @ axis
             else:
-                self._first[i, :3, :3], self._second[i, :3, :3] = turn @ cross, turn @ cross @ cross
+                self.first[i, :3, :3], self.second[i, :3, :3] = turn @ cross, turn @ cross @ cross
         #: joints of pinocchio's tree: those of θ in its order, then the coupled ones
         self.tree = np.array([*ids, *(self.model.getJointId(name) for name in followers)])
         #: position in θ of joint i of the tree, and q_i = ratio · θ + offset, each (J,)
@@ -196,14 +196,14 @@ class Kinematics:
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
-        xp, angle = library(theta), theta[:, self.theta_index, None, None]
+        angle = theta[:, self.theta_index, None, None]
         if self.transmission is not None:
             angle = self.ratio[:, None, None] * angle + self.offset[:, None, None]
-        first, second = xp.sin(angle), 1.0 - xp.cos(angle)
+        first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
             slides = self.prismatic[:, None, None]
-            first, second = xp.where(slides, angle, first), xp.where(slides, 0.0, second)
-        return self._placement + first * self._first + second * self._second
+            first, second = np.where(slides, angle, first), np.where(slides, 0.0, second)
+        return self.placements + first * self.first + second * self.second
 
     def transforms(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""

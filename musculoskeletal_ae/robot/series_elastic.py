@@ -35,7 +35,7 @@ class SeriesElastic:
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
         """Return ∂L_e/∂T [m/N], shape (..., M)."""
-        unit = 1.0 / (self.rate * (self.force + tension.clip(min=0.0)))
+        unit = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
         return unit + self.wire_stretch * absolute_length
 
     def length_slope(self, tension: Array) -> Array:

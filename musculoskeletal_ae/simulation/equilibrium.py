@@ -19,18 +19,20 @@ after winding in than after paying out.
 
 from __future__ import annotations
 
+import math
 from itertools import combinations_with_replacement
 from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from musculoskeletal_ae.arrays import Array, library
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import Load, Tree, hold
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias
 PAID_OUT = np.inf  # [m]
@@ -55,119 +57,255 @@ class ArmState(NamedTuple):
     slid: Array  # s: which way each wire slid last, in [−1, 1], (N, M)
 
 
+class Body(NamedTuple):
+    """What a step reads of muscles (M,) and joints (D,), as the compiled code wants it."""
+
+    stiffness: Array  # K_stiff [N/m]
+    bias: Array
+    most: Array  # T_max [N]
+    friction: Array  # μ
+    force: Array  # of the elastic units, as in `SeriesElastic`
+    rate: Array
+    wire_stretch: Array
+    length_at_zero: Array
+    lower: Array
+    upper: Array
+    viscosity: Array  # B
+
+
+class Limb(NamedTuple):
+    """The cubics of one limb: what `add_slopes` reads."""
+
+    joints: Ints  # places in θ
+    muscles: Ints  # places in T and l
+    pairs: Ints  # of the basis 1, θ_j, θ_j θ_k: j and k, (pairs, 2)
+    first: Array  # G of each member of the basis, (1 + D + pairs, M D)
+    second: Array  # ∂²l_i/∂θ² of 1 and each θ_j, (M, (1 + D) D²)
+
+
+@njit(cache=True)
+def clip(value: float, low: float, high: float) -> float:
+    """Return what is nearest to a value between two others."""
+    return min(max(value, low), high)
+
+
+@njit(cache=True)
+def follow(command: float, followed: float, length: float, span: float, most: float) -> float:
+    """Return the command [m] as far as a module has wound that winds `most` [m] in a step.
+
+    `followed` is how far it had a step before; a command adds tension as far as `span` [m] below
+    the length.
+    """
+    reached = followed + clip(command - followed, -most, most)
+    # What lies beyond changes no tension; following it would take as long to come back from.
+    return clip(reached, length - span, length + most)
+
+
+@njit(cache=True)
+def add_slopes(limb: Limb, theta: Array, tension: Array, jacobian: Array, curvature: Array) -> None:
+    """Add a limb's G [m/rad] to (M, D), and its Σ T_i ∂²l_i/∂θ² [N·m/rad] to (D, D)."""
+    joints, muscles, pairs = limb.joints, limb.muscles, limb.pairs
+    count, slope, bend = len(joints), limb.first[0].copy(), np.zeros(limb.second.shape[1])
+    for b in range(1, len(limb.first)):
+        if b <= count:
+            value = theta[joints[b - 1]]
+        else:
+            pair = pairs[b - count - 1]
+            value = theta[joints[pair[0]]] * theta[joints[pair[1]]]
+        for i in range(len(slope)):
+            slope[i] += value * limb.first[b, i]
+    for m in range(len(muscles)):
+        value = tension[muscles[m]]  # not in the loop, which would then be no vector operation
+        for i in range(len(bend)):
+            bend[i] += value * limb.second[m, i]
+    for j in range(count):
+        for m in range(len(muscles)):
+            jacobian[muscles[m], joints[j]] += slope[m * count + j]
+        for k in range(count):
+            value = bend[j * count + k]
+            for b in range(count):
+                value += theta[joints[b]] * bend[((b + 1) * count + j) * count + k]
+            curvature[joints[j], joints[k]] += value
+
+
+@njit(cache=True, error_model='numpy')
+def turn(
+    body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
+) -> None:
+    """Fill θ after a step of at most `most` [rad] each; the matrix (D, D) is used up.
+
+    Joints at a stop stay, forced joints go where they are forced.
+    """
+    joints = len(theta)
+    way, turned, held = np.zeros(joints), np.zeros(joints), np.empty(joints, np.bool_)
+    for d in range(joints):
+        held[d] = theta[d] <= body.lower[d] and push[d] < 0.0
+        held[d] |= theta[d] >= body.upper[d] and push[d] > 0.0
+        if math.isfinite(fixed[d]):
+            held[d] = True
+            way[d] = clip(clip(fixed[d], body.lower[d], body.upper[d]) - theta[d], -most, most)
+    for d in range(joints):
+        if not held[d]:
+            turned[d] = push[d]
+            for e in range(joints):
+                turned[d] -= matrix[d, e] * way[e]
+    for d in range(joints):
+        if held[d]:
+            for e in range(joints):
+                matrix[d, e] = matrix[e, d] = 0.0
+            matrix[d, d] = 1.0
+    # Gauss; no pivoting where viscosity is on the diagonal.
+    for d in range(joints):
+        for e in range(d + 1, joints):
+            factor = matrix[e, d] / matrix[d, d]
+            turned[e] -= factor * turned[d]
+            for k in range(d + 1, joints):
+                matrix[e, k] -= factor * matrix[d, k]
+    largest = most
+    for d in range(joints - 1, -1, -1):
+        for k in range(d + 1, joints):
+            turned[d] -= matrix[d, k] * turned[k]
+        turned[d] /= matrix[d, d]
+        largest = max(largest, abs(turned[d]))
+    for d in range(joints):
+        reached = theta[d] + turned[d] * (most / largest) + way[d]
+        arrived[d] = clip(reached, body.lower[d], body.upper[d])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def advance(
+    body: Body, tree: Tree, limbs: tuple[Limb, ...], state: ArmState, after: ArmState, h: float,
+    passed: Array, length: Array, pulled: Array, command: Array, wrench: Array, fixed: Array,
+) -> None:  # fmt: skip
+    """Fill the arms h [s] after a state.
+
+    Of the network: the lengths at θ and T_end (N, M), and Gᵀ T_end there (N, D). `passed` is what
+    friction lets through from the motor to the elastic unit, T_end / T (N, M).
+    """
+    muscles, joints = len(body.stiffness), len(body.lower)
+    load, push = np.empty(joints), np.empty(joints)
+    slope, matrix = np.empty((joints, joints)), np.empty((joints, joints))
+    jacobian, end = np.empty((muscles, joints)), np.empty(muscles)
+    compliance, wanted = np.empty(muscles), np.empty(muscles)
+    give, soft, lost = np.empty(muscles), np.empty(muscles), np.empty(muscles)
+    for n in range(len(length)):
+        theta, tension, slid, arrived = (
+            state.theta[n],
+            state.tension[n],
+            state.slid[n],
+            after.theta[n],
+        )
+        passing, turning = passed[n], after.slid[n]
+        hold(tree, theta, wrench[n], load, slope)
+        jacobian[:] = 0.0
+        rough = False
+        for m in range(muscles):
+            end[m], turning[m] = passing[m] * tension[m], slid[m]
+            rough |= body.friction[m] * end[m] != 0.0
+            span = (body.most[m] - body.bias[m]) / body.stiffness[m]
+            after.followed[n, m] = follow(
+                command[n, m], state.followed[n, m], length[n, m], span, MODULE_SPEED * h
+            )
+            stretch = body.wire_stretch[m] * (body.length_at_zero[m] + length[n, m])
+            unit = body.rate[m] * (body.force[m] + max(end[m], 0.0))
+            compliance[m] = 1.0 / unit + stretch
+        for limb in limbs:
+            add_slopes(limb, theta, end, jacobian, slope)
+        for _ in range(ROUNDS):
+            matrix[:] = slope
+            for d in range(joints):
+                push[d] = -(load[d] + pulled[n, d])
+                matrix[d, d] += body.viscosity[d] / h
+            for m in range(muscles):
+                # Where a wire slides, friction is like a stiff spring until it has turned round:
+                # one of constant stiffness, where the arm's lets go little by little.
+                rub, lost[m] = 0.0, 0.0
+                if abs(turning[m]) < 1.0:
+                    rub = body.friction[m] * end[m] / REVERSAL
+                else:
+                    lost[m] = body.friction[m] * end[m] * (turning[m] - slid[m])
+                # MSC, friction and the elastic unit in series: at rest posture T moves to `wanted`,
+                # and with the posture by `soft` K G Δθ.
+                wound = body.stiffness[m] * (length[n, m] - after.followed[n, m])
+                by_motor, aim = passing[m] * compliance[m], body.bias[m] + wound
+                give[m] = 1.0 + compliance[m] * rub
+                soft[m] = body.stiffness[m] / (give[m] + body.stiffness[m] * by_motor)
+                slack = compliance[m] * lost[m] - by_motor * (aim - tension[m])
+                wanted[m] = aim + soft[m] * slack
+                # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
+                # Newton).
+                settled = clip(wanted[m], body.bias[m], body.most[m])
+                rise = settled - tension[m]
+                moved = (compliance[m] * lost[m] - by_motor * rise) / give[m]
+                change = passing[m] * rise + rub * moved - lost[m]
+                spring = rub / give[m]
+                if settled == wanted[m]:
+                    spring = (passing[m] + rub / body.stiffness[m]) * soft[m]
+                for d in range(joints):
+                    push[d] -= change * jacobian[m, d]
+                    stiff = spring * jacobian[m, d]
+                    for e in range(joints):
+                        matrix[d, e] += stiff * jacobian[m, e]
+            turn(body, theta, push, matrix, JOINT_SPEED * h, fixed[n], arrived)
+            settled_now = True
+            for m in range(muscles):
+                stretch = 0.0
+                for d in range(joints):
+                    stretch += jacobian[m, d] * (arrived[d] - theta[d])
+                pull = clip(wanted[m] + soft[m] * stretch, body.bias[m], body.most[m])
+                rise = passing[m] * compliance[m] * (pull - tension[m])
+                moved = (stretch + compliance[m] * lost[m] - rise) / give[m]
+                before, turning[m] = turning[m], clip(slid[m] - moved / REVERSAL, -1.0, 1.0)
+                settled_now &= (abs(before) < 1.0) == (abs(turning[m]) < 1.0)
+                after.tension[n, m], after.length[n, m] = pull, length[n, m] + moved
+            if settled_now or not rough:
+                break
+        for d in range(joints):
+            stopped = arrived[d] == body.lower[d] and push[d] < 0.0
+            stopped |= arrived[d] == body.upper[d] and push[d] > 0.0
+            after.holding[n, d] = -push[d] if stopped or math.isfinite(fixed[n, d]) else 0.0
+
+
 class QuasiStatics:
     """The equations above for one robot, and for the network that was given to `use` last."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._length_at_zero = robot, robot.routes.length_at_zero
-        self._load, self._slopes = Load(robot.kinematics), Slopes(robot)
-        self._eye = np.eye(robot.joint_count)
+        self._robot, self._tree, self._slopes = robot, Load(robot.kinematics).tree, Slopes(robot)
         postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
         levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
-        self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY) * self._eye
+        self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY)
 
     def use(self, mae: Mae) -> None:
-        """Take a network; a FloatingPointError says that it has no finite lengths somewhere."""
+        """Take a network, and the muscles that are isolated now.
+
+        A FloatingPointError says that the network has no finite lengths somewhere.
+        """
         self._slopes.fit(mae)
-        self._mae = mae
+        robot, elastic, self._mae = self._robot, self._robot.series_elastic, mae
         # A noisy fit may find a little less than none, which would drive the arm.
-        self._friction = np.maximum(mae.friction, 0.0)
+        friction = np.maximum(mae.friction, 0.0)
+        muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction
+        units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
+        joints = robot.lower, robot.upper, self._viscosity
+        self._body = Body(*map(np.array, (*muscles, *units, *joints)))
 
     def step(
-        self,
-        state: ArmState,
-        command: Array,
-        h: float,
-        wrench: Array | None = None,
-        fixed: Array | None = None,
+        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
         """Return the arms h [s] later, under l_target [m] (N, M), PAID_OUT for none.
 
         A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
         forced to the angles `fixed` (N, D) [rad], nan for a free joint.
         """
-        robot, theta, tension = self._robot, state.theta, state.tension
-        stiffness, limits = robot.stiffness, robot.tension
-        xp = library(theta)
-        passed = xp.exp(-self._friction * state.slid)  # from the motor to the elastic unit
-        end = passed * tension
-        length, pullback = self._mae.lengths_with_pullback(theta, end)
-        span = (limits.max - limits.bias) / stiffness
-        followed = follow(command, state.followed, length, span, MODULE_SPEED * h)
-        compliance = robot.series_elastic.compliance(self._length_at_zero + length, end)
-        by_motor = passed * compliance
-        command_tension = limits.bias + stiffness * (length - followed)
-        jacobian, curvature = self._slopes(theta, end)
-        load, load_slope = self._load(theta, wrench)
-        torque = load + pullback(end)
-        # Where a wire slides, friction is like a stiff spring until it has turned round: one of
-        # constant stiffness, where the arm's lets go little by little.
-        rubbing = self._friction * end
-        turning, free = state.slid, abs(state.slid) < 1.0
-        for _ in range(ROUNDS):
-            rub = rubbing * free / REVERSAL
-            lost = rubbing * ~free * (turning - state.slid)
-            # MSC, friction and the elastic unit in series: at rest posture T moves to `desired`,
-            # and with the posture by `soft` K G Δθ.
-            give = 1.0 + compliance * rub
-            soft = 1.0 / (give + stiffness * by_motor)
-            slack = compliance * lost - by_motor * (command_tension - tension)
-            desired = command_tension + stiffness * soft * slack
-            # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
-            # Newton).
-            settled = desired.clip(limits.bias, limits.max)
-            moved = (compliance * lost - by_motor * (settled - tension)) / give
-            change = passed * (settled - tension) + rub * moved - lost
-            spring = xp.where(desired == settled, (passed * stiffness + rub) * soft, rub / give)
-            push = -(torque + (change[:, None, :] @ jacobian)[:, 0])
-            matrix = (jacobian * spring[..., None]).swapaxes(1, 2) @ jacobian
-            matrix += curvature + load_slope + self._viscosity / h
-            turned = self._turn(theta, push, matrix, JOINT_SPEED * h, fixed)
-            arrived = (theta + turned).clip(robot.lower, robot.upper)
-            stretch = (jacobian @ (arrived - theta)[..., None])[..., 0]
-            after = (desired + stiffness * soft * stretch).clip(limits.bias, limits.max)
-            moved = (stretch + compliance * lost - by_motor * (after - tension)) / give
-            turning = (state.slid - moved / REVERSAL).clip(-1.0, 1.0)
-            before = free
-            free = abs(turning) < 1.0
-            if (free == before).all() or not rubbing.any():
-                break
-        held = (arrived == robot.lower) & (push < 0.0) | (arrived == robot.upper) & (push > 0.0)
-        if fixed is not None:
-            held |= xp.isfinite(fixed)
-        holding = xp.where(held, -push, 0.0)
-        return ArmState(arrived, after, length + moved, followed, holding, turning)
-
-    def _turn(
-        self, theta: Array, push: Array, matrix: Array, most: float, fixed: Array | None
-    ) -> Array:
-        """Return Δθ of one step; joints at a stop stay, forced joints go where they are forced."""
-        robot, xp = self._robot, library(theta)
-        held = (theta <= robot.lower) & (push < 0.0) | (theta >= robot.upper) & (push > 0.0)
-        forced = xp.zeros_like(theta)
-        if fixed is not None:
-            given = xp.isfinite(fixed)
-            way = (fixed.clip(robot.lower, robot.upper) - theta).clip(-most, most)
-            forced = xp.where(given, way, forced)
-            held |= given
-            push = push - (matrix @ forced[..., None])[..., 0]
-        free = ~held
-        matrix = matrix * (free[:, :, None] & free[:, None, :]) + held[:, :, None] * self._eye
-        turned = xp.linalg.solve(matrix, (push * free)[..., None])[..., 0]
-        largest = xp.amax(abs(turned), axis=1, keepdims=True)
-        scaled: Array = turned * (most / largest.clip(min=most)) + forced
-        return scaled
-
-
-def follow(command: Array, followed: Array, length: Array, span: Array, most: float) -> Array:
-    """Return the command as far as modules have wound that wind at most `most` [m] in a step.
-
-    Command, how far they had `followed` it a step before, and length are (N, M) [m]; a command
-    adds tension as far as `span` [m] (M,) below the length.
-    """
-    reached = followed + (command - followed).clip(-most, most)
-    # What lies beyond changes no tension; following it would take as long to come back from.
-    return reached.clip(length - span, length + most)
+        passed = np.exp(-self._body.friction * state.slid)
+        end = passed * state.tension
+        length, pullback = self._mae.lengths_with_pullback(state.theta, end)
+        after = ArmState(*map(np.empty_like, state))
+        advance(
+            self._body, self._tree, self._slopes.limbs, state, after, h,
+            passed, length, pullback(end), command, wrench, fixed,
+        )  # fmt: skip
+        return after
 
 
 class Slopes:
@@ -188,27 +326,22 @@ class Slopes:
         self._postures = robot.random_postures(count, np.random.default_rng(0))
         middle = 0.5 * (robot.tension.bias + robot.tension.limit)
         self._tension = np.full((count, robot.muscle_count), middle)
-        self._limbs = [Cubics(group, self._postures) for group in robot.groups]
+        self._cubics = [Cubics(group, self._postures) for group in robot.groups]
 
     def fit(self, mae: Mae) -> None:
         """Fit what a network says; a FloatingPointError says that it cannot be fitted."""
         lengths = mae.lengths(self._postures, self._tension)
         if not np.isfinite(lengths).all():
             raise FloatingPointError('lengths within the joint limits that are not finite')
-        for limb in self._limbs:
-            limb.fit(lengths)
+        self.limbs = tuple(limb.fit(lengths) for limb in self._cubics)
 
     def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
-        if len(self._limbs) == 1:
-            return self._limbs[0](theta, tension)
-        xp, each = library(theta), theta[:, None, :]
-        jacobian = xp.zeros_like(tension[:, :, None] * each)
-        curvature = xp.zeros_like(theta[:, :, None] * each)
-        for limb in self._limbs:
-            (pulled, turned), (down, across) = limb.of_jacobian, limb.of_curvature
-            own = limb(theta[:, limb.joints], tension[:, limb.muscles])
-            jacobian[:, pulled, turned], curvature[:, down, across] = own
+        jacobian = np.zeros((*tension.shape, theta.shape[1]))
+        curvature = np.zeros((*theta.shape, theta.shape[1]))
+        for arm in zip(theta, tension, jacobian, curvature, strict=True):
+            for limb in self.limbs:
+                add_slopes(limb, *arm)
         return jacobian, curvature
 
 
@@ -217,11 +350,8 @@ class Cubics:
 
     def __init__(self, group: Group, postures: Array) -> None:
         """Prepare to fit to lengths at some postures θ of the body (N, D) [rad]."""
-        self.joints, self.muscles = map(list, group)
-        #: where the limb's G and Σ T_i ∂²l_i/∂θ² are in those of the body
-        self.of_jacobian = np.ix_(self.muscles, self.joints)
-        self.of_curvature = np.ix_(self.joints, self.joints)
-        theta, joints = postures[:, self.joints], len(self.joints)
+        self._joints, self._muscles = map(np.array, group)
+        theta, joints = postures[:, self._joints], len(self._joints)
         basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
         values = np.stack([theta[:, list(term)].prod(axis=1) for term in basis], axis=1)
         self._inverse = np.linalg.pinv(values)  # (basis, N)
@@ -229,25 +359,20 @@ class Cubics:
         linear = [term for term in basis if len(term) <= 1]
         self._slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
         self._bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
-        self._left, self._right = np.array([term for term in quadratic if len(term) == 2]).T
+        self._pairs = np.array([term for term in quadratic if len(term) == 2])
 
-    def fit(self, lengths: Array) -> None:
+    def fit(self, lengths: Array) -> Limb:
         """Fit lengths of the body at those postures (N, M) [m]."""
-        cubic = self._inverse @ lengths[:, self.muscles]  # (basis, M)
+        cubic = self._inverse @ lengths[:, self._muscles]  # (basis, M)
         first = np.einsum('dqb,bm->qmd', self._slope, cubic)
-        self._first = np.ascontiguousarray(first.reshape(len(first), -1))
         second = np.einsum('elq,qmd->mlde', self._bend, first)
-        self._second = np.ascontiguousarray(second.reshape(-1, len(self.joints) ** 2))
-
-    def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at the limb's θ, T."""
-        xp, (count, joints) = library(theta), theta.shape
-        products = theta[:, self._left] * theta[:, self._right]
-        basis = xp.concatenate((xp.ones_like(theta[:, :1]), theta, products), axis=1)
-        linear, jacobian = basis[:, : 1 + joints], basis @ self._first
-        weighted = (tension[:, :, None] * linear[:, None, :]).reshape(count, -1)
-        curvature = weighted @ self._second
-        return jacobian.reshape(count, -1, joints), curvature.reshape(count, joints, joints)
+        return Limb(
+            self._joints,
+            self._muscles,
+            self._pairs,
+            np.ascontiguousarray(first.reshape(len(first), -1)),
+            np.ascontiguousarray(second.reshape(len(second), -1)),
+        )
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:

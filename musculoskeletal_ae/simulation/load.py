@@ -1,27 +1,141 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gravity and a push ask of the joints, for N arms at once.
+"""What gravity and a push ask of the joints of one arm, and how that changes, compiled by numba.
 
     load(θ) = g(θ) − Jᵀ F
 
-(paper, section "Simulation": the necessary torque from the geometric model). Pinocchio answers for
-one posture; here the same is an array operation over N, and a test holds the two together. With
-forces f_i at points c_i, every joint k needs only R_k = Σ (c_i − o_k) f_iᵀ over what it carries:
+(paper, section "Simulation": the necessary torque from the geometric model). Pinocchio answers the
+same, a test holds the two together; but it has no gradient with a push, and from Python takes as
+long as all the rest of a step. With forces f_i at points c_i, every joint k at o_k with axis a_k
+needs only sums over what it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
-    ∂τ_k/∂θ_j = a_jᵀ R_k a_k − (a_j · a_k) tr R_k        for j at or before k, and symmetric
+    ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
 """
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from typing import NamedTuple
 
-from musculoskeletal_ae.arrays import Array, library
+import numpy as np
+from numba import njit
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
-#: flattened (r fᵀ) @ this gives r × f and, in the last column, r · f
-CROSS_AND_DOT = np.zeros((9, 4))
-CROSS_AND_DOT[[5, 7, 6, 2, 1, 3], [0, 0, 1, 1, 2, 2]] = [1.0, -1.0] * 3
-CROSS_AND_DOT[[0, 4, 8], 3] = 1.0
+Vector = tuple[float, float, float] | Array
+
+
+class Tree(NamedTuple):
+    """Pinocchio's joints, joint 0 being the root link, and the bodies that they carry."""
+
+    parent: Ints  # (J,)
+    master: Ints  # place in θ of what turns a joint, by q = ratio · θ + offset
+    ratio: Array
+    offset: Array
+    slides: Bools
+    #: pose in the parent = placement + sin q · first + (1 − cos q) · second, each (J, 4, 4);
+    #: placement + q · first where it slides
+    placement: Array
+    first: Array
+    second: Array
+    axis: Array  # in the joint's frame, (J, 3)
+    mass: Array  # [kg] (J,)
+    carried: Array  # mass of all that a joint carries [kg] (J,)
+    centre: Array  # of mass [m], in the joint's frame, (J, 3)
+    gravity: Array  # [m/s²] (3,)
+    carries: Bools  # whether a joint carries the end effector, (J,)
+    effector_joint: int
+    effector: Array  # its place in the frame of the joint that carries it [m], (3,)
+
+
+@njit(cache=True)
+def vector(a: Array) -> Vector:
+    """Return a (3,) as a vector that takes no memory."""
+    return a[0], a[1], a[2]
+
+
+@njit(cache=True)
+def dot(a: Vector, b: Vector) -> float:
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a × b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
+    """Return a + scale · b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@njit(cache=True)
+def place(tree: Tree, theta: Array, pose: Array) -> None:
+    """Fill the joints' poses in the root link's frame, axes, and m c of their bodies, (J, 3, 6)."""
+    pose[0] = 0.0
+    pose[0, 0, 0] = pose[0, 1, 1] = pose[0, 2, 2] = 1.0
+    for i in range(1, len(tree.parent)):
+        up, angle = pose[tree.parent[i]], tree.ratio[i] * theta[tree.master[i]] + tree.offset[i]
+        sine, rest = math.sin(angle), 1.0 - math.cos(angle)
+        if tree.slides[i]:
+            sine, rest = angle, 0.0
+        own = tree.placement[i], tree.first[i], tree.second[i]
+        for c in range(4):
+            x = own[0][0, c] + sine * own[1][0, c] + rest * own[2][0, c]
+            y = own[0][1, c] + sine * own[1][1, c] + rest * own[2][1, c]
+            z = own[0][2, c] + sine * own[1][2, c] + rest * own[2][2, c]
+            for r in range(3):
+                pose[i, r, c] = up[r, 0] * x + up[r, 1] * y + up[r, 2] * z
+        for r in range(3):
+            pose[i, r, 3] += up[r, 3]
+            pose[i, r, 4] = dot(pose[i, r], tree.axis[i])
+            pose[i, r, 5] = tree.mass[i] * (dot(pose[i, r], tree.centre[i]) + pose[i, r, 3])
+
+
+@njit(cache=True)
+def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
+    """Fill load [N·m] (D,) and ∂load/∂θ [N·m/rad] (D, D) at θ [rad] (D,).
+
+    The wrench (6,) [N, N·m] acts on the end effector's origin, in axes of the root link; its
+    torque's share in the gradient is left out.
+    """
+    joints = len(tree.parent)
+    pose = np.empty((joints, 3, 6))
+    place(tree, theta, pose)
+    for i in range(joints - 1, 0, -1):
+        for r in range(3):
+            pose[tree.parent[i], r, 5] += pose[i, r, 5]
+    load[:], gradient[:] = 0.0, 0.0
+    down, hand = vector(tree.gravity), pose[tree.effector_joint]
+    own = tree.effector
+    turned = dot(hand[0], own), dot(hand[1], own), dot(hand[2], own)
+    tip = plus(turned, vector(hand[:, 3]))
+    for k in range(1, joints):
+        push, twist = vector(wrench[:3]), vector(wrench[3:])
+        if not tree.carries[k]:
+            push = twist = 0.0, 0.0, 0.0
+        at, axis, moment = vector(pose[k, :, 3]), vector(pose[k, :, 4]), vector(pose[k, :, 5])
+        if tree.slides[k]:
+            force = plus(push, down, tree.carried[k])
+            torque, bend = dot(axis, force), cross(axis, force)
+        else:
+            weight, arm = plus(moment, at, -tree.carried[k]), plus(tip, at, -1.0)
+            turning = plus(plus(cross(weight, down), cross(arm, push)), twist)
+            bending = cross(down, cross(weight, axis)), cross(push, cross(arm, axis))
+            torque, bend = dot(axis, turning), plus(bending[0], bending[1])
+        load[tree.master[k]] -= tree.ratio[k] * torque
+        j = k
+        while j > 0:
+            if not tree.slides[j]:
+                slope = tree.ratio[j] * tree.ratio[k] * dot(pose[j, :, 4], bend)
+                gradient[tree.master[j], tree.master[k]] -= slope
+                if j != k:
+                    gradient[tree.master[k], tree.master[j]] -= slope
+            j = tree.parent[j]
 
 
 class Load:
@@ -29,61 +143,32 @@ class Load:
 
     def __init__(self, kinematics: Kinematics) -> None:
         kin, model = kinematics, kinematics.model
-        self._kinematics = kin
-        #: pinocchio's joint of each entry of θ, then the coupled ones; ∂q/∂θ of them, if there are
-        self._tree = kin.tree
-        self._gear = None if kin.transmission is None else kin.transmission[kin.tree - 1]
-        self._slides = kin.prismatic[self._tree]
-        # Columns that a pose maps to the joint's axis, its origin and its centre of mass.
-        self._columns = np.zeros((len(kin.parent), 4, 3))
-        self._columns[:, :3, 0] = kin.local_axis
-        self._columns[:, 3, 1:] = 1.0
-        self._columns[:, :3, 2] = [inertia.lever for inertia in model.inertias]
-        self._gravity: Array = np.array(model.gravity.linear)
-        carries = kin.hangs_on[:, self._tree].T.astype(float)  # (D or more, joints of the tree)
-        self._carried: Array = carries * np.array([inertia.mass for inertia in model.inertias])
-        self._carried_mass: Array = self._carried.sum(axis=1)[:, None]
         effector = model.frames[kin.end_effector_frame]
-        self._effector_joint = int(effector.parentJoint)
-        self._effector = np.append(effector.placement.translation, 1.0)
-        self._carries_effector: Array = carries[:, self._effector_joint]
-        # before[j, k]: joint k hangs on joint j, or is it
-        before = kin.hangs_on[np.ix_(self._tree, self._tree)].T
-        self._upper: Array = before * ~self._slides[:, None] * 1.0
-        self._strict: Array = self._upper * ~np.eye(len(before), dtype=bool)
-        self._cross_and_dot = CROSS_AND_DOT
+        joint = int(effector.parentJoint)
+        mass = np.array([inertia.mass for inertia in model.inertias])
+        self.tree = Tree(
+            parent=kin.parent,
+            master=kin.theta_index,
+            ratio=kin.ratio,
+            offset=kin.offset,
+            slides=kin.prismatic,
+            placement=kin.placements,
+            first=kin.first,
+            second=kin.second,
+            axis=kin.local_axis,
+            mass=mass,
+            carried=mass @ kin.hangs_on,
+            centre=np.array([inertia.lever for inertia in model.inertias]),
+            gravity=np.array(model.gravity.linear),
+            carries=kin.hangs_on[joint].copy(),
+            effector_joint=joint,
+            effector=np.array(effector.placement.translation),
+        )
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
-        """Return load [N·m] (N, D) and ∂load/∂θ [N·m/rad] (N, D, D) at θ [rad] (N, D).
-
-        The wrench (N, 6) [N, N·m] acts on the end effector's origin, in axes of the root link; its
-        torque's share in the gradient is left out.
-        """
-        poses = self._kinematics.transforms(theta)
-        placed = (poses @ self._columns)[..., :3, :]  # (N, joints of the tree, 3, 3)
-        joints = placed[:, self._tree]
-        axis, origin, centre = joints[..., 0], joints[..., 1], placed[..., 2]  # (N, …, 3)
-        moment = self._carried @ centre - self._carried_mass * origin
-        spread = moment[..., None] * self._gravity  # R of the weights, (N, D, 3, 3)
-        if wrench is not None:
-            point = poses[:, self._effector_joint, :3] @ self._effector
-            arm = (point[:, None] - origin) * self._carries_effector[:, None]
-            spread = spread + arm[..., None] * wrench[:, None, None, :3]
-        turning = spread.reshape(*axis.shape[:2], 9) @ self._cross_and_dot  # (N, D, 4)
-        pull, bend = turning[..., :3], (spread @ axis[..., None])[..., 0] - turning[..., 3:] * axis
-        if self._slides.any():
-            xp = library(axis)
-            force = xp.broadcast_to(self._carried_mass * self._gravity, axis.shape)
-            if wrench is not None:
-                force = force + self._carries_effector[:, None] * wrench[:, None, :3]
-            pull = xp.where(self._slides[:, None], force, pull)
-            bend = xp.where(self._slides[:, None], xp.linalg.cross(axis, force), bend)
-        if wrench is not None:
-            rotary = self._carries_effector * ~self._slides
-            pull = pull + rotary[:, None] * wrench[:, None, 3:]
-        torque = (axis * pull).sum(axis=-1)
-        slope = axis @ bend.swapaxes(1, 2)
-        gradient = slope * self._upper + (slope * self._strict).swapaxes(1, 2)
-        if self._gear is not None:
-            torque, gradient = torque @ self._gear, self._gear.T @ gradient @ self._gear
-        return -torque, -gradient
+        """Return what `hold` fills, (N, D) and (N, D, D), for θ (N, D) and wrenches (N, 6)."""
+        load, gradient = np.empty_like(theta), np.empty((*theta.shape, theta.shape[1]))
+        pushes = np.zeros((len(theta), 6)) if wrench is None else wrench
+        for arm in zip(theta, pushes, load, gradient, strict=True):
+            hold(self.tree, *arm)
+        return load, gradient

@@ -45,8 +45,8 @@ class PaperDescent:
         state: ArmState,
         command: Array,
         h: float,  # noqa: ARG002 (the print knows no time: one step is one descent)
-        wrench: Array | None = None,
-        fixed: Array | None = None,
+        wrench: Array,
+        fixed: Array,
     ) -> ArmState:
         """Return the arms after one descent each."""
         load, _ = self._load(state.theta, wrench)
@@ -54,8 +54,7 @@ class PaperDescent:
         # A bound that no command in its senses meets: no muscle is wound in by its whole length.
         whole = self._robot.routes.length_at_zero
         length = np.clip(length, -whole, whole)
-        forced = np.full_like(state.theta, np.nan) if fixed is None else fixed
-        arms = zip(state.theta, state.tension, length, load, forced, strict=True)
+        arms = zip(state.theta, state.tension, length, load, fixed, strict=True)
         theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
         return ArmState(theta, tension, reached, length, np.zeros_like(theta), state.slid)
 

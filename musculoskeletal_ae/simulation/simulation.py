@@ -4,8 +4,9 @@
 (Paper, section "Simulation Using Musculoskeletal AutoEncoder".) The simulated arms follow the same
 muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
 l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
-command rests at T_bias. One arm or thousands are the same array operations, by numpy or, on a GPU,
-by torch; `equilibrium` has the equations of preset `default`, `paper` the printed descent.
+command rests at T_bias. One arm or thousands are the same compiled code, on all cores; their
+network may be on a GPU. `equilibrium` has the equations of preset `default`, `paper` the printed
+descent.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from musculoskeletal_ae.arrays import Array, library, moved
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import preset_named
@@ -41,7 +42,7 @@ STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
 
 
 class Simulation:
-    """N simulated arms of one robot; on a device of torch, what follows are tensors there."""
+    """N simulated arms of one robot."""
 
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign it to go back to a state kept before
@@ -59,7 +60,7 @@ class Simulation:
     ) -> None:
         """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
 
-        A device of torch, such as `cuda`, has them all in one batch there (preset `default` only).
+        The network computes on a device of torch, such as `cuda` (preset `default` only).
 
         Raises:
             MusculoskeletalError: If torch computes nothing there, or the preset cannot.
@@ -67,8 +68,10 @@ class Simulation:
         self.robot = copy.copy(robot)
         kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
         self._body, self._device = kind(self.robot), device
-        self._put: Callable[[Any], Any] = np.asarray if device is None else _tensors(device, preset)
-        self.wrench = self._put(np.zeros((0, 6)))  # those of the arms that start
+        if device is not None and kind is PaperDescent:
+            told = f'preset {preset!r} simulates one arm after the other, and on no device'
+            raise MusculoskeletalError(f'{told}; given: {device!r}. Legal there: default')
+        self.wrench = np.zeros((0, 6))  # those of the arms that start
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
 
@@ -77,30 +80,29 @@ class Simulation:
 
         A FloatingPointError says that it cannot be simulated; the one in use stays.
         """
-        self._body.use(mae)
+        self._body.use(mae if self._device is None else _there(mae, self._device))
         self.mae = mae
-        self._move()
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
         self.robot.isolate(muscles)
-        self._move()
+        self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
         """Put the arms at θ [rad] (N, D), of numpy, with T_bias, commands forgotten.
 
         If they become more or fewer, wrenches and fixed angles are forgotten as well.
         """
-        robot, put = self.robot, self._put
+        robot = self.robot
         if len(theta) != len(self.wrench):
-            self.wrench = put(np.zeros((len(theta), 6)))
-            self.fixed = put(np.full((len(theta), robot.joint_count), np.nan))
+            self.wrench = np.zeros((len(theta), 6))
+            self.fixed = np.full((len(theta), robot.joint_count), np.nan)
         theta = np.clip(theta, robot.lower, robot.upper)
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
-        self.command = put(np.full_like(tension, PAID_OUT))
-        length = self.mae.lengths(theta, tension)
+        self.command = np.full_like(tension, PAID_OUT)
+        length = np.array(self.mae.lengths(theta, tension))
         nothing, not_slid = np.zeros_like(theta), np.zeros_like(tension)
-        self.state = ArmState(*map(put, (theta, tension, length, length, nothing, not_slid)))
+        self.state = ArmState(theta, tension, length, length, nothing, not_slid)
 
     def step(self, dt: float) -> ArmState:
         """Let time pass [s]; return the arms."""
@@ -124,9 +126,8 @@ class Simulation:
 
     def limits(self, arm: int = 0) -> list[str]:
         """Return the joints and muscles of one arm that are at the end of what they can do."""
-        robot, one = self.robot, (self.fixed[arm], self.state.holding[arm], self.state.tension[arm])
-        forced, holding, tension = (np.array(part.tolist()) for part in one)
-        stopped = np.isnan(forced) & (np.abs(holding) > STOP_TORQUE)
+        robot, forced, tension = self.robot, self.fixed[arm], self.state.tension[arm]
+        stopped = np.isnan(forced) & (np.abs(self.state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
         full = tension > robot.tension.max - TENSION_MARGIN
         return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
@@ -134,8 +135,7 @@ class Simulation:
     def report(self) -> Report:
         """Say what acts on the first arm, and whether it is at a limit."""
         values = {'checkpoint version': str(self.mae.version)}
-        one = self.fixed[0], self.wrench[0], self.command[0]
-        fixed, wrench, command = (np.array(part.tolist()) for part in one)
+        fixed, wrench, command = self.fixed[0], self.wrench[0], self.command[0]
         if forced := ', '.join(compress(self.robot.joints, np.isfinite(fixed))):
             values['forced joints'] = forced
         if wrench.any():
@@ -145,53 +145,41 @@ class Simulation:
         commanded = np.isfinite(command).all()
         return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
-    def _move(self) -> None:
-        self._there = self._body if self._device is None else moved(self._body, self._put)
-
     def _advance(self, h: float) -> None:
-        # Others may have assigned them.
-        command, wrench, fixed = map(self._put, (self.command, self.wrench, self.fixed))
-        wrench = wrench if wrench.any() else None
-        fixed = fixed if library(fixed).isfinite(fixed).any() else None
+        # Others may have assigned them, and compiled code is for arrays of one kind.
+        command, wrench, fixed = (
+            np.array(part, float, order='C') for part in (self.command, self.wrench, self.fixed)
+        )
+        count = len(command)
+        chunk = CHUNK if self._device is None else -(-count // (os.cpu_count() or 1))
+        if count <= chunk:
+            self.state = self._body.step(self.state, command, h, wrench, fixed)
+            return
 
         def advance(rows: slice) -> ArmState:
             state = ArmState(*(part[rows] for part in self.state))
-            pushed, forced = (None if part is None else part[rows] for part in (wrench, fixed))
-            return self._there.step(state, command[rows], h, pushed, forced)
+            return self._body.step(state, command[rows], h, wrench[rows], fixed[rows])
 
-        count = len(command)
-        if count <= CHUNK or self._device is not None:
-            self.state = advance(slice(count))
-        else:
-            pieces = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
-            arms = on_all_cores(advance, pieces)
-            self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
+        pieces = [slice(first, first + chunk) for first in range(0, count, chunk)]
+        arms = on_all_cores(advance, pieces)
+        self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
 
 
-def _tensors(device: str, preset: str) -> Callable[[Any], Any]:
-    """Return what puts an array on a device of torch."""
-    if not preset_named(preset).equilibrium:
-        told = f'preset {preset!r} simulates one arm after the other, and on no device'
-        raise MusculoskeletalError(f'{told}; given: {device!r}. Legal there: default')
+def _there(mae: Mae, device: str) -> Any:
+    """Return a network whose lengths are computed on a device of torch."""
     # Only here: a node that simulates one arm does without torch.
-    import torch
-
+    from musculoskeletal_ae.mae.network import TorchLengths
     from musculoskeletal_ae.mae.training import check_device
 
     check_device(device)
-
-    def put(array: Any) -> Any:
-        is_tensor = isinstance(array, torch.Tensor)
-        return array.to(device) if is_tensor else torch.tensor(array, device=device)
-
-    return put
+    return TorchLengths(mae, device)
 
 
 def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:
     """Return function(piece) of each piece, in order; the function may not wait for others.
 
-    numpy lets go of Python's lock while it computes, so threads suffice. BLAS would also like to
-    use all cores for every product, and the two together are slower than either.
+    Compiled code and numpy let go of Python's lock while they compute, so threads suffice. BLAS
+    would also like to use all cores for every product, and the two together are slower than either.
     """
     pool, libraries = _cores()
     with libraries.limit(limits=1, user_api='blas'):

@@ -55,10 +55,9 @@ def test_each_limb_of_a_body_has_slopes_of_its_own():
 
 
 def test_modules_wind_at_a_limited_speed_and_never_far_beyond_what_counts():
-    followed = np.array([[0.0, 0.0, 0.0]])
-    command = np.array([[0.5, -0.5, 1e-4]])
-    length = np.zeros((1, 3))
-    np.testing.assert_allclose(follow(command, followed, length, 0.05, 0.01), [[0.01, -0.01, 1e-4]])
-    for _ in range(100):
-        followed = follow(command, followed, length, 0.05, 0.01)
-    np.testing.assert_allclose(followed, [[0.01, -0.05, 1e-4]])
+    for command, once, at_last in ((0.5, 0.01, 0.01), (-0.5, -0.01, -0.05), (1e-4, 1e-4, 1e-4)):
+        followed = follow(command, 0.0, 0.0, 0.05, 0.01)
+        assert followed == once
+        for _ in range(100):
+            followed = follow(command, followed, 0.0, 0.05, 0.01)
+        assert followed == at_last
