@@ -60,7 +60,10 @@ class Layout:
 
 
 class Smooth(NamedTuple):
-    """ψ of one muscle: K random Fourier features, in the F directions in which they vary."""
+    """ψ of one muscle: K random Fourier features, in the F directions in which they vary.
+
+    In single precision, in which cosines take a seventh of the time.
+    """
 
     frequency: Array  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
     phase: Array  # (K,)
@@ -72,24 +75,28 @@ class Smooth(NamedTuple):
         count = FEATURES if crossed.any() else 0
         frequency = rng.normal(0.0, 1.0, (count, robot.joint_count))
         frequency = frequency * crossed / (WIDTH * (robot.upper - robot.lower))
-        every = cls(frequency, rng.uniform(0.0, 2.0 * np.pi, count), np.eye(count))
+        phase = rng.uniform(0.0, 2.0 * np.pi, count)
+        every = cls(*(part.astype(np.float32) for part in (frequency, phase, np.eye(count))))
         values = every.at(theta)
         power, basis = np.linalg.eigh(values.T @ values)
-        return every._replace(basis=basis[:, power.cumsum() > LEFT_OUT * power.sum()])
+        kept = basis[:, power.cumsum() > LEFT_OUT * power.sum()]
+        return every._replace(basis=kept.astype(np.float32))
 
     def at(self, theta: Array) -> Array:
         """Return ψ(θ) − ψ(0), shape (N, F)."""
-        values = np.cos(theta @ self.frequency.T + self.phase) - np.cos(self.phase)
-        return values @ self._scaled
+        angles = theta @ self.frequency.T + self.phase
+        values = np.cos(angles.astype(np.float32)) - np.cos(self.phase)
+        return (values @ self._scaled).astype(float)
 
     def slope(self, theta: Array, joints: Ints) -> Array:
         """Return ∂ψ/∂θ of some joints [1/rad or 1/m], shape (joints, N, F)."""
-        values = -np.sin(theta @ self.frequency.T + self.phase)
-        return (values * self.frequency.T[joints, None]) @ self._scaled
+        angles = theta @ self.frequency.T + self.phase
+        values = -np.sin(angles.astype(np.float32)) * self.frequency.T[joints, None]
+        return values @ self._scaled
 
     @property
     def _scaled(self) -> Array:
-        return np.sqrt(2.0 / max(1, len(self.phase))) * self.basis
+        return np.float32(np.sqrt(2.0 / max(1, len(self.phase)))) * self.basis
 
 
 class Poses(NamedTuple):
@@ -122,9 +129,10 @@ class CorrectedBody:
             points = np.append(routes.first[segments], routes.second[segments[-1]])
             self.layouts.append(Layout(points, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
-        #: where a fit starts: zeros of the joint sensors [rad], θ (D,) of samples by their lengths
+        #: where a fit starts: zeros of the joint sensors [rad]; θ (D,) of samples by their lengths,
+        #: with a row of `postures.Bent`
         self.zero = np.zeros(robot.joint_count)
-        self.found: dict[bytes, Array] = {}
+        self.found: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
         """Return the body of one group, with the parameters of its muscles."""
