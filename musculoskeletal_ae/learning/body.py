@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints, Singles
 from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.postures import FIRST_NOISE, fit_jointly, student
 from musculoskeletal_ae.learning.samples import Observations
@@ -65,9 +65,9 @@ class Smooth(NamedTuple):
     In single precision, in which cosines take a seventh of the time.
     """
 
-    frequency: Array  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
-    phase: Array  # (K,)
-    basis: Array  # (K, F)
+    frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
+    phase: Singles  # (K,)
+    basis: Singles  # (K, F)
 
     @classmethod
     def drawn(cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator) -> Smooth:
@@ -88,15 +88,16 @@ class Smooth(NamedTuple):
         values = np.cos(angles.astype(np.float32)) - np.cos(self.phase)
         return (values @ self._scaled).astype(float)
 
-    def slope(self, theta: Array, joints: Ints) -> Array:
+    def slope(self, theta: Array, joints: Ints) -> Singles:
         """Return ∂ψ/∂θ of some joints [1/rad or 1/m], shape (joints, N, F)."""
         angles = theta @ self.frequency.T + self.phase
         values = -np.sin(angles.astype(np.float32)) * self.frequency.T[joints, None]
         return values @ self._scaled
 
     @property
-    def _scaled(self) -> Array:
-        return np.float32(np.sqrt(2.0 / max(1, len(self.phase)))) * self.basis
+    def _scaled(self) -> Singles:
+        scaled: Singles = np.float32(np.sqrt(2.0 / max(1, len(self.phase)))) * self.basis
+        return scaled
 
 
 class Poses(NamedTuple):

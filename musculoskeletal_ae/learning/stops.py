@@ -42,7 +42,8 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
     what counts as a radian of each joint.
     """
     theta, lower, upper = (read / radian).T, lower / radian, upper / radian
-    elsewhere = (np.abs(theta[:, None] - theta[:, :, None]) > ELSEWHERE).any(axis=0)
+    apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
+    elsewhere: Bools = np.logical_or.reduce(apart > ELSEWHERE)
     found = [_zero(*each, elsewhere) for each in zip(theta, lower.tolist(), upper.tolist())]
     zero, spread = np.reshape(found, (-1, 2)).T
     return zero * radian, np.hypot(spread, STOP) * radian
