@@ -183,7 +183,8 @@ def _spread_out(theta: Array, count: int) -> Array:
     share = theta / (np.ptp(theta, axis=0) + 1e-9)
     distance, chosen = np.full(len(theta), np.inf), [0]
     for _ in range(min(count, len(theta)) - 1):
-        distance = np.minimum(distance, np.square(share - share[chosen[-1]]).sum(axis=1))
+        away = share - share[chosen[-1]]
+        distance = np.minimum(distance, np.einsum('nd,nd->n', away, away))
         chosen.append(int(distance.argmax()))
     return theta[chosen]
 

@@ -78,6 +78,18 @@ class _Rows(NamedTuple):
     prior: Array  # (W,)
 
 
+class Bent(NamedTuple):
+    """Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
+
+    theta: Array  # where it was taken last [rad], (N, D)
+    stiffness: Array  # [N·m/rad], (N, D, D)
+
+    @classmethod
+    def unknown(cls, count: int, places: int) -> Bent:
+        """Return that of postures it has never been taken of."""
+        return cls(np.full((count, places), np.nan), np.zeros((count, places, places)))
+
+
 class _GroupFit:
     """Rounds of Gauss–Newton on the joints and muscles of one group."""
 
@@ -90,7 +102,9 @@ class _GroupFit:
         mean: list[Array],
         spread: list[Array],
         least_noise: float,
+        bent: Bent,
     ) -> None:
+        self._bent, self._bend = bent, bent.stiffness[:, joints[:, None], joints]
         self._kinematics, self._joints = body.robot.kinematics, joints  # of the whole body
         self._body, self._seen = body.limb(joints, muscles), seen.limb(joints, muscles)
         self._mean = np.concatenate([mean[m] for m in muscles])
@@ -122,8 +136,6 @@ class _GroupFit:
         self._unread = np.maximum(1.0, (~self._own).sum(axis=0) / ALIKE)
         self._near = self._radian * np.where(self._own, 2.0 * ZERO, NEAR_STOP)
         self._at = np.full(self._own.shape, np.nan)  # the stops that joints lean on [rad]
-        self._bent_at = self._at.copy()  # where `_bend` was taken last [rad]
-        self._bend = np.empty((*self._own.shape, len(joints)))  # Σ T ∂²l/∂θ² [N·m/rad]
 
     # -- one point ------------------------------------------------------------------------------
 
@@ -239,79 +251,89 @@ class _GroupFit:
 
     # -- one step -------------------------------------------------------------------------------
 
-    def system(self, rows: _Rows, theta: Array, zero: Array) -> tuple[Array, ...]:
-        """Return the normal equations: of θ, mixed, of w and z; their right sides."""
+    def system(self, rows: _Rows, theta: Array) -> tuple[Array, ...]:
+        """Return the normal equations: of θ, mixed, of w and z."""
         joints, (count, places), size = self._joints, self._seen.theta.shape, len(self._mean)
         stiffness = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
         stiffness = stiffness[:, joints[:, None], joints]
         stiffness += self._bend_stiffness(theta[:, joints])
+        self._stiffness = stiffness
         a, b, slope = self._by_length, self._by_torque, rows.muscle_jacobian
         turned, e = rows.gravity_by_posture, self._by_gravity
         inner = np.einsum('nmi,nm,nmj->nij', slope, a, slope)
         inner += np.einsum('nki,nk,nkj->nij', stiffness, b, stiffness)
         inner += np.einsum('nki,nk,nkj->nij', turned, e, turned)
-        stop, by_stop = self._stops(theta)
+        _, by_stop = self._stops(theta)
         diagonal = self._by_angle + by_stop + SMALL / (STOP * self._radian) ** 2
         inner += diagonal[:, :, None] * np.eye(places)
-        pulled = np.einsum('nmi,nm->ni', slope, a * rows.length)
-        pulled += np.einsum('nki,nk->ni', stiffness, b * rows.torque)
-        pulled += np.einsum('nki,nk->ni', turned, e * rows.gravity)
-        pulled += self._by_angle * rows.angle
-        pulled += by_stop * stop
 
         outer = np.zeros((size + places, size + places))
-        right = np.zeros(size + places)
         mixed = np.zeros((count, places, size + places))
         by_torque = rows.torque_by_body
         for j, acting in enumerate(self._acting):
             weighted = by_torque[:, j, acting] * np.sqrt(b[:, j, None])
             outer[np.ix_(acting, acting)] += weighted.T @ weighted
-            right[acting] += weighted.T @ (np.sqrt(b) * rows.torque)[:, j]
         mixed[:, :, :size] = stiffness.swapaxes(1, 2) @ (b[:, :, None] * by_torque)
         self.curvature = []
         for i, (column, by_body) in enumerate(zip(self._columns, rows.by_body)):
             weighted = by_body * a[:, i, None]
             self.curvature.append(weighted.T @ by_body)
             outer[column, column] += self.curvature[-1]
-            right[column] += weighted.T @ rows.length[:, i]
             mixed[:, :, column] += slope[:, i, :, None] * weighted[:, None]
         own = self._by_angle * self._own
         zeros = size + np.arange(places)
         mixed[:, np.arange(places), zeros] = own
         outer[zeros, zeros] = own.sum(axis=0) + self._zero_precision
-        right[zeros] = (own * rows.angle).sum(axis=0) + self._zero_precision * (self._zero - zero)
         outer[np.arange(size), np.arange(size)] += self._precision
-        right[:size] += self._precision * rows.prior
 
         self.leverage = np.einsum('nmi,nij,nmj->nm', slope, np.linalg.inv(inner), slope) * a
-        return inner, mixed, outer, pulled, right
+        return inner, mixed, outer
+
+    def right_sides(self, rows: _Rows, theta: Array, zero: Array) -> tuple[Array, Array]:
+        """Return those of the normal equations: of θ (N, D), of w and z."""
+        length, torque = self._by_length * rows.length, self._by_torque * rows.torque
+        stop, by_stop = self._stops(theta)
+        pulled = np.einsum('nmi,nm->ni', rows.muscle_jacobian, length)
+        pulled += np.einsum('nki,nk->ni', self._stiffness, torque)
+        pulled += np.einsum('nki,nk->ni', rows.gravity_by_posture, self._by_gravity * rows.gravity)
+        pulled += self._by_angle * rows.angle + by_stop * stop
+        by_body = [at.T @ pull for at, pull in zip(rows.by_body, length.T)]
+        right = np.concatenate(by_body) + self._precision * rows.prior
+        right += np.tensordot(torque, rows.torque_by_body, 2)
+        angle = (self._by_angle * self._own * rows.angle).sum(axis=0)
+        return pulled, np.append(right, angle + self._zero_precision * (self._zero - zero))
 
     def _bend_stiffness(self, own: Array) -> Array:
         """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
-        moved = ~(np.abs(own - self._bent_at) < BENT * self._radian).all(axis=1)
+        at, joints = self._bent.theta[:, self._joints], self._joints
+        moved = np.flatnonzero(~(np.abs(own - at) < BENT * self._radian).all(axis=1))
         bend = muscle_hessian(self._body.robot.routes.muscle_jacobian, own[moved])
         self._bend[moved] = np.einsum('nm,nmij->nij', self._seen.tension[moved], bend)
-        self._bent_at[moved] = own[moved]
+        self._bent.theta[np.ix_(moved, joints)] = own[moved]
+        self._bent.stiffness[np.ix_(moved, joints, joints)] = self._bend[moved]
         return self._bend
 
-    def solve(self, system: tuple[Array, ...], damping: float = 0.0) -> tuple[Array, ...]:
-        """Return how w, θ and z change; note the root of the equations of w and z.
+    def factor(self, system: tuple[Array, ...], damping: float = 0.0) -> None:
+        """Prepare to solve; note the root of the equations of w and z.
 
         The damping counts steps in units of what is expected: s of w and z, `EXPECTED` of θ.
         """
-        inner, mixed, outer, pulled, right = system
-        places = pulled.shape[1]
-        size = len(right) - places
+        inner, mixed, outer = system
         usual = np.append(self._precision, self._zero_precision)
         step = damping / (EXPECTED * self._radian) ** 2
-        inverse = np.linalg.inv(np.linalg.cholesky(inner + np.diag(step)))  # products are cheaper
-        reduced, last = inverse @ mixed, (inverse @ pulled[:, :, None])[:, :, 0]
-        tall = reduced.reshape(-1, len(right))
-        schur = outer + np.diag(SMALL + damping * usual) - tall.T @ tall
-        self.root = cholesky(schur)
-        solved = cho_solve((self.root, False), right - tall.T @ last.ravel())
-        posture = (inverse.swapaxes(1, 2) @ (last - reduced @ solved)[:, :, None])[:, :, 0]
-        return solved[:size], posture, solved[size:]
+        # Products with the inverse are cheaper.
+        self._inverse = np.linalg.inv(np.linalg.cholesky(inner + np.diag(step)))
+        self._reduced = self._inverse @ mixed
+        tall = self._reduced.reshape(-1, len(outer))
+        self.root = cholesky(outer + np.diag(SMALL + damping * usual) - tall.T @ tall)
+
+    def solve(self, pulled: Array, right: Array) -> tuple[Array, Array, float]:
+        """Return how θ changes, and w with z; and the decrease of cost that is expected."""
+        inverse, reduced = self._inverse, self._reduced
+        last = (inverse @ pulled[:, :, None])[:, :, 0]
+        change = cho_solve((self.root, False), right - np.tensordot(last, reduced, 2))
+        turn = (inverse.swapaxes(1, 2) @ (last - reduced @ change)[:, :, None])[:, :, 0]
+        return turn, change, float(change @ right + (turn * pulled).sum())
 
     def determined(self) -> Array:
         """Return how many unknowns each muscle's lengths pin down, (M,)."""
@@ -325,9 +347,13 @@ class _GroupFit:
         """Bring θ (N, D) and zeros (D,) of all joints in line, in place; return the parameters."""
         body, joints = self._body, self._joints
         rows, determined, level = self.rows(theta, zero[joints]), np.zeros(len(self.noise)), 0
-        for _ in range(ROUNDS):
+        for n in range(ROUNDS):
             self.weigh(rows, theta, determined)
-            system = self.system(rows, theta, zero[joints])
+            if n and not level:  # by the last round's equations, which hardly differ
+                *_, expected = self.solve(*self.right_sides(rows, theta, zero[joints]))
+                if expected < self._enough:
+                    break
+            system = self.system(rows, theta)
             determined = self.determined()
             rows, level, gained = self._step(rows, system, theta, zero, max(0, level - 1))
             if gained < self._enough:
@@ -336,7 +362,7 @@ class _GroupFit:
         if level or (self._unread > 1.0).any():
             self._by_torque /= self._unread
             self._repeated *= self._unread
-            self.solve(self.system(rows, theta, zero[joints]))
+            self.factor(self.system(rows, theta))
         for i in np.flatnonzero((self._known == 0.0).any(axis=0)):
             # A muscle that is learned anew is trusted no more than it is known.
             wide = np.zeros((len(self.root), len(theta)))
@@ -355,16 +381,15 @@ class _GroupFit:
         body, joints = self._body, self._joints
         before = self.cost(rows, theta, zero[joints])
         old = body.parameters, theta.copy(), zero.copy()
-        *_, pulled, right = system
+        right_sides = self.right_sides(rows, theta, zero[joints])
         for level in range(first, len(DAMPING)):
-            change, turn, shift = self.solve(system, DAMPING[level])
-            expected = np.append(change, shift) @ right + (turn * pulled).sum()
+            self.factor(system, DAMPING[level])
+            turn, change, expected = self.solve(*right_sides)
             if expected < self._enough:
                 break
-            steps = (change[column] for column in self._columns)
-            body.parameters = [at + step for at, step in zip(old[0], steps)]
+            body.parameters = [at + change[own] for at, own in zip(old[0], self._columns)]
             theta[:, joints] = old[1][:, joints] + turn
-            zero[joints] = old[2][joints] + shift
+            zero[joints] = old[2][joints] + change[len(self._mean) :]
             there = self.rows(theta, zero[joints])
             now = self.cost(there, theta, zero[joints])
             if now <= before:
@@ -392,19 +417,21 @@ def fit_jointly(
     """
     own, zero = np.isfinite(seen.theta) & (seen.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in seen.length]
+    bent = Bent.unknown(*theta.shape)
     for n, sample in enumerate(samples):
-        theta[n] = body.found.get(sample, theta[n])
+        if sample in body.found:
+            theta[n], bent.theta[n], bent.stiffness[n] = body.found[sample]
     weight = np.zeros_like(seen.length)
     noise, root = np.empty(seen.length.shape[1]), []
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
-        fit = _GroupFit(body, seen, joints, muscles, mean, spread, least_noise)
+        fit = _GroupFit(body, seen, joints, muscles, mean, spread, least_noise, bent)
         fitted = fit.run(theta, zero)
         for m, parameters in zip(muscles, fitted):
             body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, fit.root))
-    body.found = dict(zip(samples, theta, strict=True))
+    body.found = dict(zip(samples, zip(theta, *bent), strict=True))
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
     read = np.where(np.isnan(seen.theta), theta, seen.theta - own * zero)
     (length,) = body.lengths(read, seen.tension, seen.direction)

@@ -16,10 +16,11 @@ normal distribution), and limits may be no stops: then no reading says anything.
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.special import logsumexp
+import math
 
-from musculoskeletal_ae.arrays import Array
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
 
 # Where a joint slides, [rad] below are times RACK [m].
 ZERO, ZEROED = np.deg2rad(2.0), 0.003  # spread of zeros that are set roughly, or well [rad]
@@ -40,14 +41,16 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
     From rests as they were `read` (N, D), NaN where nothing was, limits (D,), and `radian` (D,),
     what counts as a radian of each joint.
     """
-    theta, lower, upper = read / radian, lower / radian, upper / radian
-    found = [_zero(theta, j, lower[j], upper[j]) for j in range(len(lower))]
+    theta, lower, upper = (read / radian).T, lower / radian, upper / radian
+    apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
+    elsewhere: Bools = np.logical_or.reduce(apart > ELSEWHERE)
+    found = [_zero(*each, elsewhere) for each in zip(theta, lower.tolist(), upper.tolist())]
     zero, spread = np.reshape(found, (-1, 2)).T
     return zero * radian, np.hypot(spread, STOP) * radian
 
 
-def _zero(theta: Array, j: int, lower: float, upper: float) -> tuple[float, float]:
-    own = _different(theta, j)
+def _zero(own: Array, lower: float, upper: float, elsewhere: Bools) -> tuple[float, float]:
+    own = _different(own, elsewhere)
     stops = _at_stop(own - lower, upper - lower) + _at_stop(upper - own, upper - lower)[::-1]
     log = np.logaddexp(np.log(1.0 - NO_STOPS) + stops, np.log(NO_STOPS))
     weight = np.exp(log - log.max()) * (_normal(ZEROS, ZERO) + _normal(ZEROS, ZEROED))
@@ -63,39 +66,37 @@ def _at_stop(within: Array, span: float) -> Array:
     Beside a density that is even everywhere, as where limits stop nothing; `span` is the joint's
     range [rad].
     """
-    distance = within[within < NEAR, None] - ZEROS
-    inside = distance > 0.0
-    even = np.where(inside, 1.0, BEYOND)
-    ways = [np.log(NOT_REACHED) + np.log(even).sum(axis=0)]
+    single = np.float32  # in which logarithms take a fraction of the time
+    distance = (within[within < NEAR, None] - ZEROS).astype(single)
+    even, wide = (np.where(distance > 0.0, single(1.0), single(x)) for x in (BEYOND, GIVE))
+    ways = [np.log(NOT_REACHED) + np.log(even).sum(axis=0, dtype=float)]
     for width in WIDTHS:
         mean = 0.5 * (1.0 + GIVE) * width
-        pile = span * _normal(distance / np.where(inside, width, GIVE * width), 1.0) / mean
+        pile = span / mean * _normal(distance / (width * wide), 1.0)
         for share in SHARES:
-            log = np.log((1.0 - share) * even + share * pile).sum(axis=0)
+            log = np.log((1.0 - share) * even + share * pile).sum(axis=0, dtype=float)
             log += (len(within) - len(distance)) * np.log(1.0 - share)
             ways.append(log + np.log((1.0 - NOT_REACHED) / (len(WIDTHS) * len(SHARES))))
-    total: Array = logsumexp(ways, axis=0)
+    total: Array = np.logaddexp.reduce(ways)
     return total
 
 
-def _different(theta: Array, j: int) -> Array:
-    """Return readings of joint j, of rests that it moved to, one of many in one posture.
+def _different(own: Array, elsewhere: Bools) -> Array:
+    """Return readings of a joint (N,), of rests that it moved to, one of many in one posture.
 
-    A parked joint, or an arm that is commanded to one posture again, is none that is stopped.
+    A parked joint, or an arm that is commanded to one posture again, is none that is stopped;
+    `elsewhere` says of which two rests the postures differ, (N, N).
     """
-    theta = theta[np.isfinite(theta[:, j])]
-    theta = theta[np.abs(np.diff(theta[:, j], prepend=np.inf)) > SAME]
-    own, others = theta[:, j], np.delete(theta, j, axis=1)
-    kept: list[int] = []
-    for n in range(len(own)):
-        alike = np.abs(own[kept] - own[n]) < SAME
-        alike &= ~(np.abs(others[kept] - others[n]) > ELSEWHERE).any(axis=1)
-        if not alike.any():
-            kept.append(n)
-    readings: Array = own[kept]
-    return readings
+    read = np.flatnonzero(np.isfinite(own))
+    moved = read[np.abs(np.diff(own[read], prepend=np.inf)) > SAME]
+    own = own[moved]
+    alike = (np.abs(own[:, None] - own) < SAME) & ~elsewhere[np.ix_(moved, moved)]
+    kept = np.ones(len(own), dtype=bool)
+    for n in np.flatnonzero(np.tril(alike, -1).any(axis=1)):
+        kept[n] = not (alike[n, :n] & kept[:n]).any()
+    return own[kept]
 
 
 def _normal(x: Array, sigma: float) -> Array:
-    density: Array = np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+    density: Array = np.exp(-0.5 * (x / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
     return density

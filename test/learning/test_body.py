@@ -60,11 +60,11 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
 
 @pytest.mark.parametrize('joint', range(2))
 def test_the_slope_of_the_smooth_rest_is_its_derivative(other_body, arm26, joint):
-    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
+    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-2 * np.eye(2)[joint]
     for smooth in other_body.smooth:
         (slope,) = smooth.slope(theta, np.array([joint]))
         difference = smooth.at(theta + step) - smooth.at(theta - step)
-        np.testing.assert_allclose(slope, difference / 2e-6, atol=1e-7)
+        np.testing.assert_allclose(slope, difference / 2e-2, atol=1e-3 * np.abs(slope).max())
 
 
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):

@@ -13,7 +13,7 @@ from robots import write_robot
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.learning.body import PRIOR, CorrectedBody, fit_body
-from musculoskeletal_ae.learning.postures import _GroupFit
+from musculoskeletal_ae.learning.postures import Bent, _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
 from musculoskeletal_ae.robot.robot import Robot
@@ -146,7 +146,7 @@ def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
     joints, muscles = np.arange(2), np.arange(6)
     mean = [np.zeros(layout.size) for layout in body.layouts]
     spread = [np.ones(layout.size) for layout in body.layouts]
-    fit = _GroupFit(body, part, joints, muscles, mean, spread, 3e-4)
+    fit = _GroupFit(body, part, joints, muscles, mean, spread, 3e-4, Bent.unknown(8, 2))
     zero, step = np.zeros(2), 1e-6
     rows = fit.rows(part.theta, zero)
     column = 0
@@ -168,7 +168,8 @@ def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
 def test_a_joint_leans_on_a_stop_while_it_is_near_and_pushed(arm26, seen):
     part, body, upper = blind(seen[np.arange(8)]), CorrectedBody(arm26), arm26.upper
     means, spreads = zip(*((PRIOR.mean(o), PRIOR.spread(o)) for o in body.layouts))
-    fit = _GroupFit(body, part, np.arange(2), np.arange(6), [*means], [*spreads], 3e-4)
+    prior, bent = ([*means], [*spreads], 3e-4), Bent.unknown(8, 2)
+    fit = _GroupFit(body, part, np.arange(2), np.arange(6), *prior, bent)
     theta = np.tile(0.5 * (arm26.lower + upper), (8, 1))
     theta[:2, 1] = upper[1] - [0.02, 0.1]
     rows = fit.rows(theta, np.zeros(2))
