@@ -16,16 +16,20 @@ say 'ruff check'
 "$python" -m ruff check . || exit 1
 say 'ruff format --check'
 "$python" -m ruff format --check . || exit 1
-# What numba compiles, here and where it is installed: beside mypy, instead of in the middle of tests.
-compiled='from musculoskeletal_ae.emulator.reality import make_arm
+# What numba and Python compile: beside mypy, instead of in the middle of tests, three times.
+"$python" -c 'from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
-for reality in ("kin", "foreign"): make_arm(Robot.load("arm26"), 0, reality).step(0.001)'
-"$python" -c "$compiled" &
-(cd / && exec "$python" -c "$compiled") &
+from musculoskeletal_ae.simulation.simulation import Simulation
+robot = Robot.load("arm26")
+for reality in ("kin", "foreign"): make_arm(robot, 0, reality).step(0.001)
+Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)' &
 
 say 'mypy'
 "$python" -m mypy || exit 1
-wait
+wait $! || exit 1
+# For the installed package too: it is the same, and numba goes by the time of a source.
+cp -pr musculoskeletal_ae/. "$repository"/install/musculoskeletal_ae/lib/python3*/*/musculoskeletal_ae
 
 # A graph of our own: not the network's, and not that of another run on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
