@@ -133,7 +133,7 @@ class Plausibility:
         wound: By how much a wire may be wound in beyond what the joints allow [m].
         """
         given = (self._unknown if part is None else part for part in (tension, length, temperature))
-        values = np.array([*given]) * self._robot.used
+        values = np.where(self._robot.used, np.array([*given]), np.nan)
         low = self._low.copy()
         low[1] -= wound
         beyond = (values < low) | (values > self._high)
