@@ -86,6 +86,12 @@ class Replay(Node):
 
     def play(self, progress: tqdm, again: bool) -> None:
         """Publish everything, from start to stop; again and again until the process is ended."""
+        self._lap(progress)
+        while again:
+            self._wait(self._stop + LAP_GAP, progress)
+            self._lap(progress)
+
+    def _lap(self, progress: tqdm) -> None:
         progress.reset()
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
@@ -98,10 +104,6 @@ class Replay(Node):
                 self._timeline.catch_up(message.log_time, time.monotonic())
                 self._tick()
                 self._publisher[message.topic].publish(message.data)
-            if again and self._sought is None:
-                self._wait(self._stop + LAP_GAP, progress)
-                progress.reset()
-                self._sought = self._start if self._sought is None else self._sought
 
     def acknowledge(self) -> None:
         """Give reliable readers time to get the last messages."""
