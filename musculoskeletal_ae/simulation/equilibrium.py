@@ -335,15 +335,6 @@ class Slopes:
             raise FloatingPointError('lengths within the joint limits that are not finite')
         self.limbs = tuple(limb.fit(lengths) for limb in self._cubics)
 
-    def __call__(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return G [m/rad] (N, M, D) and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D) at θ, T."""
-        jacobian = np.zeros((*tension.shape, theta.shape[1]))
-        curvature = np.zeros((*theta.shape, theta.shape[1]))
-        for arm in zip(theta, tension, jacobian, curvature, strict=True):
-            for limb in self.limbs:
-                add_slopes(limb, *arm)
-        return jacobian, curvature
-
 
 class Cubics:
     """The cubics of one limb."""

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from robots import write_robot
 from torch.overrides import TorchFunctionMode
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.network import TorchLengths
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -30,26 +34,44 @@ class Devices(TorchFunctionMode):
         return result
 
 
-@pytest.fixture(scope='module', params=['arm26', 'musashi_upper_body'])
-def robot(request):
-    return Robot.load(request.param)
+@pytest.fixture(scope='module', params=['arm26', 'musashi_upper_body', 'slider'])
+def robot(request, tmp_path_factory):
+    if request.param != 'slider':
+        return Robot.load(request.param)
+    # Two groups, one with a joint that slides; a joint that follows another.
+    coupled = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
+    folder = tmp_path_factory.mktemp('slider')
+    return Robot.load(write_robot(folder, slider=True, finger=True, couplings=[coupled]))
 
 
 @pytest.fixture(scope='module')
 def mae(robot):
-    return initial_mae(robot, steps=20).mae
+    touch = TouchStatistics(np.full(robot.muscle_count, 0.15), np.ones(robot.joint_count))
+    return replace(initial_mae(robot, steps=20).mae, touch=touch)
+
+
+def pushed(robot, mae, device):
+    rng = np.random.default_rng(0)
+    arms = Simulation(robot, mae, arms=ARMS, device=device)
+    theta = robot.random_postures(ARMS, rng)
+    tension = rng.uniform(robot.tension.bias, robot.tension.limit, (ARMS, robot.muscle_count))
+    arms.command = mae.lengths(theta, tension)
+    arms.wrench = rng.normal(0.0, 8.0, (ARMS, 6))
+    arms.fixed[0, 0] = 0.1
+    return arms
 
 
 def test_torch_computes_what_numpy_does(robot, mae):
-    one, other = (Simulation(robot, mae, arms=ARMS, device=device) for device in (None, 'cpu'))
-    for arms in (one, other):
-        rng = np.random.default_rng(0)
-        tension = rng.uniform(robot.tension.bias, robot.tension.limit, (ARMS, robot.muscle_count))
-        arms.command = mae.lengths(robot.random_postures(ARMS, rng), tension)
-    for ours, theirs in zip(one.step(0.05), other.step(0.05), strict=True):
-        # Networks are of single precision, and muscles stiff.
-        np.testing.assert_allclose(theirs, ours, rtol=1e-4, atol=1e-2)
-    np.testing.assert_allclose(other.state.theta, one.state.theta, atol=1e-5)
+    one, other = (pushed(robot, mae, device) for device in (None, 'cpu'))
+    for _ in range(3):
+        for ours, theirs in zip(one.step(0.02), other.step(0.02), strict=True):
+            # Networks are of single precision, and muscles stiff.
+            np.testing.assert_allclose(theirs, ours, rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(other.state.theta, one.state.theta, atol=1e-5)
+        assert other.report() == one.report()
+        one.isolate([1])
+        other.isolate([1])
+    assert (other.state.tension[:, 1] == 0.0).all()
 
 
 def test_the_network_is_on_the_device(robot, mae):

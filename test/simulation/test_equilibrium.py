@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.equilibrium import Slopes, follow
+from musculoskeletal_ae.simulation.equilibrium import Slopes, add_slopes, follow
 
 
 class Cubic:
@@ -18,13 +18,23 @@ class Cubic:
         return np.stack([a**3 - a * b + 2.0 * b, a * b * b, 1.0 + a, b**2, a * a * b, b], axis=1)
 
 
+def evaluated(slopes, theta, tension):
+    """Return G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""
+    jacobian = np.zeros((*tension.shape, theta.shape[1]))
+    curvature = np.zeros((*theta.shape, theta.shape[1]))
+    for arm in zip(theta, tension, jacobian, curvature, strict=True):
+        for limb in slopes.limbs:
+            add_slopes(limb, *arm)
+    return jacobian, curvature
+
+
 def test_slopes_are_the_derivatives_of_the_cubic_they_fit():
     robot = Robot.load('arm26')
     theta = robot.random_postures(7, np.random.default_rng(0))
     tension = np.random.default_rng(1).uniform(30.0, 200.0, (7, 6))
     slopes = Slopes(robot)
     slopes.fit(Cubic())
-    jacobian, curvature = slopes(theta, tension)
+    jacobian, curvature = evaluated(slopes, theta, tension)
     a, b = theta.T
     np.testing.assert_allclose(jacobian[:, 0], np.stack([3 * a * a - b, 2.0 - a], 1), atol=1e-8)
     np.testing.assert_allclose(jacobian[:, 1], np.stack([b * b, 2.0 * a * b], 1), atol=1e-8)
@@ -40,7 +50,7 @@ def test_each_limb_of_a_body_has_slopes_of_its_own():
     tension = np.random.default_rng(1).uniform(30.0, 200.0, (5, robot.muscle_count))
     slopes = Slopes(robot)
     slopes.fit(SimpleNamespace(lengths=robot.muscle_lengths))
-    jacobian, curvature = slopes(theta, tension)
+    jacobian, curvature = evaluated(slopes, theta, tension)
     truth = robot.routes.muscle_jacobian(theta)
     off = np.sqrt(np.square(jacobian - truth).mean())
     assert off < 0.1 * np.sqrt(np.square(truth).mean())
@@ -49,7 +59,7 @@ def test_each_limb_of_a_body_has_slopes_of_its_own():
         assert not jacobian[:, limb.muscles][..., others].any()
     step = 1e-6
     for j in range(robot.joint_count):
-        after, _ = slopes(theta + step * np.eye(robot.joint_count)[j], tension)
+        after, _ = evaluated(slopes, theta + step * np.eye(robot.joint_count)[j], tension)
         turned = ((after - jacobian) / step * tension[..., None]).sum(axis=1)
         np.testing.assert_allclose(curvature[:, j], turned, rtol=1e-4, atol=1e-5)
 
