@@ -23,6 +23,7 @@ or a glitch, counts little.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -85,19 +86,18 @@ class Smooth(NamedTuple):
     def at(self, theta: Array) -> Array:
         """Return ψ(θ) − ψ(0), shape (N, F)."""
         angles = theta @ self.frequency.T + self.phase
-        values = np.cos(angles.astype(np.float32)) - np.cos(self.phase)
+        values = np.cos(angles.astype(self.phase.dtype)) - np.cos(self.phase)
         return (values @ self._scaled).astype(float)
 
     def slope(self, theta: Array, joints: Ints) -> Singles:
         """Return ∂ψ/∂θ of some joints [1/rad or 1/m], shape (joints, N, F)."""
         angles = theta @ self.frequency.T + self.phase
-        values = -np.sin(angles.astype(np.float32)) * self.frequency.T[joints, None]
+        values = -np.sin(angles.astype(self.phase.dtype)) * self.frequency.T[joints, None]
         return values @ self._scaled
 
     @property
     def _scaled(self) -> Singles:
-        scaled: Singles = np.float32(np.sqrt(2.0 / max(1, len(self.phase)))) * self.basis
-        return scaled
+        return math.sqrt(2.0 / max(1, len(self.phase))) * self.basis
 
 
 class Poses(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
+from musculoskeletal_ae.learning.body import CorrectedBody, Smooth, fit_body
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -60,13 +60,14 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
 
 @pytest.mark.parametrize('joint', range(2))
 def test_the_slope_of_the_smooth_rest_is_its_derivative(other_body, arm26, joint):
-    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-2 * np.eye(2)[joint]
-    for smooth in other_body.smooth:
+    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
+    for single in other_body.smooth:
+        smooth = Smooth(*(part.astype(float) for part in single))
         (slope,) = smooth.slope(theta, np.array([joint]))
-        # Of single precision: steps so long, and their error taken out to the fourth order.
-        near, far = (smooth.at(theta + s) - smooth.at(theta - s) for s in (step, 2.0 * step))
-        difference = (8.0 * near - far) / 12e-2
-        np.testing.assert_allclose(slope, difference, atol=5e-5 * np.abs(slope).max())
+        difference = smooth.at(theta + step) - smooth.at(theta - step)
+        np.testing.assert_allclose(slope, difference / 2e-6, atol=1e-7)
+        (shipped,) = single.slope(theta, np.array([joint]))
+        np.testing.assert_allclose(shipped, slope, atol=1e-5)
 
 
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):
