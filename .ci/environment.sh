@@ -311,6 +311,8 @@ build_package() {
     <(cut -c 67- "$stamp" | LC_ALL=C sort))" ]; then
     rm -rf "$repository/build/musculoskeletal_ae" "$repository/install/musculoskeletal_ae"
   fi
+  # numba asks only whether a file is the same, not whether what it imports is.
+  find "$repository/musculoskeletal_ae" "$repository/install" -name '*.nb[ci]' -delete 2>/dev/null
   rm -f "$stamp"
   step 'building with colcon' colcon_build || fail "colcon build failed (log: $setup_log)."
   [ -x "$executables/estimator" ] ||

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -22,7 +23,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules, wrapping
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
-from musculoskeletal_ae.emulator.wrapping import Placed, WrappedRoutes
+from musculoskeletal_ae.emulator.wrapping import Placed
+from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -45,6 +47,9 @@ Body = namedtuple(
 )
 #: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
 JointState = namedtuple('JointState', 'q velocity sticking torque')
+#: All that a step reads and writes; `wrench` is the force and torque on the end effector, axes of
+#: the root link, (6,).
+Parts = namedtuple('Parts', 'routes placed body constants muscle joint command wrench')
 
 
 @njit(cache=True)
@@ -70,15 +75,19 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 
 @njit(cache=True)
-def muscle_step(
-    routes: WrappedRoutes, placed: Placed, body: Body, constants: Modules, muscle: MuscleState,
-    joint: JointState, kind: int, command: Command, wrench: Array, acceleration: Array,
-) -> None:  # fmt: skip
-    """Move joints and motors by one STEP and leave the generalised torque in joint.torque.
+def handed(parts: Parts) -> Handle:
+    """Return what a step takes."""
+    return Handle(parts)
 
-    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `wrench` the force and torque on the end
-    effector, axes of the root link, (6,); `acceleration` q̈ from the rigid-body dynamics, (J−1,).
+
+@njit(cache=True)
+def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
+    """Move joints and motors of `Parts` by one STEP; leave the generalised torque in joint.torque.
+
+    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `acceleration` q̈ from the rigid-body dynamics,
+    (J−1,).
     """
+    routes, placed, body, constants, muscle, joint, command, wrench = arm.held
     for i in range(joint.q.shape[0]):
         joint.velocity[i] += STEP * acceleration[i]
         joint.q[i] += STEP * joint.velocity[i]
@@ -149,7 +158,24 @@ class EmulatedArm(modules.Arm):
         self._placed = Placed.empty(true.routes, robot.muscle_count)
         self._joint = JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self._angles, self._rates = self._joint.q, self._joint.velocity
+        self._hand_over()
         self.reset()
+
+    def _hand_over(self) -> None:
+        self._handle = handed(
+            Parts(
+                self.individual.routes, self._placed, self._body, self._wound, self._muscle,
+                self._joint, self._command, self._wrench,
+            )
+        )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Let copies have arrays of their own."""
+        return {**self.__dict__, '_handle': None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._hand_over()
 
     def _constants(self) -> Body:
         robot, true, unit = self.robot, self.individual, self.individual.elastic
@@ -188,10 +214,7 @@ class EmulatedArm(modules.Arm):
             bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
             free = gear.T @ (joint.torque - bias)
             acceleration = gear @ np.linalg.solve(gear.T @ inertia @ gear, free)
-        muscle_step(
-            self.individual.routes, self._placed, self._body, self._wound, self._muscle,
-            joint, self._kind, self._command, self._wrench, acceleration,
-        )  # fmt: skip
+        muscle_step(self._handle, self._kind, acceleration)
 
     def _sensed(self) -> tuple[Array, Array, Array, Array]:
         muscle, true = self._muscle, self.individual

@@ -160,9 +160,11 @@ class ForeignArm(Arm):
         self._memory = wires.Memory(*(np.zeros(muscles) for _ in wires.Memory._fields))
         self._memory = self._memory._replace(slow=np.zeros((muscles, len(wires.TIMES))))
         still = np.zeros(muscles)
+        guided = wires.GuideParts(self._guides, self._muscle.end_tension, self._memory.bend)
+        self._guided = wires.handed(guided)
         body.look(data, 0.5 * (robot.lower + robot.upper))
         self._root = self._root_pose() if file else pin.SE3.Identity()
-        wires.guides_step(self._guides, still, self._memory.bend, 0.0)
+        wires.guides_step(self._guided, 0.0)
         at_zero, bend = body.length_at_zero, self._memory.bend
         theta = robot.random_postures(500, np.random.default_rng(0))
         span = body.absolute_lengths(theta) - at_zero
@@ -171,6 +173,9 @@ class ForeignArm(Arm):
             self.warnings = *routes, *_other_limits(robot, file, model)
         self.wires = wires.make_wires(robot, body.elastic, at_zero, span, bend, draw)
         self._wound = self._modules(span, body.elastic.elongation(robot.tension.max))
+        self._wired = wires.handed(
+            wires.WireParts(self.wires, self._wound, self._muscle, self._memory, self._command)
+        )
         self._draw_sensors()
         self._time, self._steps = 0.0, 0
         self._pull = np.zeros(muscles)
@@ -270,7 +275,7 @@ class ForeignArm(Arm):
         self._time += duration
 
     def _step(self) -> None:
-        model, data, muscle = self._model, self._data, self._muscle
+        model, data = self._model, self._data
         if self.broken:
             return
         mujoco.mj_step1(model, data)
@@ -280,13 +285,9 @@ class ForeignArm(Arm):
             mujoco.mj_step1(model, data)
         self._steps += 1
         if self._steps % GUIDES_EVERY == 0:
-            wires.guides_step(
-                self._guides, muscle.end_tension, self._memory.bend, GUIDES_EVERY * STEP
-            )
-        wires.wires_step(
-            self.wires, self._wound, muscle, self._memory, self._kind, self._command,
-            data.ten_length[self.individual.tendons], self._pull,
-        )  # fmt: skip
+            wires.guides_step(self._guided, GUIDES_EVERY * STEP)
+        absolute = data.ten_length[self.individual.tendons]
+        wires.wires_step(self._wired, self._kind, absolute, self._pull)
         data.ctrl[self._control] = self._pull
         data.qfrc_applied[:] = 0.0
         if self._wrench.any():

@@ -20,7 +20,8 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, Modules, MuscleState
+from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, MuscleState
+from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
 # Chosen, where effects.py has no size.
@@ -166,15 +167,25 @@ def read(wires: Wires, muscle: MuscleState, memory: Memory, command: Command, m:
     memory.cell[m] = load_cell(wires, m, muscle.tension[m], muscle.housing[m])
 
 
+#: All that a step of the wires reads and writes, and one of the guides: tensions at the route
+#: points [N] and bends [rad], (M,).
+WireParts = namedtuple('WireParts', 'wires constants muscle memory command')
+GuideParts = namedtuple('GuideParts', 'guides tension bend')
+
+
 @njit(cache=True)
-def wires_step(
-    wires: Wires, constants: Modules, muscle: MuscleState, memory: Memory, kind: int,
-    command: Command, absolute: Array, control: Array,
-) -> None:  # fmt: skip
+def handed(parts: WireParts | GuideParts) -> Handle:
+    """Return what a step takes."""
+    return Handle(parts)
+
+
+@njit(cache=True)
+def wires_step(arm: Handle, kind: int, absolute: Array, control: Array) -> None:
     """Move the motors by one STEP and leave what the wires pull in `control` [N] (M,), negative.
 
-    `absolute` are the lengths of the routes [m], (M,).
+    The arm is WireParts, `absolute` the lengths of the routes [m], (M,).
     """
+    wires, constants, muscle, memory, command = arm.held
     for m in range(absolute.shape[0]):
         read(wires, muscle, memory, command, m)
         slid = modules.wind(constants, muscle, kind, command, m, memory.reading[m], memory.cell[m])
@@ -203,8 +214,9 @@ def wires_step(
 
 
 @njit(cache=True)
-def guides_step(guides: Guides, tension: Array, bend: Array, duration: float) -> None:
-    """Find by how much the wires are bent [rad] (M,), and let route points give for a while [s]."""
+def guides_step(arm: Handle, duration: float) -> None:
+    """Find by how much the wires of GuideParts are bent; let points give for a while [s]."""
+    guides, tension, bend = arm.held
     line, load, i = np.zeros(3), np.zeros(3), 0
     for m in range(tension.shape[0]):
         bend[m] = 0.0

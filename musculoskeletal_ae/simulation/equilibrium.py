@@ -29,6 +29,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.friction import REVERSAL
+from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
@@ -73,14 +74,23 @@ class Body(NamedTuple):
     viscosity: Array  # B
 
 
-class Limb(NamedTuple):
-    """The cubics of one limb: what `add_slopes` reads."""
+class Limbs(NamedTuple):
+    """The cubics of all limbs, one after the other: what `add_slopes` reads.
 
+    They are numbers in a row, so that the compiled code is the same for any number of limbs.
+    """
+
+    counts: Ints  # D joints and M muscles of each, (limbs, 2)
     joints: Ints  # places in θ
     muscles: Ints  # places in T and l
-    pairs: Ints  # of the basis 1, θ_j, θ_j θ_k: j and k, (pairs, 2)
-    first: Array  # G of each member of the basis, (1 + D + pairs, M D)
-    second: Array  # ∂²l_i/∂θ² of 1 and each θ_j, (M, (1 + D) D²)
+    first: Array  # of each, G (M, D) by each member of the basis 1, θ_j, θ_j θ_k with j ≤ k
+    second: Array  # of each, and each muscle, ∂²l_i/∂θ² (D, D) by 1 and each θ_j
+
+
+@njit(cache=True)
+def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
+    """Return the robot that a step takes."""
+    return Handle((body, tree, limbs))
 
 
 @njit(cache=True)
@@ -102,30 +112,41 @@ def follow(command: float, followed: float, length: float, span: float, most: fl
 
 
 @njit(cache=True)
-def add_slopes(limb: Limb, theta: Array, tension: Array, jacobian: Array, curvature: Array) -> None:
-    """Add a limb's G [m/rad] to (M, D), and its Σ T_i ∂²l_i/∂θ² [N·m/rad] to (D, D)."""
-    joints, muscles, pairs = limb.joints, limb.muscles, limb.pairs
-    count, slope, bend = len(joints), limb.first[0].copy(), np.zeros(limb.second.shape[1])
-    for b in range(1, len(limb.first)):
-        if b <= count:
-            value = theta[joints[b - 1]]
-        else:
-            pair = pairs[b - count - 1]
-            value = theta[joints[pair[0]]] * theta[joints[pair[1]]]
-        for i in range(len(slope)):
-            slope[i] += value * limb.first[b, i]
-    for m in range(len(muscles)):
-        value = tension[muscles[m]]  # not in the loop, which would then be no vector operation
-        for i in range(len(bend)):
-            bend[i] += value * limb.second[m, i]
-    for j in range(count):
-        for m in range(len(muscles)):
-            jacobian[muscles[m], joints[j]] += slope[m * count + j]
-        for k in range(count):
-            value = bend[j * count + k]
-            for b in range(count):
-                value += theta[joints[b]] * bend[((b + 1) * count + j) * count + k]
-            curvature[joints[j], joints[k]] += value
+def add(share: float, row: Array, total: Array) -> None:
+    """Add a multiple of the beginning of a row."""
+    for i in range(len(total)):
+        total[i] += share * row[i]
+
+
+@njit(cache=True)
+def add_slopes(
+    limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
+) -> None:
+    """Add G [m/rad] to (M, D), and Σ T_i ∂²l_i/∂θ² [N·m/rad] to (D, D)."""
+    joints, muscles, first, second = limbs.joints, limbs.muscles, limbs.first, limbs.second
+    for count, lines in limbs.counts:
+        slope, bend = np.zeros(lines * count), np.zeros((1 + count) * count * count)
+        add(1.0, first, slope)
+        first = first[len(slope) :]
+        for j in range(count):
+            add(theta[joints[j]], first, slope)
+            first = first[len(slope) :]
+        for j in range(count):
+            for k in range(j, count):
+                add(theta[joints[j]] * theta[joints[k]], first, slope)
+                first = first[len(slope) :]
+        for m in range(lines):
+            add(tension[muscles[m]], second, bend)
+            second = second[len(bend) :]
+        for j in range(count):
+            for m in range(lines):
+                jacobian[muscles[m], joints[j]] += slope[m * count + j]
+            for k in range(count):
+                value = bend[j * count + k]
+                for b in range(count):
+                    value += theta[joints[b]] * bend[((b + 1) * count + j) * count + k]
+                curvature[joints[j], joints[k]] += value
+        joints, muscles = joints[count:], muscles[lines:]
 
 
 @njit(cache=True, error_model='numpy')
@@ -174,14 +195,15 @@ def turn(
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def advance(
-    body: Body, tree: Tree, limbs: tuple[Limb, ...], state: ArmState, after: ArmState, h: float,
-    passed: Array, length: Array, pulled: Array, command: Array, wrench: Array, fixed: Array,
+    robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, length: Array,
+    pulled: Array, command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
-    """Fill the arms h [s] after a state.
+    """Fill the arms h [s] after a state, of a robot: Body, Tree and Limbs.
 
     Of the network: the lengths at θ and T_end (N, M), and Gᵀ T_end there (N, D). `passed` is what
     friction lets through from the motor to the elastic unit, T_end / T (N, M).
     """
+    body, tree, limbs = robot.held
     muscles, joints = len(body.stiffness), len(body.lower)
     load, push = np.empty(joints), np.empty(joints)
     slope, matrix = np.empty((joints, joints)), np.empty((joints, joints))
@@ -209,8 +231,7 @@ def advance(
             stretch = body.wire_stretch[m] * (body.length_at_zero[m] + length[n, m])
             unit = body.rate[m] * (body.force[m] + max(end[m], 0.0))
             compliance[m] = 1.0 / unit + stretch
-        for limb in limbs:
-            add_slopes(limb, theta, end, jacobian, slope)
+        add_slopes(limbs, theta, end, jacobian, slope)
         for _ in range(ROUNDS):
             matrix[:] = slope
             for d in range(joints):
@@ -287,7 +308,9 @@ class QuasiStatics:
         muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
         joints = robot.lower, robot.upper, self._viscosity
-        self._body = Body(*map(np.array, (*muscles, *units, *joints)))
+        body = Body(*map(np.array, (*muscles, *units, *joints)))
+        self._friction = body.friction
+        self._handle = handed(body, self._tree, self._slopes.limbs)
 
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
@@ -297,14 +320,12 @@ class QuasiStatics:
         A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
         forced to the angles `fixed` (N, D) [rad], nan for a free joint.
         """
-        passed = np.exp(-self._body.friction * state.slid)
+        passed = np.exp(-self._friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
+        pulled = np.ascontiguousarray(pullback(end))  # as of one arm, of many: compiled once
         after = ArmState(*map(np.empty_like, state))
-        advance(
-            self._body, self._tree, self._slopes.limbs, state, after, h,
-            passed, length, pullback(end), command, wrench, fixed,
-        )  # fmt: skip
+        advance(self._handle, state, after, h, passed, length, pulled, command, wrench, fixed)
         return after
 
 
@@ -327,13 +348,16 @@ class Slopes:
         middle = 0.5 * (robot.tension.bias + robot.tension.limit)
         self._tension = np.full((count, robot.muscle_count), middle)
         self._cubics = [Cubics(group, self._postures) for group in robot.groups]
+        places = map(np.concatenate, zip(*robot.groups, strict=True))
+        self._places = np.array([[*map(len, group)] for group in robot.groups]), *places
 
     def fit(self, mae: Mae) -> None:
         """Fit what a network says; a FloatingPointError says that it cannot be fitted."""
         lengths = mae.lengths(self._postures, self._tension)
         if not np.isfinite(lengths).all():
             raise FloatingPointError('lengths within the joint limits that are not finite')
-        self.limbs = tuple(limb.fit(lengths) for limb in self._cubics)
+        fitted = zip(*(limb.fit(lengths) for limb in self._cubics), strict=True)
+        self.limbs = Limbs(*self._places, *map(np.concatenate, fitted))
 
 
 class Cubics:
@@ -341,8 +365,8 @@ class Cubics:
 
     def __init__(self, group: Group, postures: Array) -> None:
         """Prepare to fit to lengths at some postures θ of the body (N, D) [rad]."""
-        self._joints, self._muscles = map(np.array, group)
-        theta, joints = postures[:, self._joints], len(self._joints)
+        self._muscles = np.array(group.muscles)
+        theta, joints = postures[:, np.array(group.joints)], len(group.joints)
         basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
         values = np.stack([theta[:, list(term)].prod(axis=1) for term in basis], axis=1)
         self._inverse = np.linalg.pinv(values)  # (basis, N)
@@ -350,20 +374,12 @@ class Cubics:
         linear = [term for term in basis if len(term) <= 1]
         self._slope = _derivative(basis, quadratic, joints)  # (D, quadratic, basis)
         self._bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
-        self._pairs = np.array([term for term in quadratic if len(term) == 2])
 
-    def fit(self, lengths: Array) -> Limb:
-        """Fit lengths of the body at those postures (N, M) [m]."""
+    def fit(self, lengths: Array) -> tuple[Array, Array]:
+        """Fit lengths of the body at those postures (N, M) [m]; return its part of `Limbs`."""
         cubic = self._inverse @ lengths[:, self._muscles]  # (basis, M)
         first = np.einsum('dqb,bm->qmd', self._slope, cubic)
-        second = np.einsum('elq,qmd->mlde', self._bend, first)
-        return Limb(
-            self._joints,
-            self._muscles,
-            self._pairs,
-            np.ascontiguousarray(first.reshape(len(first), -1)),
-            np.ascontiguousarray(second.reshape(len(second), -1)),
-        )
+        return first.ravel(), np.einsum('elq,qmd->mlde', self._bend, first).ravel()
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:

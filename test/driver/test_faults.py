@@ -287,6 +287,7 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
     driver.listen(2.0)
     # The module of the emulator clips by itself.
     driver.arm._wound = driver.arm._wound._replace(tension_max=np.full(M, 500.0))
+    driver.arm._hand_over()
     driver.in_tension = law(most=60.0, clip=clip)
     verdict = driver.wind((0, BICEPS))
     assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)

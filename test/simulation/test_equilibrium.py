@@ -23,8 +23,7 @@ def evaluated(slopes, theta, tension):
     jacobian = np.zeros((*tension.shape, theta.shape[1]))
     curvature = np.zeros((*theta.shape, theta.shape[1]))
     for arm in zip(theta, tension, jacobian, curvature, strict=True):
-        for limb in slopes.limbs:
-            add_slopes(limb, *arm)
+        add_slopes(slopes.limbs, *arm)
     return jacobian, curvature
 
 
