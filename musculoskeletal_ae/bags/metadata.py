@@ -25,6 +25,7 @@ REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yam
 
 Qos = Mapping[str, Any]  # a profile as rosbag2 writes it in version 9
 
+_Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 _MARK = 'musculoskeletal_ae_unfinished'
 _NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
@@ -173,7 +174,7 @@ def _check(metadata: Metadata) -> None:
 
 def _yaml(value: object) -> str:
     # Builtins are copies, so there are no aliases (&id001), which no one expects in a bag.
-    return str(yaml.safe_dump(to_builtins(value), sort_keys=False))
+    return str(yaml.dump(to_builtins(value), Dumper=_Dumper, sort_keys=False))
 
 
 def _unusable(file: Path, problem: str) -> BagError:
