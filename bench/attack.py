@@ -50,7 +50,7 @@ class Size(NamedTuple):
 
 
 FULL = Size(messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=60)
-QUICK = Size(messages=4000, node_kills=3, learner_kills=0, files=84, episodes=4)
+QUICK = Size(messages=2000, node_kills=2, learner_kills=0, files=42, episodes=2)
 
 
 class Row(NamedTuple):
@@ -164,7 +164,7 @@ def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row
 def main(argv: list[str]) -> int:
     """Attack, and print the table."""
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
-    parser.add_quick('two minutes of it')
+    parser.add_quick('a minute of it')
     parser.add_argument('--messages', type=whole(1, 10_000_000), help='instead of 100 000')
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')

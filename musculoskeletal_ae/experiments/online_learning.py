@@ -162,7 +162,7 @@ def measure(study: Study, seed: int) -> Measured:
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
-    pupil = Learner(study.robot, study.network(None, 'paper'), 'paper', seed)
+    pupil, _ = beginner(study, study.arm(seed), seed, 'paper')
     teach(pupil, zip(*study.stream(seed, 'exploring'), strict=True))
     numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')

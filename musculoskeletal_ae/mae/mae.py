@@ -157,7 +157,13 @@ class Stack(NamedTuple):
         """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
         x, tangent = given.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
+            # One product of all rows: numpy would take each (K, in) by itself, at half the speed.
+            shape = tangent.shape[:-1]
+            if len(shape) > 1:
+                tangent = tangent.reshape(-1, tangent.shape[-1])
             x, tangent = x @ weight, tangent @ weight
+            if len(shape) > 1:
+                tangent = tangent.reshape(*shape, -1)
             if i < len(self.layers) - 1:
                 x, slope = self.activation.with_slope(x, bias)
                 tangent = tangent * slope[..., None, :]
