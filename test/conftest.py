@@ -42,6 +42,13 @@ def alone(tmp_path_factory) -> Callable[[str], AbstractContextManager[Path]]:
     return partial(_alone, tmp_path_factory)
 
 
+@pytest.fixture
+def both_cores(alone) -> Iterator[None]:
+    """Let nobody else start what keeps both cores busy, such as whole systems in real time."""
+    with alone('cores'):
+        yield
+
+
 @pytest.fixture(scope='session')
 def trained_files(alone) -> dict[str, Path]:
     """Return files of briefly trained networks of arm26, by preset, trained once a run."""

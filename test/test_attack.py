@@ -55,6 +55,7 @@ def test_what_is_hostile_can_be_sent_and_told_from_what_is_not():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('both_cores')
 def test_a_quick_attack_breaks_no_promise(trained_file, tmp_path, capsys):
     status = attack.main(['--quick', '--initial', trained_file, '--out', str(tmp_path)])
     assert status == 0, capsys.readouterr().out

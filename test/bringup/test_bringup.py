@@ -24,6 +24,7 @@ from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.usefixtures('both_cores')
 STATUS = re.compile(
     r'^ *\d+ s  error (?P<error>\d+\.\d+) rad  A (?P<a>\d+\.\d+)  '
     r'samples (?P<samples>\d+)  checkpoints (?P<checkpoints>\d+)'
@@ -117,6 +118,8 @@ def test_two_arms_share_a_graph_one_learns_and_ctrl_c_ends_both_cleanly(environm
                 f'{side} to estimate',
                 deadline=5 * DEADLINE,
             )
+        # A test shares the machine with others; a stop would end the exploration.
+        assert graph.set_parameter('/left_arm/controller', 'max_age', 5.0)[0]
         learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
         graph.wait(lambda: len(learned) > 4, 'four updates of the network', 8 * DEADLINE)
         assert ports_in_shared_memory(left) == []
@@ -251,8 +254,7 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
             told.append(line)
             if 'starting controller' in line:
                 break
-        # A test shares the machine with others; a stop would end the exploration.
-        assert graph.set_parameter('controller', 'max_age', 2.0)[0]
+        assert graph.set_parameter('controller', 'max_age', 5.0)[0]  # as above
         learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         graph.wait(lambda: len(learned) > 2, 'two updates of the network', 8 * DEADLINE)
     finally:
