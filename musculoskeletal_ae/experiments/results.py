@@ -92,6 +92,7 @@ def write(
         (folder / 'result.json').write_text(text + '\n', encoding='utf-8')
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
+            figure.set_layout_engine('none')  # it stays where it is now
             # For a paper; without a date, so that the same numbers give the same file.
             vector = (folder / file).with_suffix('.pdf')
             figure.savefig(vector, bbox_inches='tight', metadata={'CreationDate': None})
