@@ -170,11 +170,12 @@ environment_setup $view # installs nothing more without --view
   export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
 use_udp
 
-# One arm to a namespace. The lock is held until the last of what is started here has ended.
+# One arm to a namespace. The lock is held until the last of what is started here has ended, which
+# after Ctrl-C takes a moment.
 in_use=/tmp/musculoskeletal_ae-${ROS_DOMAIN_ID:-0}-${namespace//\//.}.lock
 [ -e "$in_use" ] || (umask 022 && : >>"$in_use") || exit 1
 exec {arm_lock}<"$in_use"
-flock -n "$arm_lock" ||
+flock -w 5 "$arm_lock" ||
   refuse "namespace '/$namespace' is in use by another bringup.sh (ROS_DOMAIN_ID ${ROS_DOMAIN_ID:-0}):\
  stop that one, or give this one a --namespace of its own"
 

@@ -90,6 +90,7 @@ def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(envi
             break
     assert 'training the MAE' in ''.join(told), told
     run.end(signal.SIGINT)
+    assert left_behind(run) == ''
     # Only the description of a robot says which network it needs.
     (robot / 'README.md').write_text('an arm')
     run = bringup(environment, *chosen, '--duration', '8')
