@@ -23,6 +23,8 @@ from torch import Tensor
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.control.methods import first_command, msc_compensation, stiffness_command
+from musculoskeletal_ae.emulator.modules import STEP
+from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states
@@ -253,6 +255,20 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
         *there,
         Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
+        *emulation_rows(robot),
+    ]
+
+
+def emulation_rows(robot: Robot) -> list[Row]:
+    """Return a millisecond of the emulated bodies."""
+    steps = 10
+    return [
+        Row(
+            f'emulated millisecond, body {reality}',
+            partial(make_arm(robot, 0, reality).step, steps * STEP),
+            several=steps,
+        )
+        for reality in (KIN, FOREIGN)
     ]
 
 
