@@ -57,8 +57,8 @@ that was measured (be0daee), on an idle machine of two cores.
 
 `bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound:
 the network's multiply-adds at the rate of this machine's own products of matrices of that size.
-By torch's own estimate, which took {torch_before:.0f} µs before, this machine was {slower:.1f} times as slow
-as that of before: what was measured on one day can be compared, by ratios to torch and to
+By torch's own estimate, which took {torch_before:.0f} µs before, this machine was {slower:.1f} times
+as slow as that of before: compare what was measured on one day, by ratios to torch and to
 "messages alone".
 
 {core}
@@ -216,7 +216,8 @@ def main(argv: list[str]) -> None:
         table, slower = core(robot)
         page = PAGE.format(
             day=date.today().isoformat(), machine=machine(), arm=ARM, core=table,  # noqa: DTZ011
-            torch_before=TORCH_BEFORE, slower=slower, wire=wire(args.robots, args.seconds), start=start, shared=shared,
+            torch_before=TORCH_BEFORE, slower=slower, wire=wire(args.robots, args.seconds),
+            start=start, shared=shared,
             training=training, update=update,
             flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
         )  # fmt: skip
