@@ -57,8 +57,8 @@ that was measured (be0daee), on an idle machine of two cores.
 
 `bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound:
 the network's multiply-adds at the rate of this machine's own products of matrices of that size.
-By torch's own estimate, which took {torch_before:.0f} µs before, this machine was {slower:.1f} times
-as slow as that of before: compare what was measured on one day, by ratios to torch and to
+By torch's own estimate, which took {torch_before:.0f} µs before, this machine was {slower:.1f}
+times as slow as that of before: compare what was measured on one day, by ratios to torch and to
 "messages alone".
 
 {core}
