@@ -21,7 +21,7 @@ import json
 import os
 import subprocess
 import sys
-import tarfile
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
@@ -158,11 +158,11 @@ def _frozen(study: Study, seed: int, folders: list[Path]) -> tuple[list[float | 
     try:
         git = ['git', '-C']
         root = _output([*git, here, 'rev-parse', '--show-toplevel']).decode().strip()
-        archive = _output([*git, root, 'archive', '--format=tar', FROZEN, 'musculoskeletal_ae'])
+        archive = _output([*git, root, 'archive', '--format=zip', FROZEN, 'musculoskeletal_ae'])
     except (OSError, subprocess.CalledProcessError) as error:
         return nothing, f'no frozen learner: commit {FROZEN} is not at hand ({error})'
-    with TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-        tar.extractall(folder, filter='data')
+    with TemporaryDirectory() as folder, zipfile.ZipFile(io.BytesIO(archive)) as files:
+        files.extractall(folder)
         arguments = study.robot.description.directory.resolve(), str(seed), *folders
         try:
             said = _output([sys.executable, '-c', FROZEN_RUN, *arguments], cwd=folder)

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import signal
-import tarfile
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -147,7 +147,7 @@ def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_p
 
 def test_a_frozen_learner_that_fails_costs_its_own_number_only(arm26, tmp_path, monkeypatch):
     archive, output = io.BytesIO(), robustness._output
-    tarfile.open(fileobj=archive, mode='w').close()  # it needs no commit at hand
+    zipfile.ZipFile(archive, 'w').close()  # it needs no commit at hand
 
     def without_git(command, cwd=None):
         return output(command, cwd) if cwd else archive.getvalue()
