@@ -312,7 +312,9 @@ build_package() {
     rm -rf "$repository/build/musculoskeletal_ae" "$repository/install/musculoskeletal_ae"
   fi
   # numba asks only whether a file is the same, not whether what it imports is.
-  find "$repository/musculoskeletal_ae" "$repository/install" -name '*.nb[ci]' -delete 2>/dev/null
+  if [ "$(grep '\.py$' <<<"$now")" != "$(grep '\.py$' "$stamp" 2>/dev/null)" ]; then
+    find "$repository/musculoskeletal_ae" "$repository/install" -name '*.nb[ci]' -delete 2>/dev/null
+  fi
   rm -f "$stamp"
   step 'building with colcon' colcon_build || fail "colcon build failed (log: $setup_log)."
   [ -x "$executables/estimator" ] ||

@@ -255,7 +255,6 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
         *there,
         Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
-        *emulation_rows(robot),
     ]
 
 
@@ -281,6 +280,8 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
     """Return what each step takes."""
     torch.set_num_threads(1)
     one, many = gemm_rate(1), gemm_rate(256)
+    every = mae_rows(robot, preset) + simulation_rows(robot, preset, device)
+    every += emulation_rows(robot)
     return [
         Timed(
             row.name,
@@ -288,7 +289,7 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
             row_time(row, row.torch_eager) if row.torch_eager else 0.0,
             row.products / (one if row.several == 1 else many),
         )
-        for row in mae_rows(robot, preset) + simulation_rows(robot, preset, device)
+        for row in every
     ]
 
 

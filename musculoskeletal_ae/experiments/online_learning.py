@@ -137,11 +137,17 @@ def train_initial(study: Study, preset: str) -> None:
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 
+def pupil(study: Study, seed: int, preset: str) -> Learner:
+    """Return a learner that begins with the initial network."""
+    steps = STEPS // 5 if study.quick else STEPS
+    return Learner(study.robot, study.network(None, preset), preset, seed, steps=steps)
+
+
 def beginner(study: Study, arm: Arm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
-    """Return a learner that begins with the initial network, and the arm that it is to explore."""
-    initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
-    learner = Learner(study.robot, initial, preset, seed, steps=steps)
-    return learner, ClosedLoop(arm, initial, Settings(preset=preset), EXPLORATION_STREAM + seed)
+    """Return a pupil and the arm that it is to explore."""
+    learner = pupil(study, seed, preset)
+    settings = Settings(preset=preset)
+    return learner, ClosedLoop(arm, learner.mae, settings, EXPLORATION_STREAM + seed)
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -162,9 +168,9 @@ def measure(study: Study, seed: int) -> Measured:
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
-    pupil, _ = beginner(study, study.arm(seed), seed, 'paper')
-    teach(pupil, zip(*study.stream(seed, 'exploring'), strict=True))
-    numbers['paper_same_stream_after_rad'] = estimation_error(pupil.mae, held_out)
+    listener = pupil(study, seed, 'paper')
+    teach(listener, zip(*study.stream(seed, 'exploring'), strict=True))
+    numbers['paper_same_stream_after_rad'] = estimation_error(listener.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 

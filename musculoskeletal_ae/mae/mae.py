@@ -62,7 +62,8 @@ class BlockDiagonal:
             x = x[..., self._into]
         parts = [x[..., into] @ block for into, block in self._blocks]
         result: Singles = np.concatenate(parts, axis=-1)
-        return result if self._out is None else result[..., self._out]
+        # Rows stay whole in memory, as after a product with an array; [..., out] would turn them.
+        return result if self._out is None else result.take(self._out, axis=-1)
 
     @cached_property
     def T(self) -> BlockDiagonal:

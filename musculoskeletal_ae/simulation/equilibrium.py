@@ -323,10 +323,9 @@ class QuasiStatics:
         passed = np.exp(-self._friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
-        # Of one arm, many or several limbs arrays lie differently; compiled is for one kind.
-        told = np.ascontiguousarray(length), np.ascontiguousarray(pullback(end))
+        pulled = np.ascontiguousarray(pullback(end))  # as of one arm, of many: compiled once
         after = ArmState(*map(np.empty_like, state))
-        advance(self._handle, state, after, h, passed, *told, command, wrench, fixed)
+        advance(self._handle, state, after, h, passed, length, pulled, command, wrench, fixed)
         return after
 
 

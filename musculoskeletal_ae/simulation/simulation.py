@@ -100,7 +100,7 @@ class Simulation:
         theta = np.clip(theta, robot.lower, robot.upper)
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)
-        length = np.array(self.mae.lengths(theta, tension), order='C')
+        length = np.array(self.mae.lengths(theta, tension))
         nothing, not_slid = np.zeros_like(theta), np.zeros_like(tension)
         self.state = ArmState(theta, tension, length, length, nothing, not_slid)
 
