@@ -83,6 +83,13 @@ def point_of(placed: Placed, joint: int, point: Array) -> Vector:
 
 
 @njit(cache=True)
+def fill(row: Array, values: Vector | Array) -> None:
+    """Fill a row; what numba makes of `row[:] = values` takes it two seconds to compile."""
+    for i in range(len(row)):
+        row[i] = values[i]
+
+
+@njit(cache=True)
 def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
     """Find all places for q (J−1,)."""
     tree, fixed = routes.tree, np.zeros((3, 3))
@@ -102,12 +109,13 @@ def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
         )
         _multiply(placed.rotation[up], tree.rotation[i], fixed)
         _multiply(fixed, turn, placed.rotation[i])
-        placed.axis[i] = turned(fixed, tree.axis[i])
-        placed.translation[i] = point_of(placed, up, tree.translation[i])
+        fill(placed.axis[i], turned(fixed, tree.axis[i]))
+        fill(placed.translation[i], point_of(placed, up, tree.translation[i]))
         if tree.prismatic[i]:
-            placed.translation[i] += placed.axis[i] * q[i - 1]
+            for k in range(3):
+                placed.translation[i, k] += placed.axis[i, k] * q[i - 1]
     for p in range(routes.point.shape[0]):
-        placed.world[p] = point_of(placed, routes.point_joint[p], routes.point[p])
+        fill(placed.world[p], point_of(placed, routes.point_joint[p], routes.point[p]))
     placed.absolute[:] = 0.0
     for s in range(routes.first.shape[0]):
         placed.absolute[routes.muscle[s]] += wrapped_segment(
@@ -124,7 +132,7 @@ def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Ar
     jacobian = np.zeros((*lengths.shape, q.shape[1]))
     for n in range(q.shape[0]):
         place(routes, q[n], placed)
-        lengths[n] = placed.absolute
+        fill(lengths[n], placed.absolute)
         for s in range(routes.first.shape[0]):
             add_pull(routes, s, placed, -1.0, jacobian[n, routes.muscle[s]])
     return lengths, jacobian

@@ -205,8 +205,7 @@ def advance(
     """
     body, tree, limbs = robot.held
     muscles, joints = len(body.stiffness), len(body.lower)
-    load, push = np.empty(joints), np.empty(joints)
-    slope, matrix = np.empty((joints, joints)), np.empty((joints, joints))
+    load, push, slope = np.empty(joints), np.empty(joints), np.empty((joints, joints))
     jacobian, end = np.empty((muscles, joints)), np.empty(muscles)
     compliance, wanted = np.empty(muscles), np.empty(muscles)
     give, soft, lost = np.empty(muscles), np.empty(muscles), np.empty(muscles)
@@ -233,7 +232,7 @@ def advance(
             compliance[m] = 1.0 / unit + stretch
         add_slopes(limbs, theta, end, jacobian, slope)
         for _ in range(ROUNDS):
-            matrix[:] = slope
+            matrix = slope.copy()
             for d in range(joints):
                 push[d] = -(load[d] + pulled[n, d])
                 matrix[d, d] += body.viscosity[d] / h
