@@ -69,7 +69,7 @@ def measure(study: Study, seed: int) -> Measured:
     plan = GraspAndCut(robot, study.held_out_time, seed)
     driven_by = study.network(None, 'default')
     taken = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
-    duration = 20.0 if study.quick else HEALTHY_TIME / len(study.seeds)
+    duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
     stream = HEALTHY_STREAM + seed
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
     plan_idle = GraspAndCut(robot, OFF_TIME, seed, switched_off=True)

@@ -54,7 +54,7 @@ class Study:
     @property
     def held_out_time(self) -> float:
         """Duration of the motion never used for learning [s]."""
-        return 20.0 if self.quick else 300.0
+        return 10.0 if self.quick else 300.0
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
         """Return an individual at rest; without friction it is the same body otherwise."""

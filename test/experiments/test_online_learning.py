@@ -74,7 +74,7 @@ def test_exploration_goes_through_the_controller_with_the_network_being_learned(
 
 def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice):
     (study, _), _ = twice
-    other = record(study.arm(1), study.network(None), HELD_OUT_STREAM, 20.0)
+    other = record(study.arm(1), study.network(None), HELD_OUT_STREAM, study.held_out_time)
     one = study.stream(0, 'held_out')
     # The first ramp starts where each arm hangs; from the second goal on they are one list.
     start = 500
