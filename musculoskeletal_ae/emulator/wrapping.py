@@ -84,7 +84,7 @@ def point_of(placed: Placed, joint: int, point: Array) -> Vector:
 
 @njit(cache=True)
 def fill(row: Array, values: Vector | Array) -> None:
-    """Fill a row; what numba makes of `row[:] = values` takes it two seconds to compile."""
+    """Fill a row; what numba makes of `row[:] = values` takes it seconds to compile."""
     for i in range(len(row)):
         row[i] = values[i]
 

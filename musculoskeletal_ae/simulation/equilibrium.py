@@ -205,7 +205,8 @@ def advance(
     """
     body, tree, limbs = robot.held
     muscles, joints = len(body.stiffness), len(body.lower)
-    load, push, slope = np.empty(joints), np.empty(joints), np.empty((joints, joints))
+    load, push = np.empty(joints), np.empty(joints)
+    slope, matrix = np.empty((joints, joints)), np.empty((joints, joints))
     jacobian, end = np.empty((muscles, joints)), np.empty(muscles)
     compliance, wanted = np.empty(muscles), np.empty(muscles)
     give, soft, lost = np.empty(muscles), np.empty(muscles), np.empty(muscles)
@@ -232,9 +233,10 @@ def advance(
             compliance[m] = 1.0 / unit + stretch
         add_slopes(limbs, theta, end, jacobian, slope)
         for _ in range(ROUNDS):
-            matrix = slope.copy()
             for d in range(joints):
                 push[d] = -(load[d] + pulled[n, d])
+                for e in range(joints):
+                    matrix[d, e] = slope[d, e]
                 matrix[d, d] += body.viscosity[d] / h
             for m in range(muscles):
                 # Where a wire slides, friction is like a stiff spring until it has turned round:
