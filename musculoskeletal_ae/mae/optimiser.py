@@ -14,6 +14,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 MOMENTUM = 0.95
 # Newton–Schulz polynomials that together bring every singular value near 1 in five steps.
@@ -48,14 +49,21 @@ class Optimiser:
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
         others = [p for p in parameters if not muon or p.ndim != 2]
-        self._adam = torch.optim.Adam(others, lr=step_size, fused=True)
+        # torch.optim.Adam would load torch's compiler, which takes a second.
+        zeros = torch.zeros_like
+        self._adam = [(p, zeros(p), zeros(p), p.new_zeros(())) for p in others]
 
     def step(self, scale: float = 1.0) -> None:
         """Use the gradients, with the step sizes multiplied by `scale`, and clear them."""
-        self._adam.param_groups[0]['lr'] = self._step_size * scale
-        self._adam.step()
-        self._adam.zero_grad()
         with torch.no_grad():
+            parameters, first, second, counts = map(list, zip(*self._adam, strict=True))
+            adam(
+                parameters, [p.grad for p in parameters], first, second, [], counts, fused=True,
+                amsgrad=False, beta1=0.9, beta2=0.999, lr=self._step_size * scale,
+                weight_decay=0.0, eps=1e-8, maximize=False,
+            )  # fmt: skip
+            for parameter in parameters:
+                parameter.grad = None
             for matrix, momentum in zip(self._matrices, self._momenta, strict=True):
                 if matrix.grad is None:
                     continue
