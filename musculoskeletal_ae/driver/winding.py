@@ -93,6 +93,7 @@ class Winding:
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # none before l is known
         self._tame_at: Array = np.zeros(robot.muscle_count)  # when each last pulled as asked [s]
+        self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
         self._run = self._sequence()
 
     def step(self, states: Array, now: float) -> Array | None:
@@ -113,9 +114,9 @@ class Winding:
             for pause in (SETTLE, HOLD):
                 self._target[:] = self._mean().length
                 yield from self._wait(pause)
-            held, swing = self._mean(), self._noise()
-            for m in np.flatnonzero(swing > self._tolerance).tolist():
-                self.verdict.failed('hums', m, swing=swing[m])
+            held, self._swing = self._mean(), self._noise()
+            for m in np.flatnonzero(self._swing > self._tolerance).tolist():
+                self.verdict.failed('hums', m, swing=self._swing[m])
             for m in np.flatnonzero(self._off(held)).tolist():
                 self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
             for m in self._muscles:
@@ -178,11 +179,13 @@ class Winding:
     ) -> Generator[None, None, _Reading]:
         """Ask for a level [N], follow the arm as it gives way, and return what is then read.
 
-        It adds to `latency` [s] when it answered, unless it swings too much to tell.
+        It adds to `latency` [s] when it answered, unless noise may hide all that was asked for.
         """
         before = self._mean()
-        noise = self._noise()[m]
-        answer, hidden = self._response[m] + 2.0 * noise, noise > 0.5 * self._tolerance[m]
+        noise = max(self._swing[m], self._noise()[m])
+        answer = self._response[m] + 2.0 * noise
+        # A stiff arm gives way before the next message: one reading must tell.
+        hidden = answer + 3.0 * noise > level - before.demand[m]
         further = (level - self._bias[m]) / self._robot.stiffness[m]
         self._target[m] = before.length[m] - further
         start = last = self._now
