@@ -26,7 +26,7 @@ class Driver:
         self.robot, self.arm = robot, EmulatedArm(robot, seed)
         # Rows (3, M) as published, targets (M,) as taken, period of messages, commands on the way.
         self.publish: Callable = lambda rows: rows
-        self.take: Callable = lambda target, _: target
+        self.take: Callable = lambda target: target
         self.names = robot.joints
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
@@ -37,14 +37,14 @@ class Driver:
         self._target = None
         self._sent = -1.0
 
-    def step(self) -> list[np.ndarray]:
-        """Let 10 ms pass; return what is published then, each (3, M)."""
+    def step(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Let 10 ms pass; return what is published then: each time θ (D,) and rows (3, M)."""
         self.now += PERIOD
         while self._commands and self._commands[0][0] <= self.now:
             self._target = self._commands.popleft()[1]
-        rows = np.stack(self.arm.sense()[1:])
         if self._target is not None:
             if self.in_tension:
+                rows = np.stack(self.arm.sense()[1:])
                 self.arm.command_tension(self.in_tension(self._target, rows))
             else:
                 self.arm.command_length(self._target)
@@ -53,12 +53,11 @@ class Driver:
             return []
         self._sent = self.now
         read = self.arm.faults.delivered(self.arm.sense(), self.now)
-        return [self.publish(np.stack(readings[1:])) for readings in read]
+        return [(each.theta, self.publish(np.stack(each[1:]))) for each in read]
 
     def command(self, target: np.ndarray) -> None:
         """Take a command as it came."""
-        rows = np.stack(self.arm.sense()[1:])
-        self._commands.append((self.now + self.late, self.take(target.copy(), rows)))
+        self._commands.append((self.now + self.late, self.take(target.copy())))
 
     def listen(
         self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
@@ -68,9 +67,9 @@ class Driver:
         for k in range(round(seconds / PERIOD)):
             if moved:
                 self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))
-            for rows in self.step():
+            for theta, rows in self.step():
                 if joints:
-                    listening.joints(joint_state(dict(zip(self.names, self.arm.sense().theta))))
+                    listening.joints(joint_state(dict(zip(self.names, theta))))
                 listening.muscles(array(rows), self.now)
         self.arm.set_wrench(np.zeros(6))
         return listening.verdict()
@@ -81,7 +80,7 @@ class Driver:
         """Return what `Winding` says, besides what was heard before."""
         winding = Winding(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
-            for rows in self.step():
+            for _, rows in self.step():
                 if (target := winding.step(rows, self.now)) is not None:
                     self.command(target)
         return winding.verdict

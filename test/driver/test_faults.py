@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,6 +23,18 @@ ROBOT = Robot.load('arm26')
 LOW = replace(ROBOT.description, tension=TensionRange(*np.outer([30.0, 55.0, 60.0], np.ones(6))))
 M, BICEPS = ROBOT.muscle_count, 4
 BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
+
+
+@cache
+def _settled(seed):
+    driver = Driver(ROBOT, seed)
+    driver.listen(2.0)
+    return driver
+
+
+def settled(seed=0):
+    """Return a driver whose arm has come to rest: a copy of one, since most tests begin there."""
+    return copy.deepcopy(_settled(seed))
 
 
 def rows_in(order):
@@ -61,9 +75,7 @@ def test_a_sound_driver_is_found_sound(seed):
         Driver(ROBOT, seed).listen(joints=False),
     ):
         assert not verdict.faults, str(verdict)
-    driver = Driver(ROBOT, seed)
-    driver.listen(2.0)
-    verdict = driver.wind()
+    verdict = settled(seed).wind()
     assert not verdict.faults, str(verdict)
     told = str(verdict).splitlines()
     for name, line in zip(ROBOT.muscles, told[1:]):
@@ -171,21 +183,21 @@ def spring(target, rows):  # no max(0, …): it lets go where l_target is beyond
     return np.maximum(0.0, BIAS + K * (rows[0] - target))
 
 
-def only_first(target, _):
+def only_first(target):
     return np.where(np.arange(M) == BICEPS, 1.0, target)
 
 
 WOUND = {
-    'exchanged commands': ({'take': lambda t, _: exchanged(t)}, 'order', 'instead'),
+    'exchanged commands': ({'take': exchanged}, 'order', 'instead'),
     'sign of both': (
-        {'publish': flipped, 'take': lambda t, _: -t},
+        {'publish': flipped, 'take': lambda t: -t},
         'sign',
         'a longer l_target winds it in',
     ),
     'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
     'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
-    'command read as mm': ({'take': lambda t, _: t / 1000.0}, 'law', 'command in m'),
+    'command read as mm': ({'take': lambda t: t / 1000.0}, 'law', 'command in m'),
     'dead motor': ({'take': only_first}, 'law', 'does not respond'),
     'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
     'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'is T in N'),
@@ -196,8 +208,7 @@ WOUND = {
 @pytest.mark.parametrize('name', WOUND)
 def test_what_is_wrong_shows_when_a_muscle_is_wound_in(name):
     changes, check, told = WOUND[name]
-    driver = Driver(ROBOT)
-    driver.listen(2.0)
+    driver = settled()
     for attribute, value in changes.items():
         setattr(driver, attribute, value)
     verdict = driver.wind((0, BICEPS))
@@ -206,8 +217,7 @@ def test_what_is_wrong_shows_when_a_muscle_is_wound_in(name):
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
-    driver = Driver(ROBOT)
-    driver.listen(2.0)
+    driver = settled()
     home = driver.arm.sense().length
 
     def mirrored(rows):  # at the length from which it is wound in, so that the law seems to hold
@@ -251,7 +261,7 @@ def test_what_is_wrong_shows_on_a_stiff_robot_too(wrong):
 
 
 def test_a_stiff_robot_that_hums_is_told_so():
-    verdict = wound_in_stiff(1.0e6)
+    verdict = wound_in_stiff(7.0e5)  # with each of 8 seeds by 1.27 times what is tolerated, or more
     assert 'N (standard deviation) while it is held' in str(verdict)
     assert 'latency' not in verdict.wrong, str(verdict)
 
@@ -307,8 +317,7 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
     ],
 )
 def test_faults_of_the_emulated_arm_are_found(fault, checks, told):
-    driver = Driver(ROBOT)
-    driver.listen(2.0)
+    driver = settled()
     driver.arm.faults.set([fault])
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
