@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Install the package, its robots and its executables (see setup.cfg for where the latter go)."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from collections import defaultdict

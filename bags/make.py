@@ -7,8 +7,6 @@ Runs emulator, estimator and controller at 20 Hz on a graph of its own and recor
 controller send.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

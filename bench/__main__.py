@@ -5,8 +5,6 @@ A bench is a module of this folder with a `main(argv)` that returns an exit stat
 What the package refuses is one line and status 1, as of a tool.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
 import sys

@@ -16,8 +16,6 @@ never learned from:
 What a marker and an accelerometer are worth is told by `experiment sensors`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch

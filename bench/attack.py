@@ -14,8 +14,6 @@ What a stranger may do on an open graph is not tried: command the modules, whom 
 their limits; ask for a stop; set a parameter to a legal value.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from pathlib import Path

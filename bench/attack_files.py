@@ -5,8 +5,6 @@ Each must be used or refused in one line, in time and memory that a laptop does 
 read in a child process, so that one that ends the interpreter is a finding and not the end.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small bags of every kind a reader meets, for tests and for `fuzz`."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -32,8 +32,6 @@ before any learning, in rad):
     mean               4.5         0.043          0.245    0.246  0.402
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

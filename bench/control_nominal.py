@@ -10,8 +10,6 @@
     python -m bench control_nominal --checkpoint FILE --paper-checkpoint FILE [--robot …] [--quick]
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array

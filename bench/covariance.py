@@ -10,8 +10,6 @@ motion never learned from and the share of its messages whose true angles lie in
 that nearly all of a motion lies inside or outside: only the mean over individuals says something.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -9,8 +9,6 @@ its hand is pushed about, or two of its muscles wound in. Those are the drivers 
 test/driver/test_faults.py.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

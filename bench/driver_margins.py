@@ -9,8 +9,6 @@ that another muscle's model fits 2.5 times better. Then each is checked as `chec
 does, which must find no fault.
 """
 
-from __future__ import annotations
-
 import sys
 from itertools import pairwise
 from pathlib import Path

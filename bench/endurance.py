@@ -9,8 +9,6 @@ the end, and the largest change of a command in one tick. Exit status 1 if a nod
 more after the first five minutes, ended, or the arm did not move again.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from pathlib import Path

@@ -8,8 +8,6 @@ is put into the background, and what would run until Ctrl-C is given a --duratio
 committed is cloned. Ten minutes and 2 GB of wheels.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -8,8 +8,6 @@ unfinished the messages must be the first ones. Where the recorder wrote no chec
 reported, only their number counts. Anything else, or more than 5 s, is a failure.
 """
 
-from __future__ import annotations
-
 import random
 import resource
 import shutil

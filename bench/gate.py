@@ -12,8 +12,6 @@ the initial and the last learned networks are refused under each attack.
 Exit status 1 if a healthy network was refused, or an attack was not.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace

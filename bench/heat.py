@@ -6,8 +6,6 @@
 An arm with the network of the geometric model explores and holds a weight in turn for 25 minutes.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -12,8 +12,6 @@ the oracle's (mean norms over the joints), and how far `proposed` leaves the arm
 An arm that holds itself in no posture has no targets: then the cell says why.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

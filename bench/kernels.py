@@ -5,8 +5,6 @@ Other processors pick other kernels, which sum in another order. No test may han
 each combination that this processor can run must pass, whatever it picks by itself.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess

@@ -9,8 +9,6 @@ child must have every sample that was accepted and a network no older than the l
 Exit status 1 if something was lost.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import subprocess

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Individuals that were learned, kept in a folder for the benches that start from one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path

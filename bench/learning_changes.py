@@ -13,8 +13,6 @@ The held-out error [rad] of the changed arm is printed as learning goes on, and 
 a learner that starts over; `told` is a learner whose `relearn_muscles` names the muscle.
 """
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import NamedTuple

@@ -8,8 +8,6 @@ of two joints and a number of wires, and a neck of three joints and twelve wires
 torso. Every number is chosen. Pairs beyond the first hang below it, on the same torso.
 """
 
-from __future__ import annotations
-
 import csv
 from math import cos, radians, sin
 from pathlib import Path

@@ -11,8 +11,6 @@ preset `paper` that an individual learned while it explored with it. Targets can
 true body; the arm goes to a start with `first`, on to the target, and is read at rest.
 """
 
-from __future__ import annotations
-
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -7,8 +7,6 @@ Times hold for the machine and the day that the page names, which should have no
 `--flames` draws, by py-spy, where each node spends its time at 200 Hz, as OUT/flames/NODE.svg.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

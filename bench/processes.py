@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a process takes of the machine, as Linux counts it, and its end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

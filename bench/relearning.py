@@ -12,8 +12,6 @@ Errors are of the held-out motion [rad]: at once, when what was kept is learned,
 new samples; `whole` is what the learner of all muscles had from the beginning.
 """
 
-from __future__ import annotations
-
 import copy
 import tempfile
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ before and after, beside the oracle; one update of the learner as it ships, with
 the largest memory. Times are of one core. DIR keeps networks and rows, and goes on from them.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import resource

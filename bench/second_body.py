@@ -26,8 +26,6 @@ With the middles of the ranges, and half of the wires without kinks, eight of th
     mean                0.372          33                0.680  0.111             83     0.77
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

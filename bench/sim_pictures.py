@@ -7,8 +7,6 @@ writes sim_at_rest.png and sim_loaded.png. Of a running simulator, `render --top
 makes the same picture.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -11,8 +11,6 @@ body: the emulated arm without individual differences and friction, and the equa
 which, unlike the emulated arm, can hold joints fast.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

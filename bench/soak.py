@@ -14,8 +14,6 @@ fifth over what it was after two hours, or the median time of an update in the l
 than one and a half of that in the first.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -9,8 +9,6 @@ the rate of this machine's products of matrices of that size: one row for a sing
 many arms.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -10,8 +10,6 @@ Stuck: more than 0.4 rad off; ‖T‖ is beside the least that holds the target 
 is told, what the estimate is off by is still that of the estimate nobody asked.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any, NamedTuple
 

@@ -10,8 +10,6 @@ their limits. Where the learned body leaves as little, the residual is met and h
 the lengths have told G already, and far more exactly than the torques could.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

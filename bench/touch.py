@@ -7,8 +7,6 @@ Individuals that learned for ten minutes (`learned_arm`); what is measured is in
 `musculoskeletal_ae/experiments/touch.py`.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -13,8 +13,6 @@ what it would be if nothing widened, and d over its threshold beside the distanc
 of the true body at rest anywhere, and at all joint limits at once, where motion hardly leads.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -8,8 +8,6 @@ as a browser's own work is not counted. Passes if `view` takes at most 10 % of a
 looks, and at most 0.5 % while nobody does.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -15,8 +15,6 @@ same executor, and compute nothing, so that no node in Python on this machine ca
     missed    messages that the emulator should have sent, and that did not come
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -11,8 +11,6 @@ fastest muscle and highest tension meanwhile. Zeroing reads the network and the 
 stay untouched, so that nothing else learned can be lost.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

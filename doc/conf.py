@@ -5,8 +5,6 @@
 .venv/bin/python -m sphinx -W doc build/doc      # then open build/doc/index.html
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -8,8 +8,6 @@ estimator and simulator are stepped here, frame by frame, so that a slow machine
 INITIAL is what `train` writes.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import sys

@@ -4,8 +4,6 @@
 python doc/make.py
 """
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

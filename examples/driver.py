@@ -6,8 +6,6 @@
 doc/your_robot.md says what a driver must do and why; `check_driver` whether this one does.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from functools import partial

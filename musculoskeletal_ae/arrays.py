@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Types of arrays; shapes stand in the docstrings. What numpy is slow at with few rows."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

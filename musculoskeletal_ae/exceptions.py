@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of this package: one base, so that a caller can catch all of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 LONGEST_TEXT = 4000

@@ -6,8 +6,6 @@ read, and what a few bytes of YAML can ask for is bounded before anything is bui
 functions take `refuse`, which makes the error that they raise of a file and what is wrong with it.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import stat

@@ -9,8 +9,6 @@ without friction: what it takes for T is T_end, so that everybody who asks it ab
 read turns one into the other.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array

@@ -6,8 +6,6 @@ handle in compiled code, in the file of what is handed over: numba keeps its cod
 that file whether it is still right.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import types

@@ -14,8 +14,6 @@ the highest temperature. A constant that leaves what it was, once that was known
 module has changed: its motor drags, its housing is covered, or its tension sensor is wrong.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools

@@ -7,8 +7,6 @@ with --from-bag')`. What the package refuses (a robot, a file) is one line and s
 defaults by itself. Types raise `ArgumentTypeError`, before which argparse puts the option.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

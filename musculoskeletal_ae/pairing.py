@@ -5,8 +5,6 @@ A θ between two messages of the muscle modules belongs to the nearer one, the e
 in the middle, so none is used twice. The rule is the same on a live arm and on a recording.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

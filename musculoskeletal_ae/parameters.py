@@ -10,8 +10,6 @@ Settings that a user may choose are a frozen dataclass whose fields say all of t
 `nodes/parameters.py` collects them into the tables of the nodes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, fields
 from typing import Any

@@ -7,8 +7,6 @@ Limits leave room to what five healthy arms showed in a minute of exploring each
 θ_est up to 0.13 of a joint's range beyond it, T above tension.limit for up to 8.3 s, at most 343 N.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What becomes of a message, live or of a bag: used, or rejected and counted by reason."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from inspect import iscoroutinefunction

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a part of the system says of itself, for people and for /diagnostics."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

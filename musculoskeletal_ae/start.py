@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where every executable starts: `--help` loads nothing heavy, and Ctrl-C shows no traceback."""
 
-from __future__ import annotations
-
 import faulthandler
 import os
 import signal

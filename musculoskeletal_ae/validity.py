@@ -7,8 +7,6 @@ on. A JointState is matched by name in any order, a Float64MultiArray by length 
 layout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small own models of every format that `import_robot` reads."""
 
-from __future__ import annotations
-
 MJCF = """<mujoco model="own">
   <compiler angle="radian"><lengthrange mode="none"/></compiler>
   <worldbody>

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A controller without an arm: sensor data is made up, time is counted by the test."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Emulator, estimator and controller on one graph, and what tests ask of them."""
 
-from __future__ import annotations
-
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState

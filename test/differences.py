@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Derivatives of whatever is under test, without its help."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

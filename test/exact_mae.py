@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A body image without error, as of a network that had learned the geometric model perfectly."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

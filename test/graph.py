@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A test's view of a real ROS graph: nodes here or in processes, real DDS, waits with deadlines."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

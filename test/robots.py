@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot directories for tests: an arm that shares no name, size or order with the shipped ones."""
 
-from __future__ import annotations
-
 import copy
 import shutil
 from collections.abc import Sequence

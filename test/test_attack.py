@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The attack of `bench.attack`: its judgement, and a quick form of it."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m bench` lists and starts what is there."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

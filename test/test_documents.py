@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the documents say is so."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

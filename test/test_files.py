@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that a user names by mistake or malice are refused at once, in one line, by name."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Windings' temperatures are learned from the housings', and limit what muscles may pull."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules of the whole repository, and the linters of a sourced Jazzy where it has them."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

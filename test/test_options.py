@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every command line has in common."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

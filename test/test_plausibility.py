@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What messages of an arm can say: a cut wire that winds in is no lie."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is dropped as late, and under which names rejections are counted; no graph needed."""
 
-from __future__ import annotations
-
 from types import coroutine
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every executable: help at once, no traceback on Ctrl-C, no option that is silently ignored."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of validity and of order, on messages without a graph."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

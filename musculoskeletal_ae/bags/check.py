@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is in a recording, and whether it is whole and fits a robot: `replay --check`."""
 
-from __future__ import annotations
-
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field

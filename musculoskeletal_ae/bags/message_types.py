@@ -5,8 +5,6 @@ Libraries that read bags compile the definitions found in them. Here a definitio
 compared, and messages are decoded with the fixed types of rosbags.
 """
 
-from __future__ import annotations
-
 from functools import cache, lru_cache
 from typing import Any
 

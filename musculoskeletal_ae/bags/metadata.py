@@ -5,8 +5,6 @@ It is written when recording starts, with a mark that it is not ended, and repla
 The classes name and order its entries as rosbag2 does.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ recorded(t) = anchor_recorded + rate · (t − anchor_steady),  standing still w
 Or what a hand showed an arm, as a trajectory that the arm can follow: smoothed, evenly spaced.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The streams of a recording as arrays, by the rules of validity: what offline training reads."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections import Counter

@@ -18,8 +18,6 @@ of it the arm goes on by itself, exploring or not.
 `now` is a steady clock [s], `time` that of the messages.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterable, Mapping

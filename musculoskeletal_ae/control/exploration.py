@@ -14,8 +14,6 @@ of their sensors (`learning.stops`), and of several random T_const takes the one
 there most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 

@@ -12,8 +12,6 @@ passed at the speed at which they come: each is reached when the next is due, an
 the arm comes to rest at the last. A twist moves the hand for TWIST_TIMEOUT.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

@@ -21,8 +21,6 @@ Method `stiffness`: argmin ‖T − T_K‖² instead, with T_K of `methods.stiff
 τ of a moment later, and no feedback, under which a chosen stiffness would not last.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array

@@ -12,8 +12,6 @@ starts: read again and again, `second` would raise the tension without end. Whil
 under `proposed`, `RestFeedback` corrects what friction leaves, and sheds needless tension.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -14,8 +14,6 @@ the arm leans on stay at their stops. Edges are looked at only if the cheapest p
 (lazy roadmap, Bohlin and Kavraki 2000); until then the postures at their ends say what they cost.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -20,8 +20,6 @@ limit until MSC holds only T_bias, and tensions fall to T_bias at K_stiff times 
 that may pass by itself (data that is late) latches when that paying out begins.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from typing import NamedTuple
 

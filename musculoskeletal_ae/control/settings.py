@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user may choose about control: one table for the core and the node's parameters."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

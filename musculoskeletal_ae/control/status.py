@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What control says of itself: what it is doing, and what is in its way."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.control import reach

@@ -11,8 +11,6 @@ change. Where the messages' clock is slow, as of a slow simulator, ages may be l
 to SLOWEST; a fast one makes no age shorter. The controller's own pauses make nothing old.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

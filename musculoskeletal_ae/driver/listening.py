@@ -5,8 +5,6 @@ By what values are possible at all and, where θ is known, by l beside the geome
 (doc/design.md, The driver's contract).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is judged of a driver, what may be wrong with it, and what came of it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

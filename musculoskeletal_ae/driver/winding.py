@@ -12,8 +12,6 @@ K makes tension of what l is off by. Where that is more than TENSION_TOLERANCE, 
 is what is tolerated, and all tensions that are asked for or noticed grow by the same factor.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Generator, Sequence
 from typing import NamedTuple

@@ -9,8 +9,6 @@ Each muscle is a massless wire between a motor and an elastic unit at its far en
 Joint friction is Dahl's as well, so that the arm rests where it rubs, without creeping.
 """
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 from typing import Any

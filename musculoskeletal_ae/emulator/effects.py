@@ -9,8 +9,6 @@ An individual has between 3/4 and all of a size, or a normal deviation with that
 sources of the sizes are in doc/design.md.
 """
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass, fields
 

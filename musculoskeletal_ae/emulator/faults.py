@@ -5,8 +5,6 @@ A fault is one line, `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]`: 'drop:0.3', 'st
 'bias:tension:40', 'dead_sensor:elbow'. Without a name it is all muscles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import NamedTuple
 

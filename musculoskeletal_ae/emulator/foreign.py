@@ -6,8 +6,6 @@ muscle modules are those of every arm. It imports nothing of learning, of the ge
 the series-elastic class (`test/test_house.py`).
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ In what, `Spread` says. Masses and link lengths are the model's (paper, Introduc
 correct).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ MuJoCo does rigid bodies, wrapping, joint stops and joint friction. Our muscle m
 tendons; the actuators of a file are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise

@@ -8,8 +8,6 @@
 l and T are those that the module's own sensors read.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence

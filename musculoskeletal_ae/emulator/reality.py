@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which body plays reality; the one place where nodes and experiments get their arms from."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path

@@ -9,8 +9,6 @@ spool      l (1 + gain) + the second layer's share + eccentricity · sin(l / rad
 give       a route point moves by its own load, low-passed
 """
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 

@@ -28,8 +28,6 @@ tension is far from what is commanded.
 Preset `paper` decides on A alone, against the checkpoint's threshold of A.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

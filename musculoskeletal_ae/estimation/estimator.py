@@ -18,8 +18,6 @@ hot; a cool arm is not stopped for it, but the suspect is named all the same, un
 the module as it is.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterable

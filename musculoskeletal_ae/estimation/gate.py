@@ -22,8 +22,6 @@ them, beside those of attacks).
 On an anomaly the newest network that has been in use for PROOF without one comes back.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator

@@ -13,8 +13,6 @@ keeps a force small that the joints do not feel, as along a stretched arm. At it
 nothing of torques away from it, which are the stop's own; one towards it is at least what is felt.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

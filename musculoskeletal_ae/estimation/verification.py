@@ -18,8 +18,6 @@ muscles make likely:
 A sound sensor is never quite still. A suspect that nobody winds stays isolated.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

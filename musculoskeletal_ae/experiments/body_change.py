@@ -12,8 +12,6 @@ a curve beside the true one after their mean difference is taken off. "Worn" is 
 with a worn elastic unit at #2 and friction in #6, explored and learned anew.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

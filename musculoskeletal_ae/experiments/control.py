@@ -15,8 +15,6 @@ needs less. What all starts of a target have in common is the model’s error, t
 hysteresis. Where a controller stopped, the arm's place then counts, and the stop is counted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscles cut or switched off in turn, what the detector says of it, and how that is counted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

@@ -20,8 +20,6 @@ in the latter. AUROC compares d of those with d of cut messages from 0.1 s after
 median while cut. Preset paper decides on A alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

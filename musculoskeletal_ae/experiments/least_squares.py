@@ -9,8 +9,6 @@ classical estimator without any learning, and with the body that a learner fitte
 samples leave open from what the network adds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

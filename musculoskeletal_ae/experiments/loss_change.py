@@ -10,8 +10,6 @@ are the simulator’s alone. On robots without elbow_pitch and shoulder_pitch, j
 shoulder, or else the last and the first, play their parts.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

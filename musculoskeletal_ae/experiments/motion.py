@@ -25,8 +25,6 @@ whose control stops, circles of which none is found. Where the trajectory's cont
 individual failed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import pairwise

@@ -16,8 +16,6 @@ joints, with the true angles of the emulator. Oracle: weighted least squares on 
 true routes, elastic constants and noise, friction taken as zero.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple

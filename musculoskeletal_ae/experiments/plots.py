@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all plots share: colours, axes, legends, and pictures of arms in rows and columns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any

@@ -17,8 +17,6 @@ if there is none. Five hours of healthy exploration, over all individuals, with 
 released each minute and a push of 10 to 30 N for a second every ten: isolations there are wrong.
 """
 
-from __future__ import annotations
-
 import copy
 from itertools import combinations
 from typing import Any, NamedTuple

@@ -7,8 +7,6 @@ writes the table of a page anew from the result.json files in doc/results; `expe
 doc/experiments.md` first puts what it measured there.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -14,8 +14,6 @@ ablation leaves out some effects of the foreign body, the rest of the individual
 "links" adds one, of link lengths, axes and masses, which the paper takes as exact.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which joints of a robot play the parts that the paper gives to Musashi's elbow and shoulder."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

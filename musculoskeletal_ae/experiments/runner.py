@@ -9,8 +9,6 @@ takes only those with it that need it. What runs as a worker is killed, as witho
 again, one part at a time, and fails if its worker is killed then, too.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -12,8 +12,6 @@ the share of its messages whose true angles lie in the ellipsoid of 95 % that th
 with all joint sensors and with none. The arm explored with the network that saw all joint sensors.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array

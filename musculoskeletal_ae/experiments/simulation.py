@@ -9,8 +9,6 @@ angles, T beside the measured tensions. The bound is the emulated individual its
 friction: what a perfect simulator without hysteresis would be left with.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -8,8 +8,6 @@ A new experiment is a file beside this one that ends in `EXPERIMENT = Experiment
 name in `NAMES`, and what table.yaml says of it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

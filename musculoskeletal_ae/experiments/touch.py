@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Touch, a part of the experiment `motion`: pushes that are felt, and an arm that a hand moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -6,8 +6,6 @@ link 'world' stand still. SPHERICAL and CYLINDRICAL via points (axis z) are wrap
 as the point it names. A URDF alone gives a skeleton of muscles.yaml, one muscle to be replaced.
 """
 
-from __future__ import annotations
-
 import os
 from itertools import combinations_with_replacement
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a file of another format to a robot directory: what `import_robot` does and says."""
 
-from __future__ import annotations
-
 import re
 from argparse import Namespace
 from collections import Counter

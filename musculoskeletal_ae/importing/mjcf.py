@@ -6,8 +6,6 @@ and slides become joints, a body with several of them a chain of massless links;
 hinges. `equality/joint` becomes a coupling, a polynomial the line nearest to it.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 from typing import Any

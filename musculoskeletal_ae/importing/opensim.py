@@ -9,8 +9,6 @@ The source's own lengths are computed with all these as OpenSim has them, so tha
 what the approximation costs; wrap objects are those of the result on both sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A body read from another format: cut, written as a robot directory, compared with its source."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field

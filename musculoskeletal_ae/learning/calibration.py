@@ -12,8 +12,6 @@ Where joint sensors read all angles, the network learns from every second messag
 the others, which it has never seen, tell how good its estimates are.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

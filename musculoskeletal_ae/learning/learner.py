@@ -14,8 +14,6 @@ Time is the caller's: the ROS clock, recorded or simulated time. All rules on ti
 that, so that a recording steps exactly what runs on a robot, but that training takes no time there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace

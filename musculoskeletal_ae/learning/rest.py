@@ -10,8 +10,6 @@ What comes within `MARGIN` before an anomaly is noticed was already wrong; rests
 messages therefore wait that long before they count.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections import Counter, deque
 from operator import itemgetter

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user may choose about learning: one table for the core and the node's parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import Parameter

@@ -13,8 +13,6 @@ holds one file that is whole, however it is copied. Each sample's record carries
 mark by which it is found even where the disk has damaged the structure of the file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -14,8 +14,6 @@ where a stop gives way. Sensors are as often zeroed well as roughly (p(z) is a s
 normal distribution), and limits may be no stops: then no reading says anything.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

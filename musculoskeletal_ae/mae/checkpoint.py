@@ -5,8 +5,6 @@ Nothing of a checkpoint is used before all of it has been checked, and every fau
 `CheckpointError` that names the source, the value, what is legal and what to do. Never pickle.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

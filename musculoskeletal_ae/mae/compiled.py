@@ -7,8 +7,6 @@ a rational function that is as exact as single precision can tell (as in Eigen),
 computes for eight units at once.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

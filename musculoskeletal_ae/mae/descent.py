@@ -8,8 +8,6 @@ with the best of N step sizes γ in [0, γ_max], C times (paper, section "Contro
 Musculoskeletal AutoEncoder"). A task is data: how to enter, a list of terms, what to read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ number of steps it leaves a third of Adam's error on this network, for small mat
 Own code, because torch's works in bfloat16, which loses here.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

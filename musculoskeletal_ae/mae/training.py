@@ -9,8 +9,6 @@ and how well the result restores states it has not seen. `fit` knows nothing of 
 from.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

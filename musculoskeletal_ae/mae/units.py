@@ -5,8 +5,6 @@ The paper (section "Network Structure") scales (θ, T, l) to [rad], [N/200], [mm
 sizes align, and enters the network with two of the three: the mask says which. SI outside.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import NamedTuple
 

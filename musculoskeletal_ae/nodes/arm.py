@@ -5,8 +5,6 @@ For RViz and Foxglove: bones, muscles and names as markers, or poses of all link
 hardware's bones are ivory and solid; green those of the estimate, violet the simulator's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -7,8 +7,6 @@ joint_states, estimated_joint_states, anomaly, anomaly_detected, muscle_states, 
 /diagnostics → stdout.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -7,8 +7,6 @@ with method `tension`; controller_state. Action follow_joint_trajectory, where c
 installed.
 """
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from dataclasses import replace

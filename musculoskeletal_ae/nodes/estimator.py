@@ -7,8 +7,6 @@ anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_l
 marker_pose → vision_joint_states, the joint angles that a camera sees.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import replace

@@ -5,8 +5,6 @@ control_msgs is not among the wheels that this package is developed with: it is 
 stand-in of its interface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any

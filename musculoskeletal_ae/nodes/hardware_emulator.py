@@ -5,8 +5,6 @@ muscle_length_command, muscle_tension_command → joint_states, muscle_states, m
 markers; on request imu.
 """
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any

@@ -6,8 +6,6 @@ isolated_muscles →
 mae_checkpoint.
 """
 
-from __future__ import annotations
-
 import os
 from functools import partial
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS messages from arrays, which `validity` reads; their quality of service; services."""
 
-from __future__ import annotations
-
 import math
 from array import array
 from collections.abc import Callable, Sequence

@@ -9,8 +9,6 @@ and `config/nodes.yaml`:
 Imports nothing heavy, so that `--help` answers at once.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable

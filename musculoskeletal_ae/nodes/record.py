@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `record`: the topics to an mcap bag that `ros2 bag` can read."""
 
-from __future__ import annotations
-
 import math
 import signal
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `render`: one picture of a running arm as a PNG, no display needed."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from functools import partial
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `replay`: plays a recorded mcap bag onto the topics, and says what is in one."""
 
-from __future__ import annotations
-
 import sys
 import time
 from argparse import Namespace

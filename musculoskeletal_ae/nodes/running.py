@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start and end of every process: nodes, and the tools `record`, `replay` and `render`."""
 
-from __future__ import annotations
-
 import ast
 import gc
 import os

@@ -7,8 +7,6 @@ sim/external_wrench, held by sim/fixed_joint_states. A command holds until the n
 the first, muscles are at T_bias. muscle_tension_command is not followed, and modules stay at 25 °C.
 """
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a running arm is, from what all nodes say of themselves on /diagnostics."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 

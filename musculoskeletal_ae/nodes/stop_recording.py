@@ -6,8 +6,6 @@ A node remembers what it heard and said, as it came. When it stops, a thread wri
 stop are not late; the oldest recordings beyond a number are deleted.
 """
 
-from __future__ import annotations
-
 import shutil
 import threading
 import time

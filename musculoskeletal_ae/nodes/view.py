@@ -5,8 +5,6 @@ Nothing is subscribed to while nobody looks. While somebody does, only the newes
 is taken, at the rate of the picture: an executor would handle every one, at a tenth of a core.
 """
 
-from __future__ import annotations
-
 import math
 import queue
 import time

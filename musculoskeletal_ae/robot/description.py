@@ -5,8 +5,6 @@ Everything that can be wrong in the two files is refused here, with the file, th
 legal values in the message, so that no later code needs to check again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 Imports nothing heavy: the help of a command lists the robots.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError

@@ -4,8 +4,6 @@
 As in the paper's figures, a muscle is green at T_bias and turns red towards T_limit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple

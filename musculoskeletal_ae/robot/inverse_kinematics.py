@@ -10,8 +10,6 @@ so no step is free of damping, and the search ends once a step gains less than t
 A robot without joint sensors is watched by a camera: this is how its θ gets into online learning.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ A wire with a `side` that comes to lie beyond the end of what it wraps round sli
 side of it, as MuJoCo's do: at once, and by centimetres. No network restores such a length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

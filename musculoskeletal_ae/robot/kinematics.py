@@ -13,8 +13,6 @@ A coupled joint of the tree turns by q = ratio · θ_master + offset. With A = �
 says of all joints of the tree becomes Aᵀ g, Aᵀ M A and J A.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ a combination: from all of it together, each change in turn, the costliest first
 serves best, and then to the least that does as well.
 """
 
-from __future__ import annotations
-
 from copy import copy
 from dataclasses import replace
 from functools import cache

@@ -8,8 +8,6 @@ exponential tendon T = force · (exp(rate · Δ) − 1); the wire is Dyneema, wh
 its length. The constants are chosen to be plausible for Musashi, which are not public.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ holds at T_bias gives way without resistance when it is shortened: counted as sl
 (the one-sided value). What a push meets is K_θ + ∂g/∂θ, since the arm's weight moves as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -7,8 +7,6 @@ over x: each via point p is moved by d_p, less than the reach r. The penalty is 
 and moment arms are what the check requires in all but a few postures.
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

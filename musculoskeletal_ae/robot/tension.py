@@ -8,8 +8,6 @@
 control experiment; T_desired = 0.3 T_limit the well-tensed arm by which `check_robot` judges.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ The check is ours because the URDF parser only warns about a mass or an inertia 
 or missing, drops the whole inertial element and goes on with a link that weighs nothing.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path

@@ -15,8 +15,6 @@ that length and moment arm are continuous. Compiled by numba for one wire: the g
 calls it for many, the emulator in each of its steps.
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Sequence

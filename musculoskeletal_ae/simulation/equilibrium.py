@@ -17,8 +17,6 @@ whatever torque it takes. Friction along the wires (`friction`) has a say: the a
 after winding in than after paying out.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import combinations_with_replacement
 from math import comb

@@ -12,8 +12,6 @@ needs only sums over what it carries:
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

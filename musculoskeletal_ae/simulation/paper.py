@@ -14,8 +14,6 @@ N instead of 173 after. (With l_target − l_comp(T_sim), the length at which MS
 would be 85 N, and 0.34 rad instead of 0.49.)
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array

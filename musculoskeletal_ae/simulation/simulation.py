@@ -9,8 +9,6 @@ network may be on a GPU. `equilibrium` has the equations of preset `default`, `p
 descent.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Callable, Iterable, Sequence

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_robot`: says whether a robot description is sound, and where it is not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, number, whole

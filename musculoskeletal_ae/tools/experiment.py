@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`experiment`: the paper's experiments on emulated arms, with numbers, plots and a report."""
 
-from __future__ import annotations
-
 import os
 import signal
 from argparse import ArgumentTypeError

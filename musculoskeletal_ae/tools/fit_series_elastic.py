@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`fit_series_elastic`: fits L_e(l_abs, T) to the table of a one-muscle testbed."""
 
-from __future__ import annotations
-
 import math
 from argparse import Namespace
 from itertools import product

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`import_robot`: makes a robot directory out of another project's model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, names

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `train` does: initial training from a robot description, or learning from recordings."""
 
-from __future__ import annotations
-
 import copy
 import sys
 import time

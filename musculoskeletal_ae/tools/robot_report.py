@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `check_robot` prints and draws."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from typing import Any
 

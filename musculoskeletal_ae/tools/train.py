@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`train`: initial training from a robot description, or learning from recordings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status

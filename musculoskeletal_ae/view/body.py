@@ -6,8 +6,6 @@ harder it pulls. A cut one is black and dashed, an isolated one grey and dashed,
 magenta and thick.
 """
 
-from __future__ import annotations
-
 import io
 import os
 from enum import IntEnum

@@ -7,8 +7,6 @@ What a visitor asks for goes to `act`, called in viser's threads with a name and
     position s · or the name of a service
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import io

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording of an arm that behaves exactly as its nominal model says."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bench import bag_samples as samples

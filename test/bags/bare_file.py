@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bare mcap files with one message, right or wrong in one respect."""
 
-from __future__ import annotations
-
 import struct
 
 from mcap.writer import Writer

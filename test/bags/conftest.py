@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags for tests, and the tools as processes on a ROS graph of their own."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

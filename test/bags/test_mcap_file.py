@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mcap file: read in full, as a stated prefix, or refused with the place of the damage."""
 
-from __future__ import annotations
-
 import io
 import struct
 

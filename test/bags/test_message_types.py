@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a bag says of its types is compared with those of ROS 2 Jazzy, and never used."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

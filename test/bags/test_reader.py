@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags: all messages in the order of their time, within bounds of memory and work."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

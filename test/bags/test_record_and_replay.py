@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tools `record` and `replay`: their options, and real processes on a real graph."""
 
-from __future__ import annotations
-
 import re
 import signal
 import time

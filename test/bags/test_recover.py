@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recordings of an arm that was taught a motion, of one that lost a muscle, of another body."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """./bringup.sh as a user runs it: a fresh robot, two arms on one graph, faults, and a clean end."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control as a whole, without an arm: sensor data is made up, time is counted by the test."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values

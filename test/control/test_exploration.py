@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's three steps, at postures that the arm can hold."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import numpy as np

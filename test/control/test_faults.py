@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Emulator, estimator and controller stepped together: what each fault of the arm may do."""
 
-from __future__ import annotations
-
 import copy
 from types import SimpleNamespace
 

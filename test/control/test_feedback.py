@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What control does while the arm rests: it corrects the posture and sheds needless tension."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import write_robot

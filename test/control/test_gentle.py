@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What moves, and how, while nobody knows the zeros of the lengths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

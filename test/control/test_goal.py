@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What becomes of an action's goal: reached, off its path, late at its end, replaced, stopped."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control without some muscles, and the winding in of a suspect."""
 
-from __future__ import annotations
-
 import copy
 from itertools import pairwise
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lengths for a posture: on the geometric model, where the optimum is known, and on a network."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -4,8 +4,6 @@
 Where the arm matters it is an emulated one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ramp to a goal; goals themselves are tested with the controller."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What leaves is never faster, stronger or less finite than allowed, whatever control commands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

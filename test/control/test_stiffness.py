@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stiffness as the network sees it, against the geometric model and a push on the nominal arm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from exact_mae import ExactMae

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Torque by tension: exact on an exact image, and honest beyond the muscles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from exact_mae import ExactMae

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint trajectories: between points, slowed, replaced, cancelled."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """No message makes the controller do harm: glitches, lies, late data, heat, overload, clocks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A driver of the emulated arm, stepped without ROS, that errs as it is told to."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace

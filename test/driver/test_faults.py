@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sound driver is found sound; each thing that a driver may get wrong is found, and named."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace

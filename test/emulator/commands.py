@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands for arms that nobody controls."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.control.methods import msc_compensation

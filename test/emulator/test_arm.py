@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated arm: statics against mechanics, modules against their specification."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults on request: each does what it is named after, and only that, until it is mended."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

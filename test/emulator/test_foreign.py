@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The second body: without effects it is the described one, each effect does what it is named."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields, replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The true routes: Jacobian against differences, individuals against each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from differences import slopes

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A healthy message of the geometric model, and how to break it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

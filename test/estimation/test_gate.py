@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A network takes over only if it explains the arm; the attacks are those of `bench/gate.py`."""
 
-from __future__ import annotations
-
 import re
 from collections import deque
 from dataclasses import replace

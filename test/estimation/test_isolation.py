@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A suspect is isolated at once, and what it does when it is wound in decides."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A muscle without tension: cut, or a slow winch that takes up slack."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

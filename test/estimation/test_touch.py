@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What pushes the arm from outside: exact on an exact body image, silent where nothing does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zeros of the lengths, found on the network's own body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

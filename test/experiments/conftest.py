@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One quick run of every experiment, which all tests here look at."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The older estimators find the posture of a noise-free nominal arm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

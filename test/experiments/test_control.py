@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's control protocol on a small arm without mismatch: who comes nearer, and how taut."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The script of grasps and cuts, and how alarms and scores are counted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

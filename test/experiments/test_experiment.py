@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`experiment`: what it writes, for any robot, and how it refuses."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The measurement of heat runs and says how hot the windings are."""
 
-from __future__ import annotations
-
 from bench import heat
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.mae import checkpoint

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Least squares finds the posture of a body whose model it has, whichever body that is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What has to hold for the comparison to be fair: same motion, same stream, same seeds."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Driving an arm through commands, and what a script may do on the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What result.json says of several individuals, and of parts that failed; what they share."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which joints play elbow and shoulder on robots that name none."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

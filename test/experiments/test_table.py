@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The results table is what its command makes of the committed results."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

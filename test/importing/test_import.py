@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every format: lengths against the source's own, cut chains, and files that are damaged."""
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies that differ from the model, samples of them, and a network that has learned one."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The corrected body and its fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector is calibrated on what is healthy, and on nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning from the shipped recordings, and `train --from-bag`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning without some muscles: nothing is learned of them, and all else goes on."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from learning.conftest import job

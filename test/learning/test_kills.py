@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A learner that is killed loses nothing: the quick form of `bench.kills`."""
 
-from __future__ import annotations
-
 from bench.kills import digest, grown, run, samples
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learner's story, and its rules on time, which is the caller's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

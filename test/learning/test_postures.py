@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Body and postures found together, from whatever sensors there are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rest, friction, novelty, the budgeted store, the gate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

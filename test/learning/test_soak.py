@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the soak would not tolerate."""
 
-from __future__ import annotations
-
 import pytest
 
 from bench.soak import judged

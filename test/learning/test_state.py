@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is on disk survives every way in which a learner or its disk can end."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The zeros of joint sensors, told by where the joints stop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

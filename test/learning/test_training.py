@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever the training process does, it is replaced, and the node goes on."""
 
-from __future__ import annotations
-
 import os
 import queue
 import signal

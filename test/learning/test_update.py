@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The network follows the body, and the paper what it prints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

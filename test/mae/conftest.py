@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shared networks, one preset at a time."""
 
-from __future__ import annotations
-
 import pytest
 
 from musculoskeletal_ae.mae.mae import Mae

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A body of several limbs: which groups its routes make, and a network with a block for each."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Isolated muscles: the network without what their sensors read."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph per test."""
 
-from __future__ import annotations
-
 import itertools
 import os
 

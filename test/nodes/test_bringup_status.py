@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the status line says, and the screen that takes its place on a terminal."""
 
-from __future__ import annotations
-
 import io
 import math
 from types import SimpleNamespace

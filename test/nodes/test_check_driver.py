@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_driver` on the graph: it waits, judges a live driver, and moves nothing unasked."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimator and controller in one process: the same nodes, and one end."""
 
-from __future__ import annotations
-
 import signal
 
 from diagnostic_msgs.msg import DiagnosticArray

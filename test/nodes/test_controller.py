@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller moving an emulated arm on a real graph, by every method."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every cause of a safe stop on a real graph, and what lets the arm go on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver to start from, and what the controller asks of any."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator as users meet it, over DDS."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 from copy import deepcopy

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The action, with a stand-in of control_msgs and of rclpy's server; actions are served at once."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated hardware as a robot on the graph."""
 
-from __future__ import annotations
-
 import bodies
 import numpy as np
 import pinocchio as pin

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A muscle is cut, verified and isolated, and the arm moves on, over DDS."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learner's node: it learns, gates, saves, resumes, and ends with all that it started."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

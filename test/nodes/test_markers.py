@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What RViz, Foxglove and PlotJuggler get: arms that can be told apart, names, frames."""
 
-from __future__ import annotations
-
 import json
 import sys
 import types

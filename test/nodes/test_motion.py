@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories and hand poses on a real graph, with the emulated arm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm

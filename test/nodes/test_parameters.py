@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One table of parameters, and what is made from it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

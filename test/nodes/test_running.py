@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A callback that takes long gives way to what has come meanwhile."""
 
-from __future__ import annotations
-
 from std_msgs.msg import String
 
 from musculoskeletal_ae.nodes.bringup_status import BringupStatus

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rights in config/security_policy.xml are those that the running nodes use."""
 
-from __future__ import annotations
-
 import importlib
 import xml.etree.ElementTree as ET
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated arm on the graph: beside a robot, and in its place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

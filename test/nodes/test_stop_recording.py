@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is kept of the seconds before a stop."""
 
-from __future__ import annotations
-
 import errno
 import os
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """No request and no message of any kind ends a node, and every request is answered."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strangers on the graph: networks, second sources, values no arm has, and odd clocks."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zeros of the lengths as users find them, over DDS."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from std_msgs.msg import Float64MultiArray

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms that every claim about the geometric model is tested on."""
 
-from __future__ import annotations
-
 import pytest
 from robots import write_robot
 

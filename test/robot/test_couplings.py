@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coupled joints, several end effectors, and what each muscle may have of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """IK(P_marker, θ_est): it goes where the pose says, and elsewhere stays with the estimate."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from musculoskeletal_ae.emulator.modules import seen_by_camera

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wires that slip to the other side of what they wrap round: found, and in no individual."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import DRUM_ENDS, behind_a_drum

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_robot --suggest`: via points that make an arm sound."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

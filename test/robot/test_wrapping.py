@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wires round spheres, cylinders and through rings: lengths, gradients, lift-off, drawing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from differences import slopes

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator with its network by torch: what numpy computes, and where it was asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gravity and pushes for many arms at once are what pinocchio says for each."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator on a body whose lengths are exact, so that only it can be wrong; on networks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

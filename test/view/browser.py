@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A headless Chromium, driven by its DevTools protocol: what a visitor sees and clicks."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json

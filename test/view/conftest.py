@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph per test, as for the nodes."""
 
-from __future__ import annotations
-
 from nodes.conftest import arm26, graph
 
 __all__ = ['arm26', 'graph']

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page draws stands where the kinematics say, and tells muscles apart."""
 
-from __future__ import annotations
-
 import os
 import shutil
 

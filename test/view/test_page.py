@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from types import SimpleNamespace
