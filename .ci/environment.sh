@@ -14,6 +14,7 @@
 : "${repository:?is set before this file is sourced}"
 
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
+PIP=26.3 # Debian's takes twice as long to find out what fits together
 TORCH=$(sed -n 's/^torch==//p' "$repository/requirements.txt")
 
 venv=$repository/.venv
@@ -262,6 +263,7 @@ assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; t
   # an error of its own pip installs nothing.
   touch "$venv/.installing"
   export PIP_USER=0 PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+  step "installing pip $PIP" "$python" -m pip install "pip==$PIP" || say 'going on with the pip of .venv'
   if ! step "$title (minutes, the first time)" \
     "$python" -m pip install --no-compile --progress-bar off "${arguments[@]}" "${torch[@]}"; then
     rm -f "$venv/.installing"
