@@ -15,7 +15,15 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.robot.wrapping import Vector, WrapObjects, turned, wrapped_segment
+from musculoskeletal_ae.robot.wrapping import (
+    Vector,
+    WrapObjects,
+    cross,
+    dot,
+    plus,
+    turned,
+    wrapped_segment,
+)
 
 
 class Tree(NamedTuple):
@@ -112,8 +120,7 @@ def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
         fill(placed.axis[i], turned(fixed, tree.axis[i]))
         fill(placed.translation[i], point_of(placed, up, tree.translation[i]))
         if tree.prismatic[i]:
-            for k in range(3):
-                placed.translation[i, k] += placed.axis[i, k] * q[i - 1]
+            fill(placed.translation[i], plus(placed.translation[i], placed.axis[i], q[i - 1]))
     for p in range(routes.point.shape[0]):
         fill(placed.world[p], point_of(placed, routes.point_joint[p], routes.point[p]))
     placed.absolute[:] = 0.0
@@ -158,16 +165,10 @@ def add_torque(
 ) -> None:  # fmt: skip
     """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
     while joint > 0:
-        ax, ay, az = placed.axis[joint]
+        axis = placed.axis[joint]
         if tree.prismatic[joint]:
-            torque[joint - 1] += scale * (ax * force[0] + ay * force[1] + az * force[2])
+            torque[joint - 1] += scale * dot(axis, force)
         else:
-            x = point[0] - placed.translation[joint, 0]
-            y = point[1] - placed.translation[joint, 1]
-            z = point[2] - placed.translation[joint, 2]
-            torque[joint - 1] += scale * (
-                ax * (y * force[2] - z * force[1])
-                + ay * (z * force[0] - x * force[2])
-                + az * (x * force[1] - y * force[0])
-            )
+            arm = plus(point, placed.translation[joint], -1.0)
+            torque[joint - 1] += scale * dot(axis, cross(arm, force))
         joint = tree.parent[joint]

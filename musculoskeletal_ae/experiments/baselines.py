@@ -90,13 +90,11 @@ class PolynomialFilter:
         self._noise = (design @ fit - target).std(axis=0)
         self._coefficients = np.vstack([fit, np.zeros(robot.muscle_count)])
 
-    def _scaled(self, theta: Array) -> Array:
-        low, high = self._robot.lower, self._robot.upper
-        return (2.0 * theta - low - high) / (high - low)
-
     def _monomials(self, theta: Array) -> Array:
         """Return the monomials of θ (N, D), shape (N, K)."""
-        table = self._scaled(theta)[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
+        low, high = self._robot.lower, self._robot.upper
+        x = (2.0 * theta - low - high) / (high - low)
+        table = x[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:

@@ -32,23 +32,15 @@ from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.tension import holding_tension
 
-
-class Method(NamedTuple):
-    """A method under test."""
-
-    method: str  # the controller's
-    preset: str  # of the network
-    colour: str  # in plots
-
-
+#: colours of the methods under test: the controller's, with `_paper` on that preset's network
 METHODS = {
-    'geometric': Method('geometric', 'default', '#999999'),
-    'first': Method('first', 'default', '#E69F00'),
-    'second': Method('second', 'default', '#009E73'),
-    'proposed': Method('proposed', 'default', '#0072B2'),
-    'first_paper': Method('first', 'paper', '#F5D999'),
-    'second_paper': Method('second', 'paper', '#99D8C7'),
-    'proposed_paper': Method('proposed', 'paper', '#CC79A7'),
+    'geometric': '#999999',
+    'first': '#E69F00',
+    'second': '#009E73',
+    'proposed': '#0072B2',
+    'first_paper': '#F5D999',
+    'second_paper': '#99D8C7',
+    'proposed_paper': '#CC79A7',
 }
 APPROACHES = 5  # θ_eval, and starts for each
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
@@ -82,11 +74,13 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
     stops = dict.fromkeys(METHODS, 0)
     for p, (theta, _) in enumerate(held):
         for s, start in enumerate(robot.random_postures(count, rng)):
-            for name, (method, preset, _) in METHODS.items():
+            for name in METHODS:
+                method, _, preset = name.partition('_')
                 loop = ClosedLoop(arm, networks['default'])
                 loop.approach(start, STARTING)
                 if loop.core.safety.cause:  # the start is then where it stopped
                     loop = ClosedLoop(arm, networks['default'])
+                preset = preset or 'default'
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
                 loop.approach(theta, DURATION)
@@ -189,14 +183,12 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']
     whiskers = {'lw': 1, 'capsize': 2}
-    for m, (name, method) in enumerate(METHODS.items()):
+    for m, (name, colour) in enumerate(METHODS.items()):
         at = place + (m - 0.5 * (len(METHODS) - 1)) * width
-        for panel, key, form in (
-            (upper, 'errors', '{}: {:.3f} rad'),
-            (lower, 'tensions', '{}: {:.0f} N'),
-        ):
+        shown = (upper, 'errors', '{}: {:.3f} rad'), (lower, 'tensions', '{}: {:.0f} N')
+        for panel, key, form in shown:
             mean, spread = trace[key][name].mean(axis=1), trace[key][name].std(axis=1)
-            style = {'color': method.colour, 'label': form.format(name, mean.mean())}
+            style = {'color': colour, 'label': form.format(name, mean.mean())}
             panel.bar(at, mean, 0.92 * width, yerr=spread, error_kw=whiskers, **style)
     label = f'QP bound at θ_eval: {bound.mean():.0f} N'
     left, right = place - 0.45, place + 0.45

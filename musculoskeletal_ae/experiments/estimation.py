@@ -172,9 +172,8 @@ def tracking(study: Study, rows: Rows) -> Plot:
     """Draw the joint angles through grasp and cut."""
     (seed, (_, trace)), robot = first(rows), study.robot
     shown, time = _shown(trace)
-    figure, panels = plots.new_figure(
-        12.0, 1.6 * len(robot.joints) + 0.8, len(robot.joints), sharex=True
-    )
+    count = robot.joint_count
+    figure, panels = plots.new_figure(12.0, 1.6 * count + 0.8, count, sharex=True)
     for joint, panel in enumerate(panels):
         factor, unit = plotted(robot, joint)
         for when, colour in plots.WHEN.items():
@@ -199,10 +198,8 @@ def cuts(study: Study, rows: Rows) -> Plot:
     robot, numbers = study.robot, [row.numbers for row in rows.values()]
     figure, panels = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
     place = np.arange(robot.muscle_count)
-    for letter, panel, label in (
-        ('a', panels[0], 'A of the paper [scaled units]'),
-        ('d', panels[1], 'd [healthy std. dev.]'),
-    ):
+    labels = 'A of the paper [scaled units]', 'd [healthy std. dev.]'
+    for letter, panel, label in zip('ad', panels, labels):
         for when, prefix, shift in (('before', '_before', -0.18), ('after', '', 0.18)):
             colour = plots.WHEN[when]
             for each in numbers:

@@ -42,7 +42,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
 from musculoskeletal_ae.friction import FrictionDirection
-from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.learner import SENSOR, Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -135,10 +135,10 @@ def train_initial(study: Study, preset: str) -> None:
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 
-def pupil(study: Study, seed: int, preset: str) -> Learner:
-    """Return a learner that begins with the initial network."""
-    steps = STEPS // 5 if study.quick else STEPS
-    return Learner(study.robot, study.network(None, preset), preset, seed, steps=steps)
+def pupil(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
+    """Return a learner that begins with the initial network; see `Learner` for its θ's source."""
+    initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
+    return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
 
 
 def beginner(study: Study, arm: Arm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:

@@ -111,16 +111,10 @@ def read(folder: Path) -> Results:
 def combined(study: Study, rows: Rows) -> dict[str, Any]:
     """Return result.json of one experiment, without its plots."""
     numbers = {str(seed): row.numbers for seed, row in rows.items()}
-    about = {
-        'robot': study.robot.description.directory.name,
-        'preset': study.preset,
-        'reality': study.reality,
-        'minutes': study.minutes,
-        'quick': study.quick,
-        'seeds': list(study.seeds),
-    }
-    whole = {**_mean(list(numbers.values())), 'about': about, 'seeds': numbers}
-    return {key: rounded(value) for key, value in whole.items()}
+    about: dict[str, Any] = {'robot': study.robot.description.directory.name}
+    about |= {key: getattr(study, key) for key in ('preset', 'reality', 'minutes', 'quick')}
+    about['seeds'] = list(study.seeds)
+    return rounded({**_mean(list(numbers.values())), 'about': about, 'seeds': numbers})
 
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

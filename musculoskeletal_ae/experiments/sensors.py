@@ -17,7 +17,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import felt_at_rest, seen_by_camera
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.online_learning import See, teach
+from musculoskeletal_ae.experiments.online_learning import See, pupil, teach
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
     Recording,
@@ -27,7 +27,6 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.roles import elbows
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
-from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.update import ellipsoids
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
@@ -63,7 +62,10 @@ def measure(study: Study, seed: int) -> Measured:
     length, tension = stream.length, stream.tension
     # The one that explored was taught by all joint sensors.
     networks = {'before': study.network(None, 'default'), 'all': study.network(seed, 'default')}
-    networks |= {name: _taught(study, seed, *way, stream) for name, way in ways.items()}
+    for name, (source, see) in ways.items():
+        learner = pupil(study, seed, 'default', source)
+        teach(learner, zip(*stream, strict=True), see)
+        networks[name] = learner.mae
     numbers = {f'{name}_rad': estimation_error(mae, held_out) for name, mae in networks.items()}
     for name, key in ('all', 'ellipsoid_share'), ('none', 'none_ellipsoid_share'):
         if networks[name].covariance is not None:
@@ -74,13 +76,6 @@ def measure(study: Study, seed: int) -> Measured:
 def sighted(learner: Learner) -> bool:
     """Whether the marker is seen until the next sample; a full store grows no more."""
     return learner.samples.accepted % SIGHTED == 0
-
-
-def _taught(study: Study, seed: int, source: str, see: See, stream: Recording) -> Mae:
-    initial, steps = study.network(None, 'default'), STEPS // 5 if study.quick else STEPS
-    learner = Learner(study.robot, initial, 'default', seed, steps=steps, joint_source=source)
-    teach(learner, zip(*stream, strict=True), see)
-    return learner.mae
 
 
 def ellipsoid_share(mae: Mae, recording: Recording) -> float:

@@ -189,16 +189,12 @@ def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, f
 
 def forces(_: Study, rows: Rows) -> Plot:
     """Draw sizes and directions of all pushes."""
-    parts = [row.traces for row in rows.values()]
-    true, felt, free = (
-        np.concatenate([part[key] for part in parts]) for key in ('true', 'felt', 'free')
-    )
+    parts = [[row.traces[key] for key in ('true', 'felt', 'free')] for row in rows.values()]
+    true, felt, free = map(np.concatenate, zip(*parts))
     sizes, angle = np.linalg.norm(true, axis=1), _errors(true, felt)[1]
     figure, (left, right) = plots.new_figure(9.0, 3.6, columns=2)
-    for which, colour, name in (
-        (free, plots.AFTER, 'free'),
-        (~free, plots.MARK, 'a joint at its stop'),
-    ):
+    kinds = (free, plots.AFTER, 'free'), (~free, plots.MARK, 'a joint at its stop')
+    for which, colour, name in kinds:
         style = {'color': colour, 's': 12, 'label': name}
         left.scatter(sizes[which], np.linalg.norm(felt[which], axis=1), **style)
         right.scatter(sizes[which], angle[which], **style)

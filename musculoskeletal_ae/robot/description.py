@@ -115,11 +115,6 @@ class RobotDescription:
             lines.append(f'held fixed at 0: {held}')
         return lines
 
-    @property
-    def root_link(self) -> str:
-        """Name of the URDF's root link, in whose frame poses and markers are given."""
-        return str(body_frames(self.model)[0].name)
-
 
 def load_description(robot: str | Path) -> RobotDescription:
     """Read and check a robot description, by a shipped name such as 'arm26' or a directory.

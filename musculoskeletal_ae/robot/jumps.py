@@ -6,7 +6,6 @@ side of it, as MuJoCo's do: at once, and by centimetres. No network restores suc
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +15,6 @@ from musculoskeletal_ae.robot.robot import Robot
 LINES, STEPS = 60, 400  # between postures, that lengths are followed along
 JUMP = 0.001  # [m] within such a step: lengths that change smoothly bend by a hundredth of that
 REDRAWN = 50  # times that a jumping wire's points are drawn again for an individual, at most
-
-
-class Jump(NamedTuple):
-    """A muscle whose wire slips to the other side of what it wraps round."""
-
-    muscle: int
-    size: float  # [m]
-    theta: Array  # [rad] or [m], (D,), where it does
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -45,12 +36,12 @@ def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
-def jumping_muscles(robot: Robot) -> list[Jump]:
-    """Return the muscles of a robot whose lengths jump, with the largest jump of each."""
+def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
+    """Return the muscles whose lengths jump, with the largest jump [m] of each and its θ (D,)."""
     if robot.routes.objects is None:
         return []
     largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
-    return [Jump(m, largest[m], where[m]) for m in np.flatnonzero(largest > JUMP).tolist()]
+    return [(m, largest[m], where[m]) for m in np.flatnonzero(largest > JUMP).tolist()]
 
 
 def told_of_jumps(robot: Robot) -> str:

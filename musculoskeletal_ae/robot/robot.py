@@ -13,7 +13,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
 from musculoskeletal_ae.robot.groups import groups
-from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.stiffness import muscle_stiffness
@@ -31,7 +31,8 @@ class Robot:
         self.isolated: tuple[int, ...] = ()  # muscles that are not used, places in T and l
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # all others, (M,)
         self.stiffness = description.stiffness
-        self.root_link = description.root_link
+        #: the URDF's, in whose frame poses and markers are given
+        self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
             description.model, self.joints, description.end_effector, description.couplings
         )

@@ -135,37 +135,39 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
 
 
 @njit(cache=True)
-def _dot(a: Vector, b: Vector) -> float:
+def dot(a: Vector, b: Vector) -> float:
+    """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
-def _minus(a: Vector, b: Vector) -> Vector:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a × b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
-def _cross(a: Vector, b: Vector) -> Vector:
-    x, y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
-    return x, y, a[0] * b[1] - a[1] * b[0]
+def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
+    """Return a + scale · b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
 @njit(cache=True)
 def _unit(a: Vector) -> Vector:
-    size = max(math.sqrt(_dot(a, a)), TINY)
+    size = max(math.sqrt(dot(a, a)), TINY)
     return a[0] / size, a[1] / size, a[2] / size
 
 
 @njit(cache=True)
 def _beside(a: Vector) -> Vector:
     """Return some unit vector across a unit vector."""
-    return _unit(_cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
+    return _unit(cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
 
 
 @njit(cache=True)
 def turned(rotation: Array, vector: Array) -> Vector:
     """Return a vector (3,), turned by a matrix (3, 3)."""
-    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
+    return dot(rotation[0], vector), dot(rotation[1], vector), dot(rotation[2], vector)
 
 
 @njit(cache=True)
@@ -178,8 +180,8 @@ def wrapped_segment(
     The objects are placed by the poses (J, 3, 3), (J, 3) of the tree's joints. Fills the unit
     vectors along which the wire pulls its start (`leave`) and its end (`arrive`).
     """
-    j, radius, line = objects.joint[s], objects.radius[s], _minus(end, start)
-    straight = math.sqrt(_dot(line, line))
+    j, radius, line = objects.joint[s], objects.radius[s], plus(end, start, -1.0)
+    straight = math.sqrt(dot(line, line))
     for k in range(3):
         leave[k] = line[k] / max(straight, TINY)
         arrive[k] = -leave[k]
@@ -187,27 +189,27 @@ def wrapped_segment(
         return straight
     axis, side = turned(rotation[j], objects.axis[s]), turned(rotation[j], objects.side[s])
     centre, sided = turned(rotation[j], objects.centre[s]), not math.isnan(side[0])
-    a = _minus(_minus(start, translation[j]), centre)
-    b = _minus(_minus(end, translation[j]), centre)
-    if _dot(axis, axis) > 0.5:
+    a = plus(plus(start, translation[j], -1.0), centre, -1.0)
+    b = plus(plus(end, translation[j], -1.0), centre, -1.0)
+    if dot(axis, axis) > 0.5:
         u = _beside(axis)
-        v = _cross(axis, u)
+        v = cross(axis, u)
     else:
         u = _unit(a)
-        normal = _cross(u, _unit(b))  # of units: that of ends near the centre is short
-        if _dot(normal, normal) < 1e-18:
+        normal = cross(u, _unit(b))  # of units: that of ends near the centre is short
+        if dot(normal, normal) < 1e-18:
             # Through the centre every plane is as good: take that of the side, or any.
-            normal = _cross(a, side) if sided else _beside(u)
-        v = _cross(_unit(normal), u)
-    flat_a, flat_b = complex(_dot(a, u), _dot(a, v)), complex(_dot(b, u), _dot(b, v))
-    if sided and _dot(side, side) < radius * radius:
+            normal = cross(a, side) if sided else _beside(u)
+        v = cross(_unit(normal), u)
+    flat_a, flat_b = complex(dot(a, u), dot(a, v)), complex(dot(b, u), dot(b, v))
+    if sided and dot(side, side) < radius * radius:
         wraps, flat, first, last = _through_ring(flat_a, flat_b, radius)
     else:
-        way = complex(_dot(side, u), _dot(side, v)) if sided else 0j
+        way = complex(dot(side, u), dot(side, v)) if sided else 0j
         wraps, flat, first, last = _round(flat_a, flat_b, radius, way / max(abs(way), TINY))
     if not wraps:
         return straight
-    rise = _dot(line, axis)
+    rise = dot(line, axis)
     length = math.sqrt(flat * flat + rise * rise)
     for k in range(3):
         leave[k] = (flat * (first.real * u[k] + first.imag * v[k]) + rise * axis[k]) / length

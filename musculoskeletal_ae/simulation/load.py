@@ -20,8 +20,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.kinematics import Kinematics
-
-Vector = tuple[float, float, float] | Array
+from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus, turned
 
 
 class Tree(NamedTuple):
@@ -51,24 +50,6 @@ class Tree(NamedTuple):
 def vector(a: Array) -> Vector:
     """Return a (3,) as a vector that takes no memory."""
     return a[0], a[1], a[2]
-
-
-@njit(cache=True)
-def dot(a: Vector, b: Vector) -> float:
-    """Return a · b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True)
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return a × b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True)
-def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
-    """Return a + scale · b."""
-    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
 @njit(cache=True)
@@ -109,9 +90,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
             pose[tree.parent[i], r, 5] += pose[i, r, 5]
     load[:], gradient[:] = 0.0, 0.0
     down, hand = vector(tree.gravity), pose[tree.effector_joint]
-    own = tree.effector
-    turned = dot(hand[0], own), dot(hand[1], own), dot(hand[2], own)
-    tip = plus(turned, vector(hand[:, 3]))
+    tip = plus(turned(hand, tree.effector), vector(hand[:, 3]))
     for k in range(1, joints):
         push, twist = vector(wrench[:3]), vector(wrench[3:])
         if not tree.carries[k]:
