@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-from msgspec import Struct, convert, to_builtins
+from msgspec import Struct, convert, yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from musculoskeletal_ae.exceptions import BagError
@@ -23,7 +22,6 @@ REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yam
 
 Qos = Mapping[str, Any]  # a profile as rosbag2 writes it in version 9
 
-_Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 _MARK = 'musculoskeletal_ae_unfinished'
 _NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
@@ -97,7 +95,7 @@ def offered_qos(latched: bool, reliable: bool = True) -> Qos:
 
 def qos_text(profiles: Sequence[Qos]) -> str:
     """Return QoS profiles as rosbag2 writes them into a channel's metadata."""
-    return _yaml(profiles) if profiles else ''
+    return yaml.encode(profiles).decode() if profiles else ''
 
 
 def read_qos(text: str) -> Sequence[Qos]:
@@ -131,8 +129,8 @@ def write_metadata(
         custom_data=None if finished else {_MARK: 'true'},
     )
     new = directory / f'{FILE}.new'
-    with new.open('w', encoding='utf-8') as stream:
-        stream.write(_yaml(_Document(metadata)))
+    with new.open('wb') as stream:
+        stream.write(yaml.encode(_Document(metadata)))
         if finished:
             stream.flush()
             os.fsync(stream.fileno())
@@ -168,11 +166,6 @@ def _check(metadata: Metadata) -> None:
     counts = [topic.message_count for topic in metadata.topics_with_message_count]
     if sum(counts) != metadata.message_count:
         raise ValueError('message_count is not the sum over the topics')
-
-
-def _yaml(value: object) -> str:
-    # Builtins are copies, so there are no aliases (&id001), which no one expects in a bag.
-    return str(yaml.dump(to_builtins(value), Dumper=_Dumper, sort_keys=False))
 
 
 def _unusable(file: Path, problem: str) -> BagError:

@@ -30,7 +30,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
 from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
-from musculoskeletal_ae.estimation.zeroing import Zeroing, Zeros, no_offset
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.heat import Heat
@@ -95,7 +95,7 @@ class Estimator:
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
-        self.zeros = no_offset(robot.muscle_count)  # of the length sensors, as all nodes are told
+        self.zeros = Zeros.of(robot.muscle_count)  # of the length sensors, as all nodes are told
         self._zeroing: Zeroing | None = None
         self._joints: tuple[float, Array | None] = -math.inf, None
         self._time = math.inf  # of the last message; none yet
@@ -153,7 +153,7 @@ class Estimator:
         self.check_posture(posture)
         robot = self._robot
         self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
-        self.zeros = Zeros.unknown(robot.muscle_count)
+        self.zeros = Zeros.of(robot.muscle_count, UNKNOWN)
         self.detector.judges, self._verdict = False, None
         self.reset()
 

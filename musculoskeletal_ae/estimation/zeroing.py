@@ -71,14 +71,9 @@ class Zeros(NamedTuple):
         return bool(self.deviation[self.deviation.argmax()] < KNOWN)
 
     @staticmethod
-    def unknown(muscles: int) -> Zeros:
-        """Return the zeros of sensors of which nothing is known."""
-        return Zeros(np.zeros(muscles), np.full(muscles, UNKNOWN))
-
-
-def no_offset(muscles: int) -> Zeros:
-    """Return the zeros of sensors that know them."""
-    return Zeros(np.zeros(muscles), np.zeros(muscles))
+    def of(muscles: int, deviation: float = 0.0) -> Zeros:
+        """Return zeros without an offset, known but for a deviation; `UNKNOWN`: not at all."""
+        return Zeros(np.zeros(muscles), np.full(muscles, deviation))
 
 
 class Moments(NamedTuple):

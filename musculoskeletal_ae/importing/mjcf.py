@@ -80,10 +80,6 @@ class _Reader:
             self.source.renamed(kind, each, name)
         return names
 
-    def name(self, kind: str, i: int) -> str:
-        """Return the name of a thing."""
-        return self.names[kind][i]
-
     def _not_modelled(self) -> None:
         m = self.model
         for kind, told, values in (
@@ -95,7 +91,7 @@ class _Reader:
             ('tendon', 'friction', m.tendon_frictionloss),
             ('body', 'compensated weight', m.body_gravcomp),
         ):
-            if named := ', '.join(self.name(kind, i) for i in np.flatnonzero(values).tolist()):
+            if named := ', '.join(self.names[kind][i] for i in np.flatnonzero(values).tolist()):
                 self.source.note('dropped', f'{told}: {kind} {named}')
         touching = int(np.count_nonzero(m.geom_contype | m.geom_conaffinity))
         if m.npair or touching > 1:
@@ -108,7 +104,7 @@ class _Reader:
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
             for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
                 if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-                    told = f'free joint {self.name("joint", j)}, where the file puts it'
+                    told = f'free joint {self.names["joint"][j]}, where the file puts it'
                     self.source.note('held fixed', told)
                     continue
                 before, stand = stand, pin.SE3(turn, data.xanchor[j].copy())
@@ -117,14 +113,14 @@ class _Reader:
             at = pin.SE3(turn, data.xpos[i].copy())
             weight = pin.Inertia(float(m.body_mass[i]), np.zeros(3), np.diag(m.body_inertia[i]))
             centre = at.inverse() * pin.SE3(data.ximat[i].reshape(3, 3), data.xipos[i].copy())
-            link = self.name('body', i), carrier, stand.inverse() * at
+            link = self.names['body'][i], carrier, stand.inverse() * at
             self.source.add_link(*link, centre.act(weight))
             if i:
-                self.source.above[link[0]] = self.name('body', m.body_parentid[i])
+                self.source.above[link[0]] = self.names['body'][m.body_parentid[i]]
 
     def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
         """Add a joint that stands at a pose in the carrier at the start; return its number."""
-        m, source, types, name = self.model, self.source, mujoco.mjtJoint, self.name('joint', j)
+        m, source, types, name = self.model, self.source, mujoco.mjtJoint, self.names['joint'][j]
         low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
         kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
         axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
@@ -144,14 +140,14 @@ class _Reader:
         m, source = self.model, self.source
         for e in np.flatnonzero(m.eq_active0).tolist():
             if m.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT:
-                source.note('dropped', f'equality {self.name("equality", e)}: not of joints')
+                source.note('dropped', f'equality {self.names["equality"][e]}: not of joints')
                 continue
             slave, master, terms = int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e][4::-1]
-            name, leader = self.name('joint', slave), master
+            name, leader = self.names['joint'][slave], master
             while leader in self.polynomials:
                 leader = self.polynomials[leader][0]
             if slave in self.polynomials or leader == slave:
-                told = f'equality {self.name("equality", e)}: joint {name} is coupled already'
+                told = f'equality {self.names["equality"][e]}: joint {name} is coupled already'
                 source.note('dropped', told)
                 continue
             self.polynomials[slave], zero = (master, terms.copy()), m.qpos0[m.jnt_qposadr[slave]]
@@ -161,7 +157,7 @@ class _Reader:
                 continue
             start = m.qpos0[m.jnt_qposadr[master]]
             value = np.poly1d([zero]) + np.poly1d(terms)(np.poly1d([1.0, -start]))
-            source.couple(name, self.name('joint', master), value)
+            source.couple(name, self.names['joint'][master], value)
 
     def _tendons(self) -> None:
         m, source = self.model, self.source
@@ -170,9 +166,9 @@ class _Reader:
             if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
                 driven[int(m.actuator_trnid[a][0])].append(self._strength(a))
             else:
-                source.note('dropped', f'actuator {self.name("actuator", a)}: on no tendon')
+                source.note('dropped', f'actuator {self.names["actuator"][a]}: on no tendon')
         for t in range(m.ntendon):
-            name, first = self.name('tendon', t), m.tendon_adr[t]
+            name, first = self.names['tendon'][t], m.tendon_adr[t]
             if m.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT:
                 source.note('dropped', f'tendon {name}: a fixed one, which has no route')
             elif driven and t not in driven:
@@ -203,7 +199,7 @@ class _Reader:
         # A force that shortens is negative in MuJoCo.
         pull = float(max(-gear * ends)) if gear else 0.0
         if pull <= 0.0:
-            told = f'actuator {self.name("actuator", a)}: it can only push, and a wire only pulls'
+            told = f'actuator {self.names["actuator"][a]}: it can only push, and a wire only pulls'
             self.source.note('dropped', told)
         return max(pull, 0.0) if pull <= STRONGEST else np.inf
 
@@ -217,7 +213,7 @@ class _Reader:
                 branches.append([])
                 divided |= bool(m.wrap_prm[w] != 1.0)
             elif kind == types.mjWRAP_SITE:
-                body = self.name('body', m.site_bodyid[i])
+                body = self.names['body'][m.site_bodyid[i]]
                 branches[-1].append(RoutePoint(body, m.site_pos[i].copy()))
             else:
                 round_axis = kind == types.mjWRAP_CYLINDER
@@ -244,12 +240,12 @@ class _Reader:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
                 side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo has it
-        return Wrap(self.name('body', body), m.geom_pos[geom].copy(), radius, axis, side)
+        return Wrap(self.names['body'][body], m.geom_pos[geom].copy(), radius, axis, side)
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
         """Return MuJoCo's own lengths."""
         m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
-        address = {self.name('joint', j): at for j, at in enumerate(m.jnt_qposadr.tolist())}
+        address = {self.names['joint'][j]: at for j, at in enumerate(m.jnt_qposadr.tolist())}
         lengths = []
         for n in range(len(next(iter(values.values())))):
             data.qpos[:] = start

@@ -339,7 +339,7 @@ def _fit_muscle(
     spread: Array,
     least_noise: float,
     m: int,
-) -> tuple[Array, float, Array]:
+) -> None:
     precision, known = 1.0 / spread**2, used.astype(float)
     noise, weight = FIRST_NOISE, known
 
@@ -376,10 +376,8 @@ def _fit_muscle(
             if cost() <= highest:
                 break
         else:
-            residual, jacobian = linearised(at)
-            break
-    noise, weight = _noise_and_weight(residual, known, noise, max(1.0, known.sum()), least_noise)
-    return residual, noise, weight
+            linearised(at)
+            return
 
 
 def _noise_and_weight(

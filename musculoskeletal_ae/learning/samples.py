@@ -10,7 +10,7 @@ always stays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -74,15 +74,10 @@ class Observations:
 
     def limb(self, joints: Ints, muscles: Ints) -> Observations:
         """Return what they say of the joints and muscles of one group."""
-        return Observations(
-            self.theta[:, joints],
-            self.tension[:, muscles],
-            self.length[:, muscles],
-            self.direction[:, muscles],
-            self.known[:, muscles],
-            self.spread[:, joints],
-            self.gravity,
-            self.age,
+        ours = {'theta': joints, 'spread': joints}
+        ours |= dict.fromkeys(('tension', 'length', 'direction', 'known'), muscles)
+        return replace(
+            self, **{name: getattr(self, name)[:, which] for name, which in ours.items()}
         )
 
     def state(self) -> State:

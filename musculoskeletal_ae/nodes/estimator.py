@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.estimation.zeroing import Zeros
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Frames, Markers
@@ -68,7 +68,7 @@ class Estimator(Shell):
         self.follow_parameter('zero_posture', self._take_posture)
         self.unzeroed = self.parameter('zero_at_start')
         if self.unzeroed:  # nobody moves on what sensors say before the network is there
-            self.core.zeros = Zeros.unknown(self.robot.muscle_count)
+            self.core.zeros = Zeros.of(self.robot.muscle_count, UNKNOWN)
         self.follow_parameter('isolate_muscles', self._choose_muscles)
         self.follow_checkpoints(self._use)
         if self.parameter('isolate_muscles'):

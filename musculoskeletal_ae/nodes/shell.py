@@ -32,7 +32,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
-from musculoskeletal_ae.estimation.zeroing import Zeros, no_offset
+from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     GateError,
@@ -90,7 +90,7 @@ class Shell(Node):
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
-        self.zeros = no_offset(self.robot.muscle_count)  # that readings of l are too long by
+        self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -371,7 +371,7 @@ class Shell(Node):
         Known ones that are not those known before come from an estimator that starts anew and
         has not heard of them: nothing is known then, until it finds them.
         """
-        heard = Zeros.unknown(self.robot.muscle_count)
+        heard = Zeros.of(self.robot.muscle_count, UNKNOWN)
 
         def take(rows: Array) -> None:
             nonlocal heard
@@ -382,7 +382,7 @@ class Shell(Node):
             if before.known and zeros.known:
                 if (zeros.offset == before.offset).all():
                     return
-                zeros = Zeros(zeros.offset, Zeros.unknown(len(zeros.offset)).deviation)
+                zeros = Zeros(zeros.offset, np.full(len(zeros.offset), UNKNOWN))
             less, self.zeros = zeros.offset - self.zeros.offset, zeros
             changed(zeros.known, less)
 
