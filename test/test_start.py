@@ -63,6 +63,18 @@ def test_help_loads_nothing_that_takes_long(name):
     assert len(done.stdout) > 300
 
 
+def test_who_simulates_loads_no_scipy_for_numba_and_may_load_it_later():
+    done = python(
+        'from musculoskeletal_ae.emulator.arm import EmulatedArm\n'
+        'from musculoskeletal_ae.robot.robot import Robot\n'
+        'EmulatedArm(Robot.load("arm26"), 0).step(0.001)\n'
+        'print("loaded", *{"coverage", "scipy.linalg"} & set(sys.modules))\n'
+        'import scipy.linalg.cython_blas'
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == 'loaded'
+
+
 @pytest.mark.parametrize('name', EXECUTABLES)
 @pytest.mark.parametrize('after', [0.05, 1.0])
 def test_ctrl_c_shows_no_traceback(name, after, tmp_path):
