@@ -2,7 +2,7 @@
 """numba's `njit`, without two things that numba loads on the way and no code here needs.
 
 They are BLAS for products in compiled code, and with it all of scipy.linalg, and the measuring of
-test coverage: together 0.3 s of a core and 20 MB of every process that simulates.
+test coverage: together a third of a second and 20 MB of every process that simulates.
 """
 
 import sys
