@@ -27,6 +27,8 @@ Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)' &
 
 say 'mypy'
 "$python" -m mypy || exit 1
+# What pytest compiles of the tests' sources, once instead of in each of its processes.
+[ -d test/__pycache__ ] || "$python" -m pytest --collect-only -q >/dev/null 2>&1
 wait $! || exit 1
 # For the installed package too: it is the same, and numba goes by the time of a source.
 cp -pr musculoskeletal_ae/. "$repository"/install/musculoskeletal_ae/lib/python3*/*/musculoskeletal_ae
