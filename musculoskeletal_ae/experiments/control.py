@@ -76,11 +76,11 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
         for s, start in enumerate(robot.random_postures(count, rng)):
             for name in METHODS:
                 method, _, preset = name.partition('_')
+                preset = preset or 'default'
                 loop = ClosedLoop(arm, networks['default'])
                 loop.approach(start, STARTING)
                 if loop.core.safety.cause:  # the start is then where it stopped
                     loop = ClosedLoop(arm, networks['default'])
-                preset = preset or 'default'
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
                 loop.approach(theta, DURATION)

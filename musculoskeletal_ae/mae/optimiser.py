@@ -46,21 +46,21 @@ class Optimiser:
         self._matrices = [p for p in parameters if muon and p.ndim == 2]
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
-        others = [p for p in parameters if not muon or p.ndim != 2]
         # torch.optim.Adam would load torch's compiler, which takes a second.
-        zeros = torch.zeros_like
-        self._adam = [(p, zeros(p), zeros(p), p.new_zeros(())) for p in others]
+        self._others = [p for p in parameters if not muon or p.ndim != 2]
+        self._moments = [[torch.zeros_like(p) for p in self._others] for _ in range(2)]
+        self._counts = [p.new_zeros(()) for p in self._others]
 
     def step(self, scale: float = 1.0) -> None:
         """Use the gradients, with the step sizes multiplied by `scale`, and clear them."""
         with torch.no_grad():
-            parameters, first, second, counts = map(list, zip(*self._adam, strict=True))
+            gradients = [p.grad for p in self._others]
             adam(
-                parameters, [p.grad for p in parameters], first, second, [], counts, fused=True,
+                self._others, gradients, *self._moments, [], self._counts, fused=True,
                 amsgrad=False, beta1=0.9, beta2=0.999, lr=self._step_size * scale,
                 weight_decay=0.0, eps=1e-8, maximize=False,
             )  # fmt: skip
-            for parameter in parameters:
+            for parameter in self._others:
                 parameter.grad = None
             for matrix, momentum in zip(self._matrices, self._momenta, strict=True):
                 if matrix.grad is None:
