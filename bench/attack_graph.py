@@ -34,7 +34,6 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -48,7 +47,7 @@ from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.running import message_class
+from musculoskeletal_ae.nodes.running import Spinner, message_class
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
@@ -128,8 +127,7 @@ class Attack:
         self.namespace = f'/attack_{os.getpid()}'
         rclpy.init()
         self.node = rclpy.create_node('stranger', namespace=self.namespace)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        self.executor = Spinner(self.node)
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
@@ -224,19 +222,11 @@ class Attack:
             self.found('samples survive', f'{self.samples} samples accepted, {accepted} now')
         self.samples = accepted
 
-    def handle(self) -> None:
-        """Handle one message.
-
-        The timeout is always the same: at another one rclpy waits anew and takes the first entity
-        that is ready, so that on a slow machine the first topic's messages are all it handles.
-        """
-        self.executor.spin_once(timeout_sec=0.05)
-
     def spin(self, seconds: float) -> None:
         """Handle messages for a while, and look after the processes."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.handle()
+            self.executor.look(0.05)
             if time.monotonic() > self._looked + 1.0:
                 self._looked = time.monotonic()
                 for name, process in self.processes.items():
@@ -425,7 +415,7 @@ class Attack:
             topic = rng.choice(topics)
             for _ in range(min(left, rng.choice((1, 1, 1, 30, 300)))):
                 self.publish(*topic)
-                self.handle()
+                self.executor.look(0.05)
             if topic[0].endswith(LATCHING):
                 self.spin(0.1)
                 self.node.destroy_publisher(self.publishers.pop(topic[0]))

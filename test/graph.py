@@ -27,6 +27,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
+LOOK = 0.05  # [s] until a condition is looked at again
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 
@@ -69,17 +70,6 @@ class Process:
         return self.process.returncode, output
 
 
-class Executor(LeanExecutor):
-    """The nodes' own executor, a look at a time."""
-
-    _patience = 50_000_000  # [ns] until a condition is looked at again
-
-    def look(self) -> None:
-        """Handle what there is, or wait a moment for something."""
-        if not self._spin_messages():
-            self._spin_rest()
-
-
 class Graph:
     """A node of the test, what it received, and the processes it started."""
 
@@ -88,7 +78,7 @@ class Graph:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node('test', context=self.context, namespace=namespace)
-        self.executor = Executor(context=self.context)
+        self.executor = LeanExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
@@ -152,7 +142,7 @@ class Graph:
         """Handle messages for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.look()
+            self.executor.look(LOOK)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Handle messages until a condition holds; fail with what was waited for."""
@@ -164,7 +154,7 @@ class Graph:
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
                 raise AssertionError(f'waited {deadline:g} s in vain for {what}; {self._told()}')
-            self.executor.look()
+            self.executor.look(LOOK)
         return value
 
     def next(self, topic: str, count: int = 1) -> Any:

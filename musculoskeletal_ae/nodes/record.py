@@ -94,7 +94,7 @@ def _record(options: Namespace, arguments: list[str]) -> None:
         drained, before = time.monotonic() + DRAIN_TIME, -1
         while time.monotonic() < drained and node.received != before:
             before = node.received
-            spinner.spin_once(timeout_sec=0.05)
+            spinner.look(0.05)
         node.destroy_node()
     if node.timeless:
         told = 'messages came before the first /clock, and are left out'

@@ -122,7 +122,7 @@ class Replay(Node):
                 wait = min(wait, max(self._next_tick - now, 0.0))
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
-                self._spinner.spin_once(timeout_sec=wait)
+                self._spinner.look(wait)
                 if now > self._next_report:
                     self._next_report = now + 1.0
                     seconds = self._before + np.array([self._done(), self.length])

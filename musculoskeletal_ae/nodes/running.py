@@ -93,7 +93,6 @@ class LeanExecutor(SingleThreadedExecutor):
     _urgent: tuple[tuple[list[Any], Any, str, Any], ...] = ()
     _actions: tuple[Any, ...] = ()
     _rest_at = _next_piece = 0.0
-    _patience = EVENTS_EVERY * S_TO_NS  # [ns]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -104,8 +103,12 @@ class LeanExecutor(SingleThreadedExecutor):
         """Spin until shutdown."""
         with self._held:
             while self.context.ok() and not self._is_shutdown:
-                if not self._spin_messages():
-                    self._spin_rest()
+                self.look(EVENTS_EVERY)
+
+    def look(self, longest: float) -> None:
+        """Run what there is to run, or wait at most so long [s] for something."""
+        if not self._spin_messages(int(longest * S_TO_NS)):
+            self._spin_rest()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Let go of the node's entities, and of this executor's own."""
@@ -114,7 +117,7 @@ class LeanExecutor(SingleThreadedExecutor):
         self._held.close()
         return super().shutdown(timeout_sec)
 
-    def _spin_messages(self) -> bool:
+    def _spin_messages(self, longest: int) -> bool:
         """Wait, and run what messages and timers ask for; False if there may be more to do."""
         if self._wait_set is None:
             self._build()
@@ -125,7 +128,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 add(entity.handle)
         for action in self._actions:
             action.add_to_wait_set(waiting)
-        waiting.wait(self._pause() if self._begun else self._patience)
+        waiting.wait(self._pause() if self._begun else longest)
         if not self.context.ok():
             raise ExternalShutdownException
         for entities, _, kind, take in self._urgent:
@@ -306,8 +309,8 @@ def message_class(type_name: str) -> Any:
         ) from error
 
 
-class Spinner(SingleThreadedExecutor):
-    """Spins the node of a tool, as long as the tool wants."""
+class Spinner(LeanExecutor):
+    """Spins the node of a tool, as long as the tool wants; what escapes a callback ends it."""
 
     def __init__(self, node: Node) -> None:
         super().__init__()
@@ -317,7 +320,10 @@ class Spinner(SingleThreadedExecutor):
         """Handle what comes until a condition holds, at most so long [s]."""
         end = time.monotonic() + longest
         while not condition() and (left := end - time.monotonic()) > 0.0:
-            self.spin_once(timeout_sec=min(0.1, left))
+            self.look(min(0.1, left))
+
+    def _escaped(self, _entity: Any, error: Exception) -> None:
+        raise error
 
 
 def start_ros(arguments: list[str]) -> None:

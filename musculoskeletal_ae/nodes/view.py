@@ -19,6 +19,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3, WrenchStamped
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -29,7 +30,7 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
@@ -79,7 +80,8 @@ class View(Node):
         self.ruptured: list[str] = []
         self.payload = 0.0
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
-        self.spinner = Spinner(self)
+        self.answers = SingleThreadedExecutor()
+        self.answers.add_node(self)
         self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
         self.pushes: list[Any] = []
         if not options.read_only:
@@ -131,7 +133,7 @@ class View(Node):
                 while message := each.handle.take_message(each.msg_type, each.raw):
                     each.callback(*message)
         for _ in range(len(self.pending) + 1 if self.pending else 0):
-            self.spinner.spin_once(timeout_sec=0.0)
+            self.answers.spin_once(timeout_sec=0.0)
         waiting, self.pending = self.pending, []
         for since, future, answered in waiting:  # an executor would call back one request later
             if future.done():
