@@ -107,7 +107,10 @@ def run(
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start)
+    # What takes seconds to import is imported once, by the server from which workers are forked.
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload([__name__, 'torch'])
+    return ProcessPoolExecutor(jobs, context, _start)
 
 
 def _measure(name: str, study: Study, seed: int) -> Measured:
