@@ -102,7 +102,7 @@ def main() -> None:
                 if not frames:
                     time.sleep(3.0)  # the warning that there is no graphics card comes late
                     browser.close_notifications()
-                time.sleep(0.2)
+                time.sleep(0.5)
                 shot = Image.open(io.BytesIO(browser.screenshot(Path(profile) / 'frame.png')))
                 frames.append(shot.convert('RGB').resize(SCALED, Image.Resampling.LANCZOS))
         finally:

@@ -113,10 +113,8 @@ class SampleStore:
 
     def is_new(self, sample: Sample) -> bool:
         """Whether a sample differs enough from every stored one."""
-        stored = np.array([self._scaled(s) for s in self.samples])
-        return not self.samples or bool(
-            np.nanmax(np.abs(stored - self._scaled(sample)), axis=1).min() > 1.0
-        )
+        *stored, new = self._scaled([*self.samples, sample])
+        return not stored or bool(np.nanmax(np.abs(stored - new), axis=1).min() > 1.0)
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
         """Store a sample, as the newest; `known` and `number` are given to one stored before."""
@@ -152,17 +150,18 @@ class SampleStore:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
-    def _scaled(self, sample: Sample) -> Array:
+    def _scaled(self, samples: Sequence[Sample]) -> Array:
+        """Return samples as points (N, D + 2 M), NaN where something does not count."""
+        theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         distances = self._settings.new_joint_distance, self._settings.new_tension_distance
-        joint, tension = (max(distance, LEAST_DISTANCE) for distance in distances)
-        unread = np.isnan(sample.theta).any()
+        joint, pull = (max(distance, LEAST_DISTANCE) for distance in distances)
+        unread = np.isnan(theta).any(axis=1, keepdims=True)
         # Of a posture that was not read the lengths tell whether it is another one.
-        length = sample.length / (MOMENT_ARM * joint) if unread else np.nan * sample.length
-        theta = sample.theta / (joint * self._radian)
-        return np.concatenate([theta, sample.tension / tension, length])
+        told = np.where(unread, length / (MOMENT_ARM * joint), np.nan)
+        return np.concatenate([theta / (joint * self._radian), tension / pull, told], axis=1)
 
     def _dispensable(self) -> int:
-        points = np.nan_to_num(np.array([self._scaled(s) for s in self.samples]))
+        points = np.nan_to_num(self._scaled(self.samples))
         square = np.sum(points**2, axis=1)
         distance = square[:, None] + square - 2.0 * points @ points.T
         distance[np.diag_indices_from(distance)] = np.inf

@@ -126,11 +126,12 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         *_jumping_muscles(robot),
         *_idle_objects(robot, theta),
     )
-    return replace(result, warnings=(*result.warnings, *suspicious))
+    faults = (*result.faults, *_inertia_faults(robot, theta))
+    return replace(result, faults=faults, warnings=(*result.warnings, *suspicious))
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Measure and judge a robot in given postures; errors as for `check_robot`."""
+    """Measure and judge the muscles of a robot in given postures; errors as for `check_robot`."""
     robot, theta, jacobian, hessian, torque = setting
     bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
@@ -156,7 +157,6 @@ def judge(setting: Setting) -> RobotCheck:
         *_wrong_signs(robot, arms),
         *_one_way_joints(robot, arms, matters),
         *_useless_muscles(robot, arms, matters),
-        *_inertia_faults(robot, theta),
         *_holding_faults(robot, stiffness, required, softest, missing),
     )
     warnings = tuple(_flipping_muscles(robot, arms))

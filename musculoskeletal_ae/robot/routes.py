@@ -6,7 +6,7 @@
     G(θ)         = ∂f_geo/∂θ
 
 (paper, section "Initial Training": start, relay and end points linearly connected.) G follows from
-the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines between them. Of a
+the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines d between them. Of a
 segment that may wrap round a sphere or cylinder (`wrapping`) it is the velocity of the end points
 as seen from that object's link, projected on the directions in which the wire leaves them.
 """
@@ -70,6 +70,19 @@ class Routes:
         self._sum: Array = 1.0 * (np.arange(len(routes))[:, None] == self.muscle)
         #: segments that may wrap, and round what
         self.wrapping, self.objects = self._attach_objects(routes)
+        #: pulls of wires: of each segment on both its ends, where it may wrap of either alone;
+        #: points where they act, (Q,), which of the tree's joints lengthen it and which muscle's
+        #: they are: (Q, J−1), (M, Q), and joints of the tree that move θ, (J−1, D)
+        ends = self.first[self.wrapping], self.second[self.wrapping]
+        self._pulled = np.concatenate([self.first, *ends])
+        carried, moved = 1.0 * kinematics.hangs_on[:, 1:], self.joint
+        self._share = carried[moved[self.second]] - carried[moved[self.first]]
+        if self.objects is not None:
+            apart = [carried[self.objects.joint] - carried[moved[end]] for end in ends]
+            self._share = np.concatenate([self._share, *apart])
+        own = self._sum[:, self.wrapping]
+        self._gather = np.concatenate([self._sum, own, own], axis=1)
+        self._of_theta = kinematics.ratio[1:, None] * of_theta
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
 
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
@@ -164,35 +177,16 @@ class Routes:
         points = self.placed(poses)
         line = points[:, self.second] - points[:, self.first]
         norm = np.linalg.norm(line, axis=-1, keepdims=True)
-        direction = np.divide(line, norm, out=np.zeros_like(line), where=norm > 0.0)
+        pull = np.divide(line, norm, out=np.zeros_like(line), where=norm > 0.0)
+        at = points[:, self._pulled]
         if self.objects is not None:
-            wraps, link = self.wrapping, self.objects.joint
             _, leave, arrive = self._wrapped(poses, points)
-            ends = self.first[wraps], self.second[wraps]
-            direction[:, wraps] = 0.0
-        jacobian = np.zeros((len(theta), len(self._sum), theta.shape[1]))
-        for i in range(1, len(kin.parent)):
-            k, hangs = kin.theta_index[i], kin.hangs_on[:, i]
-            moves = hangs[self.joint]
-            # A segment whose ends both move, or both stay, keeps its length.
-            across = np.flatnonzero(moves[self.first] != moves[self.second])
-            outer = moves[self.second[across]]
-            end = np.where(outer, self.second[across], self.first[across])
-            motion = self._motion(poses, i, points[:, end])
-            sign = np.where(outer, kin.ratio[i], -kin.ratio[i])
-            longer = np.einsum('nsi,nsi,s->ns', direction[:, across], motion, sign)
-            jacobian[:, :, k] += longer @ self._sum.T[across]
-            if self.objects is not None:
-                for end, pull in zip(ends, (leave, arrive)):
-                    seen = kin.ratio[i] * (1.0 * moves[end] - hangs[link])
-                    motion = self._motion(poses, i, points[:, end])
-                    longer = np.einsum('nsi,nsi,s->ns', pull, motion, seen)
-                    jacobian[:, :, k] -= longer @ self._sum.T[wraps]
-        return jacobian
-
-    def _motion(self, poses: JointPoses, i: int, points: Array) -> Array:
-        """Return ∂/∂q of points (N, S, 3) that joint i of the tree moves, the same shape."""
-        axis = np.broadcast_to(poses.axis[:, i, None], points.shape)
-        if self._kinematics.prismatic[i]:
-            return axis
-        return np.cross(axis, points - poses.translation[:, i, None])
+            pull[:, self.wrapping] = 0.0
+            pull = np.concatenate([pull, leave, arrive], axis=1)
+        # d · (a × (p − o)) = a · (p × d) + (o × a) · d
+        axis, origin = poses.axis[:, 1:], poses.translation[:, 1:]
+        slides = kin.prismatic[1:, None]
+        turn, shift = np.where(slides, 0.0, axis), np.where(slides, axis, np.cross(origin, axis))
+        screw = np.concatenate([turn, shift], axis=-1).swapaxes(-1, -2)
+        longer = np.concatenate([np.cross(at, pull), pull], axis=-1) @ screw
+        return self._gather @ (self._share * longer) @ self._of_theta

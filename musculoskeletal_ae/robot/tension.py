@@ -8,6 +8,7 @@
 control experiment; T_desired = 0.3 T_limit the well-tensed arm by which `check_robot` judges.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,9 +43,11 @@ class TensionProgramme:
     ) -> None:
         """State G [m/rad] (M, D), τ [N·m] (D,) and the limits [N], scalar or (M,)."""
         self._jacobian, self._torque, self._count = muscle_jacobian, torque, len(muscle_jacobian)
-        eye, low = np.eye(self._count), np.broadcast_to(low, self._count)
-        self._constraints = np.hstack([-muscle_jacobian, eye, -eye])
-        self._bounds = np.concatenate([torque, low, -np.maximum(high, low + ROOM)])
+        self._eye, limits = _unit(self._count)
+        self._constraints = np.concatenate([-muscle_jacobian, limits], axis=1)
+        least = np.empty(self._count)
+        least[:] = low
+        self._bounds = np.concatenate([torque, least, -np.maximum(high, least + ROOM)])
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
@@ -62,12 +65,12 @@ class TensionProgramme:
 
     def nearest(self, desired: Array | float) -> Array:
         """Return the hard form: of all tensions the nearest to desired ones [N]."""
-        return self.minimum(np.eye(self._count), np.full(self._count, desired, dtype=float))
+        return self.minimum(self._eye, np.full(self._count, desired, dtype=float))
 
     def compromise(self) -> Exertion:
         """Return the soft form: what comes nearest to the torque, and of that the least."""
         jacobian = self._jacobian
-        quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * np.eye(self._count)
+        quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * self._eye
         tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
         return Exertion(tension, self._torque + jacobian.T @ tension)
 
@@ -102,6 +105,13 @@ def least_tension(
         return Exertion(programme.nearest(desired), np.zeros(len(torque)))
     except InfeasibleError:
         return programme.compromise()
+
+
+@cache
+def _unit(count: int) -> tuple[Array, Array]:
+    """Return the unit matrix, and with its negative the normals of limits: never written to."""
+    eye = np.eye(count)
+    return eye, np.hstack([eye, -eye])
 
 
 def _require_finite(*parts: Array) -> None:

@@ -26,6 +26,11 @@ OPTIONS = (
     '--hide-scrollbars',
 )
 DEADLINE = 120.0  # [s]
+#: pictures a second are few: without a graphics card each takes a core for a while
+SLOWLY = """
+const soon = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 100);
+"""
 #: every text on the page, shadow trees excepted
 TEXT = 'document.body ? document.body.innerText : ""'
 
@@ -44,7 +49,7 @@ class Browser:
         assert program is not None
         window = f'--window-size={size[0]},{size[1]}'
         self._process = subprocess.Popen(
-            [program, *OPTIONS, window, f'--user-data-dir={profile}', url],
+            [program, *OPTIONS, window, f'--user-data-dir={profile}', 'about:blank'],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -61,6 +66,9 @@ class Browser:
             self.call(
                 'Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics
             )
+            self.call('Page.enable')
+            self.call('Page.addScriptToEvaluateOnNewDocument', source=SLOWLY)
+            self.call('Page.navigate', url=url)
         except BaseException:
             self._process.kill()
             raise
