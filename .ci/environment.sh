@@ -232,9 +232,31 @@ requirements_stamp() { # FILE…
   } | sha256sum
 }
 
+# The page is tested in a real browser. Where there is none, and we may, as in CI, it is installed.
+lacks_chromium() {
+  ! command -v chromium chromium-browser google-chrome >/dev/null &&
+    [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null
+}
+
+install_chromium() {
+  export DEBIAN_FRONTEND=noninteractive
+  apt-get update &&
+    apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends chromium
+}
+
+# Usage: beside FUNCTION COMMAND…   Runs both at once; the status is the command's.
+beside() {
+  local status=0
+  "$1" &
+  shift
+  "$@" || status=$?
+  wait
+  return $status
+}
+
 install_packages() { # [test|view]
   local file title='installing torch, pinocchio, numba and colcon'
-  local -a base=("$repository/requirements.txt") files arguments=() torch=()
+  local -a base=("$repository/requirements.txt") files arguments=() torch=() other=()
   if [ "$ros" = wheels ]; then
     base+=("$repository/.ci/requirements-ros.txt")
     title+=', the ROS 2 Jazzy wheels'
@@ -245,6 +267,7 @@ install_packages() { # [test|view]
   if [ "${1-}" = test ]; then
     files+=("$repository/.ci/requirements-test.txt")
     title+=', the test tools'
+    lacks_chromium && other=(beside install_chromium)
   fi
   if [ "$(cat "$venv/.installed${1:+-$1}" 2>/dev/null)" = "$(requirements_stamp "${files[@]}")" ]
   then
@@ -265,7 +288,8 @@ assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; t
   export PIP_USER=0 PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
   step "installing pip $PIP" "$python" -m pip install "pip==$PIP" || say 'going on with the pip of .venv'
   if ! step "$title (minutes, the first time)" \
-    "$python" -m pip install --no-compile --progress-bar off "${arguments[@]}" "${torch[@]}"; then
+    "${other[@]}" "$python" -m pip install --no-compile --progress-bar off \
+    "${arguments[@]}" "${torch[@]}"; then
     rm -f "$venv/.installing"
     fail "The packages could not be installed (log: $setup_log). Is the network there?" \
       "Run the same command again to go on."
@@ -273,16 +297,6 @@ assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; t
   rm -f "$venv/.installing"
   requirements_stamp "${base[@]}" >"$venv/.installed"
   [ -z "${1-}" ] || requirements_stamp "${files[@]}" >"$venv/.installed-$1"
-}
-
-# The page is tested in a real browser. Where there is none, and we may, as in CI, it is installed.
-install_chromium() {
-  command -v chromium chromium-browser google-chrome >/dev/null && return
-  [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null || return 0
-  export DEBIAN_FRONTEND=noninteractive
-  step 'installing chromium with apt-get' bash -c 'apt-get update &&
-    apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends chromium' ||
-    say 'no chromium: the page is not tested in a browser'
 }
 
 # --- colcon --------------------------------------------------------------------------------------
@@ -371,7 +385,10 @@ environment_setup() { # [test|view]
   # The wheels are an installation of ROS like any other.
   [ "$ros" = wheels ] && export AMENT_PREFIX_PATH=$venv
   install_packages "$@"
-  [ "${1-}" != test ] || install_chromium
+  if [ "${1-}" = test ] && lacks_chromium; then
+    step 'installing chromium with apt-get' install_chromium ||
+      say 'no chromium: the page is not tested in a browser'
+  fi
   build_package
   exec {lock}>&-
 
