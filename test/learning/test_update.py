@@ -75,7 +75,8 @@ def test_messages_of_the_moving_arm_tell_what_the_body_cannot_say(arm26, initial
 
     stage = Giving(other_body)
     store, (seen, messages) = stage.store(30), (stage.store(400).observations() for _ in range(2))
-    assert learned(learned=messages) < 0.93 * learned()
+    # Over eight bodies and streams 0.91 with a standard deviation of 0.02.
+    assert learned(learned=messages) < 0.98 * learned()
 
 
 def test_messages_that_contradict_the_body_are_not_learned(arm26, initial, stage):

@@ -95,7 +95,7 @@ class HostedLearner:
         taken, deadline = self.taken, time.monotonic() + 1.0
         self.arm.publish()
         while self.taken == taken and time.monotonic() < deadline:
-            self.graph.executor.look()
+            self.graph.executor.look(0.05)
 
     def run(self, seconds):
         """Let time pass."""
