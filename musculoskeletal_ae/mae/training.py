@@ -236,7 +236,8 @@ def initial_mae(
     count = chosen.steps(robot.groups) if steps is None else steps
     settings = replace(chosen.training, steps=count)
     rng = np.random.default_rng(seed)
-    samples = training_states(robot, preset, settings.samples, rng).scaled()
+    drawn = min(settings.samples, count * settings.batch)  # of a short training: in one epoch
+    samples = training_states(robot, preset, drawn, rng).scaled()
     if chosen.network.standardise:
         mean, std = samples.mean(axis=0), np.maximum(samples.std(axis=0), LEAST_SPREAD)
     else:
