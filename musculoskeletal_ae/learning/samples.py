@@ -113,8 +113,8 @@ class SampleStore:
 
     def is_new(self, sample: Sample) -> bool:
         """Whether a sample differs enough from every stored one."""
-        *stored, new = self._scaled([*self.samples, sample])
-        return not stored or bool(np.nanmax(np.abs(stored - new), axis=1).min() > 1.0)
+        points = self._scaled([*self.samples, sample])
+        return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
         """Store a sample, as the newest; `known` and `number` are given to one stored before."""
