@@ -4,6 +4,7 @@
 # Runs the whole system on the emulated arm, or on your own. This is the launch file: what is started, with which
 # parameters, stands at the end, under "The system".
 set -u
+unset CDPATH # with it, cd would print where it went
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
 
 usage() {
@@ -285,8 +286,8 @@ train_once() {
     > >(tee "$logs/train.log") 2>&1
   watch_until_ended train || status=$?
   [ $status -eq 0 ] || died train $status
-  mv -f "$training"/* "$cache"/
-  rmdir "$training"
+  mv -f "$training/$(basename "$checkpoint")" "$checkpoint" || exit 1
+  rm -rf "$training"
   training=
 }
 

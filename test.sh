@@ -6,6 +6,7 @@
 #     ./test.sh                    everything
 #     ./test.sh -x -k estimator    what pytest understands
 set -u
+unset CDPATH # with it, cd would print where it went
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"

@@ -15,6 +15,7 @@ TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 TYPESTORE.max_sequence_length = 1 << 26
 
 ENCODING = 'ros2msg'
+ORDERS = {b'\0\0': False, b'\0\1': True}  # of bytes: whether the lowest comes first
 _LONGEST = 1 << 18  # [bytes] of a definition, ten times that of any type here
 
 
@@ -36,9 +37,17 @@ def type_hash(type_name: str) -> str:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Return the message in serialized bytes; a ValueError says that they are none of the type."""
+    """Return the message in serialized bytes; a ValueError says that they are none of the type.
+
+    As for ROS, more may follow: rmw_fastrtps sends all that it reserved, and it reserves too much.
+    """
+    little_endian = ORDERS.get(bytes(data[:2]))
+    if little_endian is None:
+        raise ValueError(f'not a {type_name}: {data[:2].hex()} is no encapsulation of CDR')
+    kind = TYPESTORE.get_msgdef(type_name)
+    read = kind.deserialize_cdr_le if little_endian else kind.deserialize_cdr_be
     try:
-        return TYPESTORE.deserialize_cdr(data, type_name)
+        return read(data[4:], 0, kind.cls, TYPESTORE)[0]
     # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes
     # that are not a message; all of them mean the same.
     except Exception as error:

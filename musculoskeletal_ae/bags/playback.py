@@ -128,8 +128,12 @@ def shown(bag: Bag, topic: str, start: int, stop: int) -> Shown:
         problem = f'{topic} goes on for {span:.0f} s, and a trajectory for {longest:.0f} s at most'
         raise BagError(bag.path, problem, 'choose a part by --start and --duration')
     time = np.linspace(seen[0], seen[-1], max(2, round((seen[-1] - seen[0]) / SPACING)) + 1)
-    weight = np.exp(-0.5 * ((time[:, None] - seen) / SMOOTHING) ** 2)
-    smooth = weight @ theta / weight.sum(axis=1, keepdims=True)
+    # What lies further off than the longest hole weighs nothing.
+    ends = np.searchsorted(seen, [time - LONGEST_HOLE, time + LONGEST_HOLE]).T
+    smooth = np.empty((len(time), len(joints)))
+    for n, (first, last) in enumerate(ends):
+        weight = np.exp(-0.5 * ((time[n] - seen[first:last]) / SMOOTHING) ** 2)
+        smooth[n] = weight @ theta[first:last] / weight.sum()
     velocity = np.gradient(smooth, time, axis=0)
     velocity[[0, -1]] = 0.0
     return Shown(joints, LEAD + time - time[0], smooth, velocity)

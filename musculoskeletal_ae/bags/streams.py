@@ -123,13 +123,18 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
     start, told = bag.start, list[str]()
     reception = Reception(told.append)
-    receive = {name: reception.of(name, topic.take, lambda: 1) for name, topic in topics.items()}
+    receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
     # Who is isolated first: the recorder may have heard of them later than of what they read.
     early = [name for name, topic in topics.items() if topic is isolated]
     for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
-        content = (message.log_time - start) / 1e9, bag.decode(message)
+        decoded = bag.decode(message)
+        # Who publishes some of the joints only has a clock of its own.
+        sender = message.topic, *getattr(decoded, 'name', ())
+        if sender not in receive:
+            take = topics[message.topic].take
+            receive[sender] = reception.of(message.topic, take, lambda: 1)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
-        receive[message.topic](content, sent)
+        receive[sender](((message.log_time - start) / 1e9, decoded), sent)
     for topic, stream in topics.items():
         why = [each.partition(f' {topic}: ')[2] for each in told if f' {topic}: ' in each]
         if why and not stream.values:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
@@ -133,7 +133,8 @@ class BagWriter:
         if kind is None:
             self.close()
         else:
-            self._file.close()
+            with suppress(OSError):  # what Python still holds: the first error says why
+                self._file.close()
 
     def _write_metadata(self, finished: bool) -> None:
         # Counts come with the end: until then readers go by what is in the mcap file.

@@ -215,9 +215,10 @@ class Controller:
         else:
             planned = Trajectory.through(start, points, max(-delay, 0.0))
             # One that is slowed and starts in motion takes another way.
-            planned.scaled(slowness(robot, mae, planned, self.settings)).check(robot)
+            slower = slowness(robot, mae, planned, self.settings)
+            planned.scaled(slower).check(robot)
             self._within_reach(planned.end, nearest=False)
-            self._follow(planned, max(delay, 0.0))
+            self._follow(planned, max(delay, 0.0), slower=slower)
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Bring the end effector to a pose in the root link's frame, or to its position only.
@@ -281,7 +282,13 @@ class Controller:
         inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
         return Setpoint.resting(inside), self.mae
 
-    def _follow(self, planned: Trajectory, delay: float = 0.0, effort: Array | None = None) -> None:
+    def _follow(
+        self,
+        planned: Trajectory,
+        delay: float = 0.0,
+        effort: Array | None = None,
+        slower: float | None = None,
+    ) -> None:
         if not self.follows or self._starts:
             self._explore(False)
             self.motion.start()
@@ -290,7 +297,7 @@ class Controller:
         self.follows, self._starts, self.clamped, self.short = True, False, (), ''
         self._approaches = 0
         try:
-            self.motion.follow(planned, delay)
+            self.motion.follow(planned, delay, slower)
             self.motion.exert(np.zeros(self.robot.joint_count) if effort is None else effort)
         except Exception as error:  # noqa: BLE001 (as in `step`)
             self.stop(f'fault of control: {type(error).__name__}: {error}')
@@ -334,7 +341,7 @@ class Controller:
         """Clear a stop and go on to the last target; return why not, or ''."""
         cause = self.watch.present_cause(now)
         if not cause and self.safety.cause:
-            self.safety.cause = ''
+            self.safety.cause, self.safety.passing = '', False
             self._starts = True
         return cause
 

@@ -129,10 +129,17 @@ class MotionControl:
         self._feedback.reset()
         self.winches.forget()
 
-    def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
-        """Follow a trajectory from `delay` [s] on, in the place of all that was to come after."""
+    def follow(
+        self, trajectory: Trajectory, delay: float = 0.0, slower: float | None = None
+    ) -> None:
+        """Follow a trajectory from `delay` [s] on, in the place of all that was to come after.
+
+        It is passed `slower` times later, its `slowness` where that is not known yet.
+        """
         assert self._mae is not None
-        trajectory = trajectory.scaled(slowness(self._robot, self._mae, trajectory, self.settings))
+        if slower is None:
+            slower = slowness(self._robot, self._mae, trajectory, self.settings)
+        trajectory = trajectory.scaled(slower)
         if delay > 0.0:
             self.next = trajectory, delay
         else:
@@ -286,8 +293,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they change
     suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
-    time = trajectory.moments
-    theta = trajectory.sample(time).theta
+    time, theta = trajectory.path
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
     return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))

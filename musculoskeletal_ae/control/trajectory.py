@@ -29,6 +29,7 @@ from musculoskeletal_ae.robot.robot import Robot
 BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
 STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
 SAMPLES, WITHIN = 200, 5  # of a trajectory that are looked at, and of each piece at least
+RESOLUTION = 1e-11  # share of a time that there is to the next, or doubles cannot tell any between
 #: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
 CUBIC = np.array(
@@ -88,13 +89,15 @@ class Trajectory:
     def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
         """Lead through points, `passed` [s] after the time that they count from.
 
-        A MessageError says that no point is left.
+        A MessageError says that no point is left, or that two are as good as at the same time.
         """
         kept = points.time > passed + 1e-9
         if not kept.any():
             raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
         time, position = points.time[kept] - passed, points.position[kept]
+        if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
+            raise MessageError('points too close in time', f'{apart.min():.3g} s apart')
         left = Points(points.joints, time, position, velocity, acceleration)
         return cls._joined(start, left)
 
@@ -136,7 +139,7 @@ class Trajectory:
 
     def check(self, robot: Robot) -> None:
         """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
-        theta = self.sample(self.moments).theta
+        _, theta = self.path
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         if not np.isfinite(out).all():
             raise MessageError('leaves the joint limits', 'its curve is too steep for a number')
@@ -147,11 +150,12 @@ class Trajectory:
             raise MessageError('leaves the joint limits', told)
 
     @property
-    def moments(self) -> Array:
-        """Moments [s] that show each piece, and so many of all, however long it takes, (N,)."""
+    def path(self) -> tuple[Array, Array]:
+        """Moments [s] (N,) that show each piece, and so many of all, and θ [rad] (N, D) then."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
-        return np.append(inner.ravel(), self.time[-1])
+        theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
+        return np.append(inner.ravel(), self.time[-1]), np.vstack([*theta, self.end])
 
     @property
     def duration(self) -> float:

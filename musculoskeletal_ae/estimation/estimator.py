@@ -111,8 +111,10 @@ class Estimator:
     def isolate(self, muscles: Iterable[int]) -> None:
         """Go on without these muscles, places in T and l, and with all others.
 
-        A suspect among the others is verified no longer; what was detected stays.
+        A suspect among the others is verified no longer; what was detected stays. Zeros that are
+        being found are looked for anew.
         """
+        before = self._robot.isolated
         self._robot.isolate(muscles)
         suspect = self._verification
         if suspect is not None and self._robot.used[suspect.muscle]:
@@ -120,6 +122,8 @@ class Estimator:
         if self._whole is not None:
             self.use(self._whole)
         self.detector.reset()
+        if self._zeroing is not None and self.mae is not None and self._robot.isolated != before:
+            self._zeroing = Zeroing(self._robot, self.mae, self._zeroing.posture)
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None

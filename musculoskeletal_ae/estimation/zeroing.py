@@ -106,7 +106,7 @@ class Zeroing:
 
     def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
         """Find zeros with a network; `posture` [rad] (D,) if the arm stands in a known one."""
-        self._robot, self._mae, self._posture = robot, mae, posture
+        self._robot, self._mae, self.posture = robot, mae, posture
         self._rng = np.random.default_rng([0, 0x2E])
         self._direction = FrictionDirection()
         self._window: list[tuple[Array, Array, Array]] = []  # T, l, s
@@ -143,7 +143,7 @@ class Zeroing:
     @property
     def stands(self) -> bool:
         """Whether the arm is said to stand in a posture."""
-        return self._posture is not None
+        return self.posture is not None
 
     @property
     def enough(self) -> float:
@@ -168,7 +168,7 @@ class Zeroing:
         """Take T [N] and readings of l [m] (M,), dt [s] after the last, and θ (D,) if measured."""
         if self.done or (self.stands and self.trouble):
             return
-        known = self._posture if self.stands else theta
+        known = self.posture if self.stands else theta
         tension, length = tension * self._used, length * self._used
         self._window.append((tension, length, self._direction.step(length)))
         self._angles += [] if known is None else [known]

@@ -59,6 +59,21 @@ NICENESS = 5  # of nodes that no command waits for
 ASLEEP: Any = SimpleNamespace(trigger=lambda: None)
 
 
+_interrupts: list[int] = []  # signals that ended something
+
+
+def interrupt(number: int, _: object) -> None:
+    """End by a KeyboardInterrupt, and note it: what rclpy makes of one while it takes is not."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def _note_interrupts() -> None:
+    _interrupts.clear()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not one that is ignored
+        signal.signal(signal.SIGINT, interrupt)
+
+
 def reason(error: Exception) -> str:
     """Return what rcl says is wrong, without where in its sources it says so."""
     return ' '.join(str(error).split(', at /')[0].split())
@@ -226,7 +241,8 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _escaped(self, entity: Any, error: Exception) -> None:
         # The end, asked for by a callback or by a signal while it took or published, is none.
-        if isinstance(error, ExternalShutdownException) or not self.context.ok():
+        asked = isinstance(error, ExternalShutdownException) or _interrupts
+        if asked or not self.context.ok():
             raise ExternalShutdownException from error
         named = getattr(entity, 'topic_name', None) or getattr(entity, 'srv_name', None)
         nodes: list[Any] = self.get_nodes()
@@ -256,6 +272,7 @@ def run(name: str) -> None:
             sys.exit(2)
         check_names(parameters_given(given), name)
         modules = [load(f'musculoskeletal_ae.nodes.{each}') for each in own]
+        _note_interrupts()  # before rclpy's handler is there, which calls this one
         rclpy.init()
         with LeanExecutor() as executor:
             for module, each in zip(modules, own, strict=True):
@@ -323,6 +340,8 @@ class Spinner(LeanExecutor):
             self.look(min(0.1, left))
 
     def _escaped(self, _entity: Any, error: Exception) -> None:
+        if _interrupts:
+            raise KeyboardInterrupt from error
         raise error
 
 
@@ -344,7 +363,8 @@ def run_tool(
     that something cannot be used, 2 that an option is wrong.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    _note_interrupts()
+    signal.signal(signal.SIGTERM, interrupt)
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])
     for given in parameters_given(arguments):

@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 
 from bags.bare_file import FLOAT, write
+from bench import bag_samples as samples
 from musculoskeletal_ae.bags import message_types
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
@@ -76,3 +79,11 @@ def test_bytes_that_are_no_message_are_a_value_error(data):
         if type_name != FLOAT or len(data) < 12:
             with pytest.raises(ValueError, match=f'not a {type_name}: '):
                 message_types.decode(data, type_name)
+
+
+def test_what_rmw_reserves_beyond_a_message_is_no_damage():
+    data = serialize_message(JointState(name=['elbow'], position=[1.0]))
+    read = message_types.decode(data, 'sensor_msgs/msg/JointState')
+    again = samples.encode(read, 'sensor_msgs/msg/JointState')
+    assert len(again) + 4 <= len(data) and data.startswith(again)
+    assert read.name == ['elbow'] and read.position.tolist() == [1.0]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+import tracemalloc
 
+import numpy as np
 import pytest
 
 from bags.arm_bag import JOINTS, Arm, joints
@@ -109,3 +111,18 @@ def test_what_was_shown_is_of_the_joints_that_most_messages_name(tmp_path):
 def test_a_motion_that_no_controller_could_follow_is_refused(tmp_path, times, told):
     with pytest.raises(BagError, match=told):
         motion(tmp_path, times)
+
+
+def test_a_long_motion_takes_no_memory_for_every_pair_of_point_and_message(tmp_path):
+    times = [0.01 * k for k in range(1, 6001)]
+    tracemalloc.start()
+    try:
+        taught = motion(tmp_path, times)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 2e7  # 600 points by 6000 messages: 2.9e7 bytes, and several of them
+    # Of a straight line the weighted mean is the line, away from its ends.
+    middle = slice(10, -10)
+    expected = 0.5 + 0.1 * (taught.time - taught.time[0] + times[0])
+    np.testing.assert_allclose(taught.theta[middle, 1], expected[middle], atol=1e-6)

@@ -191,3 +191,17 @@ def test_the_check_of_damage_fails_and_says_where(arm, tmp_path):
     file.write_bytes(data)
     (fault,) = check_bag(tmp_path / 'bag').faults
     assert 'bag_0.mcap, byte ' in fault
+
+
+def test_who_publishes_some_joints_has_a_clock_of_its_own(robot, tmp_path):
+    arm = Arm(robot)
+    for i, sample in enumerate(arm.content):
+        if sample.type == JOINTS:
+            theta = arm.theta[i // 2]
+            one, other = (joints([name], theta[[j]]) for j, name in enumerate(robot.joints))
+            arm.content[i] = sample._replace(data=one)
+            behind = sample._replace(data=other, publish_time=sample.publish_time - 20_000_000)
+            arm.content.append(behind)
+    found = streams(arm, robot, tmp_path)
+    assert not found.rejected
+    assert np.isfinite(found.joints.values).sum(axis=0).tolist() == [200, 200]

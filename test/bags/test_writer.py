@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
 import random
+import resource
 
 import pytest
 import yaml
@@ -113,3 +114,17 @@ def test_an_empty_recording_is_a_sound_bag(tmp_path):
     BagWriter(tmp_path / 'bag').close()
     bag = Bag.open(tmp_path / 'bag')
     assert (bag.message_count, bag.unfinished, list(bag.messages())) == (0, [], [])
+
+
+def test_a_full_disk_is_told_with_the_place_and_what_to_do(tmp_path, content):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, hard))
+    told = pytest.raises(BagError, match=r'bag: cannot be written: .*; name another place')
+    try:
+        with told, BagWriter(tmp_path / 'bag', 'none') as writer:
+            writer.add_topic(content[0].topic, content[0].type, [offered_qos(False)])
+            for _ in range(30_000):
+                writer.write(content[0].topic, *content[0][2:])
+            writer.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

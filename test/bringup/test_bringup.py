@@ -81,7 +81,7 @@ def statuses(output):
 
 
 def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(environment, tmp_path):
-    robot = write_robot(tmp_path / 'other')
+    robot = write_robot(tmp_path / '.other')
     with (robot / 'recording.bin').open('wb') as file:
         file.truncate(2**42)  # to read it would take an hour
     # The paper's network is trained in a few seconds.
@@ -234,6 +234,19 @@ def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments
     output, _ = run.process.communicate(timeout=DEADLINE)
     assert run.process.returncode == 2
     assert expected in output
+
+
+def test_it_finds_itself_and_robots_whatever_cd_would_print(environment):
+    command = [f'{REPOSITORY.name}/bringup.sh', '--robot', 'no_such_robot']
+    done = subprocess.run(
+        command,
+        cwd=REPOSITORY.parent,
+        env={**environment, 'CDPATH': '.'},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+    )
+    assert done.returncode == 2 and 'musashi_left_arm' in done.stderr and 'cd:' not in done.stderr
 
 
 def driver(namespace):

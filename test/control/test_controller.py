@@ -13,6 +13,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.posture import REPLAN
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -390,3 +391,26 @@ def test_a_floating_arm_stops_as_any_other_and_floats_again():
     np.testing.assert_array_equal(bench.step(400)[-1].value, bias)
     assert not bench.core.reset(bench.now)
     assert bench.step(200)[-1].value.max() > bias[0]
+
+
+def test_of_a_long_trajectory_the_network_is_asked_once_only(monkeypatch):
+    bench, asked = Bench(), []
+    bench.step(5)
+    lengths = bench.mae.lengths
+    monkeypatch.setattr(bench.mae, 'lengths', lambda *at: asked.append(len(at[0])) or lengths(*at))
+    time = 0.1 * np.arange(1.0, 1001.0)
+    bench.core.trajectory(Points(np.array([0]), time, REST[0] + 1e-3 * time[:, None], None, None))
+    assert [count for count in asked if count > 100] == [5001]
+
+
+def test_a_reset_ends_the_wait_for_fresh_data():
+    bench = Bench()
+    bench.target(REST)
+    bench.step(10)
+    bench.blind = {'muscles'}
+    bench.step(30)
+    assert bench.core.safety.passing
+    bench.blind = set()
+    bench.step(2)
+    assert bench.core.reset(bench.now) == ''
+    assert not bench.core.safety.passing

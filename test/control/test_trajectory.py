@@ -48,6 +48,15 @@ def test_points_are_passed_as_given_however_slowed(rows, order, slower):
     np.testing.assert_array_equal(trajectory.sample(0.0).theta, MIDDLE)
     np.testing.assert_allclose(trajectory.sample(1e3).theta, points.position[-1])
     assert not trajectory.sample(1e3).velocity.any()
+    time, theta = trajectory.path
+    np.testing.assert_allclose(theta, trajectory.sample(time).theta, atol=1e-9)
+
+
+def test_points_that_are_as_good_as_simultaneous_are_refused():
+    time = np.array([0.001, 3e5, 3e5 + 1e-9])  # [s] between moments of the last piece: none
+    points = Points(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
+    with pytest.raises(MessageError, match='points too close in time'):
+        Trajectory.through(Setpoint.resting(MIDDLE), points)
 
 
 @given(rows, st.integers(0, 2), st.floats(0.01, 0.99))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zeros of the lengths, found on the network's own body."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -138,3 +140,18 @@ def test_an_arm_that_carries_nothing_is_no_division_by_zero(mae):
     found = run(Zeroing(robot, mae), swinging(robot, mae), 60.0, sees=False)
     assert np.isfinite(found.zeros.offset).all()
     assert np.isfinite(found._fit.cost)
+
+
+def test_without_a_muscle_that_is_isolated_meanwhile_they_are_found_anew(robot, mae, moment):
+    estimator = Estimator(robot)
+    estimator.use(mae)
+    estimator.zero()
+    for n in range(400):
+        _, tension, length = moment(0.01 * n)
+        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+    told = str(estimator.report(4.0))
+    assert re.search('finding the length zeros: [1-4] of', told)
+    estimator.isolate(())
+    assert str(estimator.report(4.0)) == told
+    estimator.isolate((3,))
+    assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A callback that takes long gives way to what has come meanwhile."""
+"""A callback that takes long gives way to what has come meanwhile; an interrupt ends it all."""
 
+import signal
+
+import pytest
+from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import String
 
+from musculoskeletal_ae.nodes import running
 from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 from musculoskeletal_ae.nodes.running import give_way
 
@@ -58,3 +63,18 @@ def test_what_a_later_piece_lets_out_is_counted_and_the_node_goes_on(graph):
         say(publisher, 'in a later piece')
         graph.wait(lambda count=count: sum(node.rejected.values()) == count, 'the fault')
     assert node.rejected == {f'{graph.namespace}/slow: ValueError': 2}
+
+
+def test_an_interrupt_that_leaves_rclpy_as_another_error_is_an_interrupt(graph, monkeypatch):
+    monkeypatch.setattr(running, '_interrupts', [])
+
+    def interrupted(_):
+        try:
+            running.interrupt(signal.SIGINT, None)
+        except KeyboardInterrupt as error:
+            raise RuntimeError('Unable to convert call argument') from error
+
+    graph.node.create_subscription(String, 'topic', interrupted, 10)
+    say(graph.publisher(String, 'topic'), 'a')
+    with pytest.raises(ExternalShutdownException):
+        graph.wait(lambda: False, 'the end')
