@@ -44,9 +44,9 @@ def decode(data: bytes, type_name: str) -> Any:
     little_endian = ORDERS.get(bytes(data[:2]))
     if little_endian is None:
         raise ValueError(f'not a {type_name}: {data[:2].hex()} is no encapsulation of CDR')
-    kind = TYPESTORE.get_msgdef(type_name)
-    read = kind.deserialize_cdr_le if little_endian else kind.deserialize_cdr_be
     try:
+        kind = TYPESTORE.get_msgdef(type_name)
+        read = kind.deserialize_cdr_le if little_endian else kind.deserialize_cdr_be
         return read(data[4:], 0, kind.cls, TYPESTORE)[0]
     # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes
     # that are not a message; all of them mean the same.

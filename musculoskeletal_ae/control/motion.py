@@ -36,6 +36,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 PROPORTIONAL, INTEGRAL = 0.7, 4.0  # k_p; k_i [1/s]
 FRICTION = 0.05  # μ where none was learned: the mean of what hands build
 SHARE = 0.7  # of the winches' speed that lengths may use; the rest is for tensions and feedback
+MOST_MOMENTS = 12_500  # that a network is asked about; every piece of 10 000 has one still
 BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
 FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
 SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
@@ -293,7 +294,8 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they change
     suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
     """
-    time, theta = trajectory.path
+    # Of very many points fewer moments between: no command may wait for a tenth of a second.
+    time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
     return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))

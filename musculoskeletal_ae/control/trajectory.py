@@ -155,7 +155,8 @@ class Trajectory:
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
-        return np.append(inner.ravel(), self.time[-1]), np.vstack([*theta, self.end])
+        joints = len(self.end)
+        return np.append(inner, self.time[-1]), np.append(theta, self.end).reshape(-1, joints)
 
     @property
     def duration(self) -> float:

@@ -250,9 +250,8 @@ def measure(study: Study, seed: int) -> Measured:
     loop = loop_at(study.arm(seed), mae, postures[0], OURS, 1.0)
     numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
     laps = [circle(loop, *each) for each in circles(robot, mae, rng, 1 if study.quick else CIRCLES)]
-    if laps:
-        off = [np.linalg.norm(true - wanted, axis=1).mean() for wanted, true in laps]
-        numbers['hand_circle_m'] = float(np.mean(off))
+    off = [np.linalg.norm(true - wanted, axis=1).mean() for wanted, true in laps]
+    numbers['hand_circle_m'] = float(np.mean(off)) if laps else None
     traces['laps'] = laps
     felt = touch.measure(study, seed)
     return Measured(numbers | felt.numbers, traces | felt.traces)

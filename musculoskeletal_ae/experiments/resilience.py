@@ -241,8 +241,7 @@ def measure(study: Study, seed: int) -> Measured:
         'healthy_s': duration,
         'muscles': cuts,
     }
-    if arrived:
-        numbers['proposed_one_isolated_rad'] = float(np.mean(arrived))
+    numbers['proposed_one_isolated_rad'] = float(np.mean(arrived)) if arrived else None
     if free := len(arrived) - len(trapped):
         numbers['proposed_not_trapped_rad'] = (sum(arrived) - sum(trapped)) / free
     return Measured(numbers, {'one': one, 'two': two, 'healthy': whole})

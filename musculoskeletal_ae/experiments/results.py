@@ -120,12 +120,11 @@ def combined(study: Study, rows: Rows) -> dict[str, Any]:
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key in dict.fromkeys(key for row in rows for key in row):
-        values = [row[key] for row in rows if key in row]
-        first = values[0]
-        if isinstance(first, Mapping):
-            result[key] = _mean(values)
-        elif None in values:
+        values = [row[key] for row in rows if row.get(key) is not None]
+        if not values:
             result[key] = None
+        elif isinstance(first := values[0], Mapping):
+            result[key] = _mean(values)
         elif isinstance(first, str):
             result[key] = first if len(set(values)) == 1 else sorted(set(values))
         elif key.removeprefix('paper_') in TOTALS:

@@ -66,10 +66,11 @@ def measure(study: Study, seed: int) -> Measured:
         learner = pupil(study, seed, 'default', source)
         teach(learner, zip(*stream, strict=True), see)
         networks[name] = learner.mae
-    numbers = {f'{name}_rad': estimation_error(mae, held_out) for name, mae in networks.items()}
+    errors = {f'{name}_rad': estimation_error(mae, held_out) for name, mae in networks.items()}
+    numbers: dict[str, float | None] = {**errors}
     for name, key in ('all', 'ellipsoid_share'), ('none', 'none_ellipsoid_share'):
-        if networks[name].covariance is not None:
-            numbers[key] = ellipsoid_share(networks[name], held_out)
+        known = networks[name].covariance is not None
+        numbers[key] = ellipsoid_share(networks[name], held_out) if known else None
     return Measured(numbers, {})
 
 

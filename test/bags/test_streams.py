@@ -195,7 +195,7 @@ def test_the_check_of_damage_fails_and_says_where(arm, tmp_path):
 
 def test_who_publishes_some_joints_has_a_clock_of_its_own(robot, tmp_path):
     arm = Arm(robot)
-    for i, sample in enumerate(arm.content):
+    for i, sample in enumerate([*arm.content]):
         if sample.type == JOINTS:
             theta = arm.theta[i // 2]
             one, other = (joints([name], theta[[j]]) for j, name in enumerate(robot.joints))

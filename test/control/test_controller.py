@@ -398,9 +398,9 @@ def test_of_a_long_trajectory_the_network_is_asked_once_only(monkeypatch):
     bench.step(5)
     lengths = bench.mae.lengths
     monkeypatch.setattr(bench.mae, 'lengths', lambda *at: asked.append(len(at[0])) or lengths(*at))
-    time = 0.1 * np.arange(1.0, 1001.0)
-    bench.core.trajectory(Points(np.array([0]), time, REST[0] + 1e-3 * time[:, None], None, None))
-    assert [count for count in asked if count > 100] == [5001]
+    time = 0.1 * np.arange(1.0, 10_001.0)
+    bench.core.trajectory(Points(np.array([0]), time, REST[0] + 1e-4 * time[:, None], None, None))
+    assert [count for count in asked if count > 100] == [10_001]
 
 
 def test_a_reset_ends_the_wait_for_fresh_data():

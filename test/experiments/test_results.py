@@ -25,13 +25,14 @@ def test_result_json_has_means_of_the_seeds_that_have_them_but_counts_alarms(arm
         0: {'after_rad': 0.1, 'false_alarms': 1, 'first': {'error_rad': 0.2}, 'joint': 'elbow'},
         1: {'after_rad': 0.3, 'false_alarms': 2, 'first': {'error_rad': 0.4}, 'joint': 'elbow'},
     }
-    rows[1]['hand_circle_m'] = 0.01  # 0 found no circle
+    rows[0] |= {'hand_circle_m': None, 'ellipsoid_share': None}  # it found no circle
+    rows[1] |= {'hand_circle_m': 0.01, 'ellipsoid_share': None}
     content = combined(study, {seed: Measured(row, {}) for seed, row in rows.items()})
     assert content['after_rad'] == 0.2
     assert content['false_alarms'] == 3
     assert content['first']['error_rad'] == pytest.approx(0.3)
     assert content['joint'] == 'elbow'
-    assert content['hand_circle_m'] == 0.01
+    assert content['hand_circle_m'] == 0.01 and content['ellipsoid_share'] is None
     assert content['seeds']['1']['after_rad'] == 0.3
 
 
