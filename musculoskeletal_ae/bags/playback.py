@@ -130,7 +130,7 @@ def shown(bag: Bag, topic: str, start: int, stop: int) -> Shown:
     time = np.linspace(seen[0], seen[-1], max(2, round((seen[-1] - seen[0]) / SPACING)) + 1)
     # What lies further off than the longest hole weighs nothing.
     ends = np.searchsorted(seen, [time - LONGEST_HOLE, time + LONGEST_HOLE]).T
-    smooth = np.empty((len(time), len(joints)))
+    smooth: Array = np.empty((len(time), len(joints)))
     for n, (first, last) in enumerate(ends):
         weight = np.exp(-0.5 * ((time[n] - seen[first:last]) / SMOOTHING) ** 2)
         smooth[n] = weight @ theta[first:last] / weight.sum()

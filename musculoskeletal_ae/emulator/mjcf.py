@@ -20,7 +20,7 @@ from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.mjcf import resting_joints
-from musculoskeletal_ae.importing.source import names_of_all
+from musculoskeletal_ae.importing.source import names_of_all, safe_name
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
 from musculoskeletal_ae.robot.robot import Robot
@@ -240,7 +240,7 @@ def from_file(robot: Robot, file: Path) -> Any:
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
             for ball in [j.name for j in spec.joints if j.type == kinds.mjJNT_BALL]:
-                if kind == 'joint' and missing[0].startswith(f'{ball}_'):
+                if kind == 'joint' and missing[0].startswith(f'{safe_name(ball, "")}_'):
                     told = f'{ball!r} is a ball joint there, {missing[0]!r} of'
                     told = f'{told} {robot.description.directory} a part of it'
                     raise _refusal(file, f'{told}; write it as three hinges')

@@ -60,6 +60,8 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
             for via in part.findall('viaPoint'):
                 where, kind = f'muscle {name}: viaPoint', via.get('type', 'FIXPOINT')
                 at = centres[link] + numbers(via.text, 3, where)
+                if link not in source.links:
+                    at = source.place(body)[1].actInv(at)
                 if kind in ROUND:
                     if not route or isinstance(route[-1], Wrap):
                         source.note('dropped', f'muscle {name}: a {kind} via point after no point')
@@ -122,9 +124,10 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     for joint in root.findall('joint'):
         limits, kind = joint.findall('limit'), joint.get('type')
         ends = [limit.get(end) for limit in limits for end in ('lower', 'upper')]
-        if kind != 'continuous' and not (kind == 'revolute' and _endless(*ends)):
+        if kind != 'continuous' and not (kind in ONE_AXIS and _endless(*ends)):
             continue
-        joint.set('type', 'revolute')
+        if kind == 'continuous':
+            joint.set('type', 'revolute')
         for limit in limits:
             joint.remove(limit)
         ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
@@ -156,6 +159,10 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an sdf with a model')
+    if len([*root.iter('model')]) > 1 or model.find('include') is not None:
+        raise refuse(file, 'expected one model, and nothing that it includes: write it as one')
+    version = [int(part) for part in root.get('version', '1.6').split('.')]
+    frame_of_axis = '1' if version < [1, 5] else '0'  # the model's before 1.5, then the joint's
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
@@ -172,6 +179,10 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         return pin.SE3(pin.rpy.rpyToMatrix(*values[3:]), values[:3])
 
     links = unique('link', ((e.get('name', ''), e) for e in model.findall('link')))
+
+    def placed(link: str) -> pin.SE3:
+        return pose(model) * pose(links[link])
+
     hung = ((e.findtext('child', '').strip(), e) for e in model.findall('joint'))
     carried_by = unique('child of a joint', hung, 'one joint for each link')
     above = {name: e.findtext('parent', '').strip() for name, e in carried_by.items()}
@@ -187,15 +198,21 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     stands: dict[str, tuple[int, pin.SE3]] = {}
     for name in order:
         carrier, at = stands.get(above.get(name, ''), (0, pin.SE3.Identity()))
-        if stands:
+        if not stands and name in carried_by:
+            if (kind := carried_by[name].get('type', '')) != 'fixed':
+                label = carried_by[name].get('name', '')
+                source.note('held fixed', f'joint {label}: it is {kind}, and carries the root link')
+        elif stands:
             joint = carried_by[name]
             label, kind = joint.get('name', ''), joint.get('type', '')
-            here, axis = pose(links[name]) * pose(joint), value(joint, 'axis/xyz', 3, '0 0 1')
-            if joint.findtext('axis/use_parent_model_frame', '0').strip() in ('1', 'true'):
-                axis = here.rotation.T @ axis
+            here, axis = placed(name) * pose(joint), value(joint, 'axis/xyz', 3, '0 0 1')
+            told = joint.findtext('axis/use_parent_model_frame', frame_of_axis)
+            if told.strip() in ('1', 'true'):
+                axis = here.rotation.T @ pose(model).rotation @ axis
             if kind in ONE_AXIS:
                 limit = joint.find('axis/limit') if kind != 'continuous' else None
-                if limit is not None and _endless(limit.findtext('lower'), limit.findtext('upper')):
+                ends = 'lower', 'upper'
+                if limit is not None and _endless(*(limit.findtext(e, '1e16') for e in ends)):
                     limit = None
                 limits = float(value(limit, 'lower')[0]), float(value(limit, 'upper')[0])
                 here_in, slides = at.inverse() * here, kind == 'prismatic'
@@ -211,5 +228,5 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         weight = link_inertia(name, float(value(own, 'mass')[0]), np.zeros(3), tensor)
         centres[name] = pose(own).translation
-        source.add_link(name, carrier, at.inverse() * pose(links[name]), pose(own).act(weight))
+        source.add_link(name, carrier, at.inverse() * placed(name), pose(own).act(weight))
     return source, centres

@@ -7,7 +7,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
@@ -71,13 +70,14 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
     there = out.exists()
-    write(source, out)
+    ours = not there or (out.is_dir() and not any(out.iterdir()))
     try:
+        write(source, out)
         robot = Robot.load(out)
-    except MusculoskeletalError:
-        for file in out.iterdir():  # which was new or empty
+    except BaseException:  # Ctrl-C too leaves nothing that looks like a robot
+        for file in out.glob('*') if ours else ():
             file.unlink()
-        if not there:
+        if not there and out.exists():
             out.rmdir()
         raise
     return Imported(robot, tuple(source.notes), compare(source, robot))

@@ -93,10 +93,11 @@ def _function(element: ET.Element | None) -> Function:
     if kind == 'Constant':
         return np.poly1d(_vector(element, 'value', 1))
     if kind in ('LinearFunction', 'PolynomialFunction'):
-        count = len(element.findtext('coefficients', '0').split())
-        return np.poly1d(_vector(element, 'coefficients', count))
+        text = element.findtext('coefficients') or ('1 0' if kind[0] == 'L' else '0')
+        return np.poly1d(numbers(text, len(text.split()), 'coefficients'))
     if kind == 'MultiplierFunction':
-        return _scaled(_function(element.find('function')), _number(element, 'scale'))
+        scale = _number(element, 'scale') if element.findtext('scale') else 1.0
+        return _scaled(_function(element.find('function')), scale)
     if kind not in ('SimmSpline', 'NaturalCubicSpline', 'PiecewiseLinearFunction'):
         raise ValueError(f'a {kind} is not read')
     x, y = (_vector(element, tag, len(element.findtext('x', '').split())) for tag in 'xy')

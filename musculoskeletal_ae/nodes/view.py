@@ -149,7 +149,11 @@ class View(Node):
         while rclpy.ok():
             looked_at = self.page.looked_at.wait(timeout=1.0)
             while not self.asked.empty():  # also what the last visitor asked for
-                self._do(*self.asked.get())
+                what, *value = self.asked.get()
+                try:
+                    self._do(what, *value)
+                except Exception as error:  # noqa: BLE001 - a page may send anything
+                    self.page.notify(printable(f'{what}: {error}'), False)
             if not looked_at:
                 for subscription in self.taken:
                     self.destroy_subscription(subscription)
@@ -237,6 +241,8 @@ class View(Node):
                 stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
                 self.targets.publish(joint_message([*value], theta, stamp))
             case 'hand':
+                if value.shape != (3,) or not np.isfinite(value).all():
+                    raise ValueError(f'expected a place of three numbers [m], not {value}')
                 if (theta := self._newest('estimated')) is not None:
                     pose = pin.SE3(np.eye(3), value)
                     target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta

@@ -64,8 +64,8 @@ class Page:
         try:  # viser waits for ever, or takes another port
             family = socket.getaddrinfo(host, port)[0][0]
             socket.create_server((host, port), family=family).close()
-        except OSError as error:
-            told = f'no page at port {port} of {host}: {error.strerror}'
+        except (OSError, UnicodeError) as error:
+            told = f'no page at port {port} of {host}: {getattr(error, "strerror", error)}'
             raise MusculoskeletalError(f'{told}; choose another --port or --host') from error
         with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
             server = self._server = viser.ViserServer(host, port, verbose=False)

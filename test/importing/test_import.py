@@ -258,6 +258,70 @@ def test_of_a_model_without_routes_it_is_said_what_was_dropped_of_muscles(tmp_pa
     assert 'equality' not in told and 'follows' not in told
 
 
+def wires_and_weight(tmp_path, name, text):
+    """Return the lengths of an SDF's muscles (N, M), and what holds its weight (N, D)."""
+    put(tmp_path, 'model.sdf', text)
+    robot = import_robot(tmp_path / 'cardsflow.xml', tmp_path / name).robot
+    theta = np.linspace(-1.0, 1.0, 5)[:, None]
+    return robot.routes.absolute_lengths(theta), robot.kinematics.holding_torque(theta)
+
+
+def same_arm(tmp_path, first, second):
+    (tmp_path / 'model.urdf').unlink()
+    one, other = wires_and_weight(tmp_path, 'a', first), wires_and_weight(tmp_path, 'b', second)
+    return all(np.allclose(*pair, atol=1e-9) for pair in zip(one, other))
+
+
+@pytest.mark.usefixtures('cardsflow')
+def test_the_pose_of_an_sdf_s_model_is_one_of_all_its_links(tmp_path):
+    lift, at = '0 0 0.5 0.4 0 0', np.array([0.0, -np.sin(0.4), np.cos(0.4)]) * 0.1
+    arm = f'0 {at[1]} {0.5 + at[2]} 0.4 0 0'
+    posed = bodies.SDF.replace('name="own">', f'name="own"><pose>{lift}</pose>')
+    links = bodies.SDF.replace('<pose>0 0 0 0 0 0', f'<pose>{lift}', 1)
+    assert same_arm(tmp_path, posed, links.replace('<pose>0 0 0.1 0 0 0', f'<pose>{arm}', 1))
+
+
+@pytest.mark.usefixtures('cardsflow')
+def test_before_version_1_5_of_sdf_an_axis_stood_in_the_model_s_frame(tmp_path):
+    turned = '<pose>0 0 0.1 0 0 0.5</pose>\n    <axis>'
+    early = bodies.SDF.replace('<pose>0 0 0.1 0 0 0</pose>\n    <axis>', turned)
+    assert early != bodies.SDF
+    assert same_arm(tmp_path, early.replace('"1.6"', '"1.4"'), bodies.SDF)
+
+
+def test_points_of_the_world_stay_where_they_are_if_the_root_link_stands_elsewhere(
+    cardsflow, tmp_path
+):
+    (tmp_path / 'model.urdf').unlink()
+    cardsflow.write_text(
+        bodies.CARDSFLOW.replace('"base"><viaPoint type', '"world"><viaPoint type')
+    )
+    text = bodies.SDF.replace('<pose>0 0 0 0 0 0', '<pose>0 0 0.5 0 0 0')
+    put(tmp_path, 'model.sdf', text)
+    (point, *_), *_ = import_robot(cardsflow, tmp_path / 'out').robot.description.routes
+    np.testing.assert_allclose(point.xyz, [0.05, 0.0, -0.4])
+
+
+def test_a_limit_with_one_end_is_none_and_a_joint_of_the_root_link_is_told(cardsflow, tmp_path):
+    (tmp_path / 'model.urdf').unlink()
+    turntable = '<joint name="t" type="revolute"><parent>world</parent><child>base</child></joint>'
+    text = bodies.SDF.replace('<lower>-1</lower>', '').replace('</model>', f'{turntable}</model>')
+    put(tmp_path, 'model.sdf', text)
+    result = import_robot(cardsflow, tmp_path / 'out')
+    assert result.robot.lower == pytest.approx(-np.pi)
+    assert 'held fixed: joint t: it is revolute, and carries the root link' in result.notes
+
+
+def test_an_import_that_is_interrupted_leaves_nothing(mjcf, tmp_path, monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Robot, 'load', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        import_robot(mjcf, tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
+
+
 TWICE = '<joint name="other" type="fixed"><child>arm</child></joint></model>'
 
 
@@ -268,6 +332,8 @@ TWICE = '<joint name="other" type="fixed"><child>arm</child></joint></model>'
         ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
         ('"shoulder"', '"universe"', 'joint universe: expected a name that no other has'),
         ('<joint', '<link name="arm"/><joint', "link 'arm' comes twice; expected unique names"),
+        ('</model>', '<model name="palm"/></model>', 'expected one model'),
+        ('</model>', '<include><uri>a</uri></include></model>', 'expected one model'),
         ('</model>', TWICE, "child of a joint 'arm' comes twice; expected one joint for each link"),
     ],
 )

@@ -87,6 +87,8 @@ def test_the_faults_of_a_recording_are_left_out_and_said(robot, capsys):
             2,
             'after one option only',
         ),
+        (['--from-bag', str(BAGS / 'rupture'), '--out', str(BAGS / 'rupture/a')], 2, 'replace it'),
+        (['--out', 'net.png', '--plot', './net.png'], 2, 'would replace the checkpoint'),
     ],
 )
 def test_a_bag_that_cannot_be_learned_from_is_one_clear_error(

@@ -169,6 +169,8 @@ def test_whoever_leaves_while_pushing_pushes_no_longer(arm26):
 def test_an_address_that_is_not_of_this_machine_is_refused(arm26):
     with pytest.raises(MusculoskeletalError, match=r'no page at port \d+ of 192\.0\.2\.1: Cannot'):
         Page(arm26, '192.0.2.1', free_port(), False, lambda *_: None)
+    with pytest.raises(MusculoskeletalError, match=r'of 127\.\.0\.1: .*choose another'):
+        Page(arm26, '127..0.1', free_port(), False, lambda *_: None)
 
 
 def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
