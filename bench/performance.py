@@ -138,21 +138,26 @@ def resident(pid: int) -> tuple[float, float]:
     return whole, files
 
 
+def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Return the CPU of each node until the first command [s], and what is resident later."""
+    system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
+    try:
+        deadline = time.monotonic() + STARTING
+        while not system.stamps['muscle_length_command']:
+            if time.monotonic() > deadline:
+                raise MusculoskeletalError(f'no command came within {STARTING:g} s')
+            time.sleep(0.1)
+        used = {name: cpu(process.pid) for name, process in system.nodes.items()}
+        time.sleep(SETTLING)
+        return used, {name: resident(process.pid) for name, process in system.nodes.items()}
+    finally:
+        system.end()
+
+
 def starting(network: Path) -> tuple[str, float]:
     """Return the table of starts and memory, and what the estimator has of files [MB]."""
-    for _ in range(2):  # the first may compile, and is not counted
-        system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
-        try:
-            deadline = time.monotonic() + STARTING
-            while not system.stamps['muscle_length_command']:
-                if time.monotonic() > deadline:
-                    raise MusculoskeletalError(f'no command came within {STARTING:g} s')
-                time.sleep(0.1)
-            used = {name: cpu(process.pid) for name, process in system.nodes.items()}
-            time.sleep(SETTLING)
-            held = {name: resident(process.pid) for name, process in system.nodes.items()}
-        finally:
-            system.end()
+    started(network)  # this may compile, and is not counted
+    used, held = started(network)
     said = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )

@@ -69,13 +69,13 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     cut(source, **chain)
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
-    there = out.exists()
-    ours = not there or (out.is_dir() and not any(out.iterdir()))
+    if (there := out.exists()) and (not out.is_dir() or any(out.iterdir())):
+        raise refuse(out, 'expected a new or empty directory')
     try:
         write(source, out)
         robot = Robot.load(out)
     except BaseException:  # Ctrl-C too leaves nothing that looks like a robot
-        for file in out.glob('*') if ours else ():
+        for file in out.glob('*'):  # of which none was there
             file.unlink()
         if not there and out.exists():
             out.rmdir()

@@ -338,9 +338,7 @@ def urdf(source: Source) -> str:
 
 
 def write(source: Source, out: Path) -> None:
-    """Write robot.urdf and muscles.yaml into a directory, which must be new or empty."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SourceError(f'{out}: expected a new or empty directory')
+    """Write robot.urdf and muscles.yaml into a directory, which is made if it is not there."""
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
         muscles.append({'name': name, 'route': [written(item) for item in route]})

@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
     learned = {path.resolve() for path in args.from_bag}
     if both := [str(path) for path in args.hold_out if path.resolve() in learned]:
         parser.error(f'{both[0]} is to be learned from and held out: name it after one option only')
-    out, read = args.out.resolve(), {path.resolve() for path in (*args.from_bag, *args.hold_out)}
+    out, read = args.out.resolve(), learned | {path.resolve() for path in args.hold_out}
     if read & {out, *out.parents}:
         parser.error(f'--out {args.out} is a recording, or in one, and would replace it')
     if args.plot and args.plot.resolve() == out:

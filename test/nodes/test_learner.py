@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph import DEADLINE
+from graph import DEADLINE, LOOK
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
@@ -95,7 +95,7 @@ class HostedLearner:
         taken, deadline = self.taken, time.monotonic() + 1.0
         self.arm.publish()
         while self.taken == taken and time.monotonic() < deadline:
-            self.graph.executor.look(0.05)
+            self.graph.executor.look(LOOK)
 
     def run(self, seconds):
         """Let time pass."""

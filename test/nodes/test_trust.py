@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 from controlled_arm import ControlledArm
+from graph import LOOK
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -69,7 +70,7 @@ def test_of_networks_that_come_while_one_is_tried_the_last_is_used(arm, trained)
     for version in range(1, 21):
         mae = replace(trained['default'], version=version)
         arm.graph.send_network(checkpoint.to_bytes(mae))
-        arm.graph.executor.look(0.05)
+        arm.graph.executor.look(LOOK)
         begun.append(len(arm.graph.executor._begun))
     arm.graph.wait(lambda: all(node.gate.mae.version == 20 for node in nodes), 'the last')
     assert 0 < max(begun) <= 4  # one is tried, one waits, in each node
