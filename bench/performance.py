@@ -9,6 +9,7 @@ Times hold for the machine and the day that the page names, which should have no
 
 import os
 import platform
+import shutil
 import subprocess
 import tempfile
 import time
@@ -212,6 +213,8 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
+    if args.flames and shutil.which('py-spy') is None:
+        parser.error('--flames draws by py-spy, which is not installed: pip install py-spy')
 
     robot = Robot.load(ARM)
     with tempfile.TemporaryDirectory() as folder:

@@ -22,6 +22,13 @@ def test_every_bench_is_explained():
     assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
 
 
+def test_what_draws_flames_is_there_before_anything_is_measured(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv('PATH', str(tmp_path))
+    with pytest.raises(SystemExit):
+        importlib.import_module('bench.performance').main(['--flames', '--out', str(tmp_path)])
+    assert 'pip install py-spy' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('name', benches())
 def test_every_bench_has_help(name, capsys):
     with pytest.raises(SystemExit) as ended:

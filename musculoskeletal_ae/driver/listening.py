@@ -23,6 +23,7 @@ from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
 RATE_TOLERANCE = 0.2
 LONGEST_GAP = 0.2  # [s], the controller's `max_age`
 MOST_REPEATED = 0.2  # share of messages that say what the one before said, to the last digit
+QUIET = 3  # values that a sensor without noise may have while nothing moves, but not one alone
 TEMPERATURES = -20.0, 130.0  # [°C]
 BEYOND = 0.1, 1.0  # [m] that l may lie beyond what the routes allow, with and without known zeros
 BEYOND_JOINT = 0.3  # [rad]
@@ -76,7 +77,8 @@ class Listening:
         """Take a message of joint_states."""
         with self._rejecting('joint_states'):
             theta = read_posture(message, self._robot.joints, some=True)
-            self._theta = self._theta if self._stated else theta
+            if not self._stated:  # joints may come in several messages
+                self._theta = np.where(np.isnan(theta), self._theta, theta)
 
     @contextmanager
     def _rejecting(self, topic: str) -> Iterator[None]:
@@ -85,17 +87,21 @@ class Listening:
         except MessageError as error:
             self._rejected.setdefault((topic, error.reason), []).append(error)
 
-    def verdict(self) -> Verdict:
-        """Judge what came."""
+    def verdict(self, now: float) -> Verdict:
+        """Judge what came until now [s]."""
         verdict = Verdict(self._robot)
+        heard = not self._stated and not np.isnan(self._theta).all()
         for (topic, reason), errors in self._rejected.items():
             told = f'{topic}: {len(errors)} messages refused, {errors[-1]}'
-            verdict.failed(reason if reason in FAULTS else 'refused', told=told)
+            if reason == 'missing joint' and heard:  # those of a hand, say
+                verdict.notes.append(told)
+            else:
+                verdict.failed(reason if reason in FAULTS else 'refused', told=told)
         if not self.count:
             verdict.failed('silent')
             return verdict
         states, theta = map(np.array, zip(*self._read)) if self._read else (np.zeros(0),) * 2
-        self._judge_rate(verdict, states)
+        self._judge_rate(verdict, states, now)
         if len(states) and self._judge_values(verdict, np.median(states, axis=0)):
             known = np.flatnonzero(np.isfinite(theta).all(axis=1))
             if len(known):
@@ -111,19 +117,26 @@ class Listening:
                 )
         return verdict
 
-    def _judge_rate(self, verdict: Verdict, states: Array) -> None:
-        gaps = np.diff(self._times)
+    def _judge_rate(self, verdict: Verdict, states: Array, now: float) -> None:
+        gaps, silent = np.diff(self._times), now - self._times[-1]
         rate = len(gaps) / gaps.sum() if gaps.sum() > 0.0 else 0.0
         if abs(rate / self._rate - 1.0) > RATE_TOLERANCE:
             verdict.failed('rate', rate=rate, wanted=self._rate)
-        elif gaps.max(initial=0.0) > LONGEST_GAP:
-            verdict.failed('gap', gap=gaps.max())
+        elif (gap := gaps.max(initial=silent)) > LONGEST_GAP:
+            verdict.failed('gap', gap=gap)
         if len(states) > 10:
             # The rate at which messages come is not the rate at which modules are read. (A
             # temperature may stand.)
             same: Bools = states[1:, :2] == states[:-1, :2]
             repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
-            if repeated > MOST_REPEATED:
+            different = max(
+                len(np.unique(column)) for column in states[:, :2].reshape(len(states), -1).T
+            )
+            if repeated > MOST_REPEATED and 1 < different <= QUIET:
+                verdict.notes.append(
+                    'readings hardly change: move the arm, and it shows whether each is new'
+                )
+            elif repeated > MOST_REPEATED:
                 verdict.failed('repeated', share=100.0 * repeated)
             elif stuck.any():
                 verdict.failed('stuck', *np.flatnonzero(stuck).tolist())

@@ -37,6 +37,7 @@ LENGTH_ERROR = 2.0e-4  # [m] noise and resolution of l, two standard deviations
 SLOPES = 0.7, 1.4  # of what the law asks for
 RESPONSE = 4.0, 0.0006  # [N], [m] above noise
 CLIP = 20.0, 0.05  # asked for beyond tension.max [N], tolerated beyond it (share)
+MOST_BEYOND = 0.3  # share of tension.max that is asked for beyond it
 
 Wait = Generator[None, None, None]  # each step takes one message
 
@@ -73,7 +74,11 @@ class Winding:
         self._tolerance = np.maximum(TENSION_TOLERANCE, LENGTH_ERROR * robot.stiffness)
         self._scale: Array = self._tolerance / TENSION_TOLERANCE
         self._response: Array = RESPONSE[0] * self._scale
-        self._highest: Array = self._bias + ABOVE_BIAS * self._scale
+        #: what it may be off where T_bias, or no tension, is asked for
+        usual = np.minimum(TENSION_TOLERANCE, 0.5 * self._bias)
+        self._resting = np.maximum(usual, LENGTH_ERROR * robot.stiffness)
+        self._run_away = np.minimum(RUN_AWAY_TENSION * self._scale, robot.tension.max)
+        self._highest: Array = np.minimum(self._bias + ABOVE_BIAS * self._scale, robot.tension.max)
         if highest is not None:
             self._highest = np.full(robot.muscle_count, highest)
         for m in self._muscles:
@@ -134,9 +139,10 @@ class Winding:
         while self._now < end:
             yield
             length, tension, _ = self._recent[-1][1]
-            most = np.maximum(self._robot.tension.limit, self._highest)
+            tensions = self._robot.tension
+            most = np.minimum(np.maximum(tensions.limit, self._highest), tensions.max)
             asked = np.minimum(self._robot.demanded(length, self._target), most)
-            self._tame_at[~(tension > asked + RUN_AWAY_TENSION * self._scale)] = self._now
+            self._tame_at[~(tension > asked + self._run_away)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
                 told = f'T rose to {tension[m]:.0f} N, {asked[m]:.0f} N were asked for'
@@ -158,7 +164,7 @@ class Winding:
 
     def _off(self, reading: _Reading) -> Bools:
         """Return which muscles pull with another tension than the law asks for, (M,)."""
-        tolerated = np.maximum(self._tolerance, TENSION_SHARE * reading.demand)
+        tolerated = np.maximum(self._resting, TENSION_SHARE * reading.demand)
         wrong: Bools = np.abs(reading.tension - reading.demand) > tolerated
         return wrong
 
@@ -218,14 +224,14 @@ class Winding:
         if not (abs(pulled[m]) > self._response[m] or wound[m] > RESPONSE[1]):
             yield from self._ask_outwards(m, home, pulled, wound)
             return
-        verdict.passed('order', m)
-        verdict.passed('unit', m)
+        verdict.passed('unit', m)  # whose l and T they are only θ tells
         if wound[m] < -RESPONSE[1]:
             verdict.failed('sign', m, told=f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in')
         verdict.passed('sign', m)
         clip = robot.tension.max[m]
         if clip <= self._highest[m]:
             beyond = max((CLIP[0] * self._scale)[m], 2.0 * CLIP[1] * clip)
+            beyond = min(beyond, MOST_BEYOND * clip)
             past = yield from self._wind(m, clip + beyond, home.length[m], [])
             if past.tension[m] > (1.0 + CLIP[1]) * clip:
                 verdict.failed('clip', m, got=past.tension[m], most=clip)

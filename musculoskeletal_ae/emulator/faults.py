@@ -90,7 +90,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
         quantities = quantities[:1]  # of a spike or bias: length
     if quantities and kind.size:
         size, most = SIZES[quantities[0]]
-    if words and most:
+    # A muscle may be called like a number.
+    if words and most and ':'.join(words) not in robot.muscles:
         try:
             size = float(words[-1])
             words.pop()
@@ -129,8 +130,14 @@ class Faults:
         Raises:
             MusculoskeletalError: If one says nothing legal; nothing changes then.
         """
+        before = self._late()
         self._faults = tuple(read_fault(line, self._robot) for line in lines)
-        self._frozen.clear()
+        still = {(name, m) for f in self._of('freeze') for name in f.quantities for m in f.which}
+        self._frozen = {one: read for one, read in self._frozen.items() if one in still}
+        if not self._of('reorder'):
+            self._held = None
+        if self._late() != before:  # what is on the way would come between what is newer
+            self._queue.clear()
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:] = -np.inf
         for fault in self._of('winch_speed'):
@@ -165,6 +172,9 @@ class Faults:
                     value[self._rng.choice(which)] += fault.size
         return readings._replace(**values)
 
+    def _late(self) -> float:
+        return sum(fault.size for fault in self._of('delay'))
+
     def _happens(self, name: str) -> bool:
         return any(self._rng.random() < fault.size for fault in self._of(name))
 
@@ -177,8 +187,7 @@ class Faults:
             sent, self._held = [*sent, self._held], None
         elif sent and self._happens('reorder'):
             sent, self._held = [], readings
-        late = sum(fault.size for fault in self._of('delay'))
-        self._queue += [(now + late, one) for one in sent]
+        self._queue += [(now + self._late(), one) for one in sent]
         due = [one for at, one in self._queue if at <= now]
         self._queue = [(at, one) for at, one in self._queue if at > now]
         return due

@@ -150,6 +150,8 @@ class ForeignArm(Arm):
         super().__init__(robot, seed, body.length_bias)
         if file is None:
             self._rub()
+        elif effects is not None and effects.joint_friction == 0.0:
+            model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0.0
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
         self._hand = model.body(mjcf.HAND).id

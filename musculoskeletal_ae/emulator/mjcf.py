@@ -261,12 +261,15 @@ def from_file(robot: Robot, file: Path) -> Any:
     ties = [tie for tie in ties if not gone.isdisjoint([tie.name1, tie.name2])]
     bound = [t for t in spec.tendons if t not in tendons]
     bound = [t for t in bound if not gone.isdisjoint(wrap.target.name for wrap in t.path)]
+    less = {tendon.name for tendon in bound}
+    loose = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_TENDON]
+    loose = [tie for tie in loose if not less.isdisjoint([tie.name1, tie.name2])]
     moved = list[tuple[Any, dict[str, Array]]]()
     if ties:
         with _loading(file):
             whole = spec.compile()
         moved = _moved_by(whole, spec, held)
-    for thing in [*ties, *bound, *held]:
+    for thing in [*ties, *loose, *bound, *held]:
         spec.delete(thing)
     for joint in spec.joints:  # limits of what the file's own actuators do
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE

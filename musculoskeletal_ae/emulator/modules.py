@@ -216,7 +216,7 @@ class Arm(ABC):
     def _attach(self, which: Bools) -> None:
         """Wind the given muscles so that they carry T_bias in the present posture."""
         bias = self.robot.tension.bias
-        length = self.individual.muscle_lengths(self.theta[None], bias)[0]
+        length = self.individual.muscle_lengths(self.theta[None], bias)[0] - self.faults.slack
         self._muscle.length[which] = length[which]
         self._muscle.tension[which] = bias[which]
         self._muscle.end_tension[which] = bias[which]
@@ -304,6 +304,16 @@ class Arm(ABC):
         mended = (self._muscle.ruptured > 0.0) & ~cut
         self._muscle.ruptured[:] = cut
         self._attach(mended)
+
+    def set_faults(self, lines: Iterable[str]) -> None:
+        """Break what the lines say and mend all else; wires made shorter take up T_bias.
+
+        Raises:
+            MusculoskeletalError: If one says nothing legal; nothing changes then.
+        """
+        before = self.faults.slack.copy()
+        self.faults.set(lines)
+        self._attach((self.faults.slack < before) & (self._muscle.ruptured == 0.0))
 
     def step(self, duration: float) -> None:
         """Let time pass [s], in whole steps of `STEP`."""

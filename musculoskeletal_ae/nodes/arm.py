@@ -33,7 +33,7 @@ NAME_HEIGHT = 0.018  # [m]
 BONES = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
 SOLID = (*BONE_COLOUR, 1.0)
 # After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
-LONGEST_STEP = 0.1  # [s]
+LONGEST_STEP, MOST_PERIODS = 0.1, 2.0  # [s], or if they are longer
 
 
 class Markers:
@@ -103,6 +103,11 @@ class Frames:
 
 class Arm(Shell):
     """A node that stands for an arm."""
+
+    @property
+    def longest_step(self) -> float:
+        """What may pass at once [s]."""
+        return max(LONGEST_STEP, MOST_PERIODS / self.rate)
 
     def follow_wrench(self, arm: str, follow: Callable[[Array], object]) -> None:
         """Give `follow` what comes on ARM/external_wrench, (6,) [N, N·m] in root link axes."""

@@ -70,7 +70,7 @@ class CheckDriver:
             self.spin_until(lambda: listening.count or self._mistyped(), wait)
         if listening.count:
             self.spin_until(lambda: False, chosen.seconds)
-        verdict: Verdict = listening.verdict()
+        verdict: Verdict = listening.verdict(time.monotonic())
         if wrong := self._mistyped():
             verdict.failed('type', topic=self.topic, type=wrong)
         elif (publishers := node.count_publishers(STATES)) > 1:
@@ -172,7 +172,7 @@ def _parse(arguments: list[str]) -> Namespace:
     add('--muscles', type=names, metavar='NAME,…', help='with --move: only these')
     text = (
         'with --move: the highest tension asked for [N] (default: 40 above T_bias, where K is '
-        'beyond 50 kN/m 0.8 mm times K)'
+        'beyond 50 kN/m 0.8 mm times K; at most tension.max)'
     )
     add('--tension', type=positive, metavar='N', help=text)
     add('--wait', action='store_true', help='wait for a driver, and until it has no fault')

@@ -9,6 +9,7 @@ import time
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, Vector3
 from rclpy.publisher import Publisher
@@ -17,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm, Markers
+from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -41,8 +42,8 @@ class HardwareEmulator(Arm):
         self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)
-        self.follow_parameter('faults', self.arm.faults.set)
-        self.follow_parameter('marker_pose_rate', partial(setattr, self, 'marker_pose_rate'))
+        self.follow_parameter('faults', self.arm.set_faults)
+        self.follow_parameter('marker_pose_rate', self._set_marker_pose_rate)
         self.advertise('', self.parameter('joint_sensors'), description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
         self.imu = None
@@ -64,9 +65,12 @@ class HardwareEmulator(Arm):
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
         return 'arm at rest, free and cool, modules safe; parameters stay as set'
 
+    def _set_marker_pose_rate(self, rate: float) -> None:
+        self.marker_pose_rate, self.pose_due = rate, 0.0
+
     def _tick(self) -> None:
         now = time.monotonic()
-        elapsed = min(now - self.ticked, LONGEST_STEP) + self.remainder
+        elapsed = min(now - self.ticked, self.longest_step) + self.remainder
         self.ticked = now
         whole = int(elapsed * 1000.0) / 1000.0
         self.remainder = elapsed - whole
@@ -107,7 +111,8 @@ class HardwareEmulator(Arm):
 
     def report(self) -> Report:
         """Return what /diagnostics shows."""
-        values = {'hottest module': f'{self.reading.temperature.max():.1f} °C'}
+        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only where all are
+        values = {'hottest module': f'{hottest:.1f} °C'}
         if self.arm.broken:
             return Report('error', 'broken by forces beyond all bounds: reset it', values)
         if self.arm.safe:

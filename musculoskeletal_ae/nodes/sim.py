@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.arm import LONGEST_STEP, Arm, Markers
+from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -33,7 +33,7 @@ class Sim(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
         Markers(self, 'sim', self._lines)
-        self.hurried = as_robot = self.parameter('as_robot')
+        self.hurried = self.as_robot = as_robot = self.parameter('as_robot')
         self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
@@ -55,7 +55,8 @@ class Sim(Arm):
     def _use_checkpoint(self, mae: Mae) -> None:
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
-            arm.isolate(self.gate.isolated)
+            if not self.as_robot:
+                arm.isolate(self.gate.isolated)
             arm.settle()
             self.arm = arm
         else:
@@ -63,7 +64,7 @@ class Sim(Arm):
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         self.gate.isolated = muscles
-        if self.arm is not None:
+        if self.arm is not None and not self.as_robot:  # whose modules pull whatever is suspected
             self.arm.isolate(muscles)
 
     def _command(self, length: Array) -> None:
@@ -84,7 +85,7 @@ class Sim(Arm):
 
     def _tick(self) -> None:
         now = self.get_clock().now()
-        elapsed = min((now - self.ticked).nanoseconds * 1e-9, LONGEST_STEP)
+        elapsed = min((now - self.ticked).nanoseconds * 1e-9, self.longest_step)
         self.ticked = now
         if self.arm is None or elapsed <= 0.0:
             return

@@ -103,8 +103,8 @@ class Simulation:
         self.state = ArmState(theta, tension, length, length, nothing, not_slid)
 
     def step(self, dt: float) -> ArmState:
-        """Let time pass [s]; return the arms."""
-        substeps = max(1, int(np.ceil(dt / LONGEST_STEP - 1e-9)))
+        """Let time pass [s], none if it is not positive; return the arms."""
+        substeps = int(np.ceil(dt / LONGEST_STEP - 1e-9))
         for _ in range(substeps):
             self._advance(dt / substeps)
         return self.state
@@ -127,7 +127,7 @@ class Simulation:
         robot, forced, tension = self.robot, self.fixed[arm], self.state.tension[arm]
         stopped = np.isnan(forced) & (np.abs(self.state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
-        full = tension > robot.tension.max - TENSION_MARGIN
+        full = robot.used & (tension > robot.tension.max - TENSION_MARGIN)
         return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
 
     def report(self) -> Report:

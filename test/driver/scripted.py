@@ -70,7 +70,7 @@ class Driver:
                     listening.joints(joint_state(dict(zip(self.names, theta))))
                 listening.muscles(array(rows), self.now)
         self.arm.set_wrench(np.zeros(6))
-        return listening.verdict()
+        return listening.verdict(self.now)
 
     def wind(
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None

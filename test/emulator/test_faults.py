@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults on request: each does what it is named after, and only that, until it is mended."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
+from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
 
 MUSCLE = 2
 
@@ -43,6 +47,27 @@ def test_readings_get_lost_come_late_twice_or_after_the_next(robot):
     assert {tuple(np.diff(one)) for one in swapped} == {(), (-1,)}
     order = np.concatenate(swapped)
     np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
+
+
+def test_what_is_on_the_way_is_gone_once_it_is_late_no_more(robot):
+    faults = Faults(robot, np.random.default_rng(0))
+    for i, lines in enumerate(['delay:0.25'] * 50 + [''] * 50):
+        faults.set([lines] if lines else [])
+        last = [int(one.length[0]) for one in faults.delivered(numbered(robot, i), i * 0.0078125)]
+        assert last == ([i] if not lines else [i - 32] if i >= 32 else [])
+    faults.set(['reorder:1'])
+    assert faults.delivered(numbered(robot, 100), 1.0) == []
+    faults.set([])
+    assert len(faults.delivered(numbered(robot, 101), 1.1)) == 1
+
+
+def test_a_frozen_sensor_stays_frozen_whatever_else_breaks(arm, robot):
+    frozen, other = robot.muscles[MUSCLE], robot.muscles[MUSCLE + 1]
+    lines = [f'freeze:tension:{frozen}']
+    arm.faults.set(lines)
+    before = arm.sense().tension[MUSCLE]
+    after = hold(arm, robot, [*lines, f'bias:tension:{other}']).tension
+    assert after[MUSCLE] == before and after[MUSCLE + 1] > before + 50.0
 
 
 def sensed(arm, line, count=300):
@@ -109,6 +134,25 @@ def test_a_slack_wire_is_wound_in(robot):
     assert after[MUSCLE] - before[MUSCLE] < -0.02
 
 
+@pytest.mark.parametrize('reality', ['kin', 'foreign'])
+def test_a_wire_that_is_slack_no_more_takes_up_the_bias(robot, reality):
+    arm, name = make_arm(robot, 1, reality), robot.muscles[MUSCLE]
+    command = to_mid_range(robot, 80.0)
+    for slack in ([f'slack:{name}:0.1'], []):
+        arm.set_faults(slack)
+        most = 0.0
+        for _ in range(2000):
+            arm.command_length(command)
+            arm.step(0.001)
+            most = max(most, arm.tension[MUSCLE])
+    assert most < 200.0  # 2996 N, had it become short at once
+    arm.set_faults([f'slack:{name}'])
+    arm.reset()
+    assert arm.tension[MUSCLE] == pytest.approx(robot.tension.bias[MUSCLE])
+    arm.step(0.01)
+    assert arm.tension[MUSCLE] > 0.5 * robot.tension.bias[MUSCLE]
+
+
 def test_a_slow_winch_takes_its_time(robot):
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     lines = [f'slack:{name}', f'winch_speed:{name}:0.009']
@@ -144,6 +188,13 @@ def test_what_is_no_fault_is_refused_with_what_is_legal(line, arm):
     with pytest.raises(MusculoskeletalError, match='legal'):
         arm.faults.set(['drop', line])
     assert arm.faults.stuck.all()
+
+
+def test_a_muscle_may_be_called_like_a_number(robot):
+    names = tuple(map(str, range(robot.muscle_count)))
+    numbers = Robot(replace(robot.description, muscles=names))
+    assert read_fault('slack:1', numbers)[2:] == (1, 0.05)
+    assert read_fault('slack:1:0.2', numbers)[2:] == (1, 0.2)
 
 
 @pytest.mark.parametrize('name', KINDS)

@@ -332,6 +332,20 @@ def test_what_ties_joints_that_are_held_is_left_out(imported, tmp_path):
     text = text.replace('joint="elbow" coef="1"/>', 'joint="more" coef="1"/>')
     other.write_text(text, encoding='utf-8')
     assert make_arm(imported[1], 0, str(other))._model.neq == 1
+    tie = '</fixed><fixed name="last"><joint joint="elbow" coef="1"/></fixed>'
+    text = text.replace('</fixed>', tie, 1)
+    text = text.replace('<equality>', '<equality><tendon tendon1="last" tendon2="none"/>')
+    other.write_text(text, encoding='utf-8')
+    assert make_arm(imported[1], 0, str(other))._model.neq == 1
+
+
+def test_without_friction_nothing_of_a_file_rubs(imported, tmp_path):
+    rub = '<default><joint frictionloss="0.7"/><tendon frictionloss="5"/></default><worldbody>'
+    other = tmp_path / 'other.xml'
+    other.write_text(bodies.MJCF.replace('<worldbody>', rub), encoding='utf-8')
+    for friction in (True, False):
+        model = make_arm(imported[1], 0, str(other), friction=friction)._model
+        assert model.dof_frictionloss.all() == model.tendon_frictionloss.all() == friction
 
 
 @pytest.mark.parametrize('tie', ['joint1="more"', 'joint1="more" joint2="swing"'])

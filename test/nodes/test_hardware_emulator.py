@@ -114,6 +114,8 @@ def test_payload_offset_and_wrench_act(arm, arm26):
 
 
 def test_a_marker_pose_is_published_on_request(arm, arm26):
+    assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 0.001)[0]
+    arm.next('marker_pose')
     assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 30.0)[0]
     pose = arm.next('marker_pose', 3)
     assert pose.header.frame_id == arm26.root_link

@@ -173,6 +173,17 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     assert graph.node.count_publishers('sim/joint_states') == 0
 
 
+def test_as_the_robot_it_pulls_what_others_leave_out(graph, arm26, trained_file):
+    graph.listen(Float64MultiArray, 'muscle_states')
+    shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
+    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
+    graph.wait(lambda: shell.left_out == (1,), 'the isolation')
+    graph.next('muscle_states', 2)
+    _, tension, _ = read_array(graph.received['muscle_states'][-1], 3, 6)
+    np.testing.assert_array_equal(tension, arm26.tension.bias)
+    assert shell.longest_step == 1.0  # or at 2 Hz it would fall behind
+
+
 def test_as_the_robot_it_has_no_zeros_but_its_own(graph, trained_file):
     shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True)
     topics = {subscription.topic_name for subscription in shell.subscriptions}

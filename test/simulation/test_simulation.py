@@ -162,6 +162,11 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
     assert set(arms.limits()) & set(robot.muscles)
     arms.command = np.full((1, robot.muscle_count), -1e9)
     assert np.isfinite(arms.settle().theta).all()
+    before = arms.state
+    assert arms.step(0.0) is before
+    arms.isolate([0])
+    assert robot.muscles[0] not in arms.limits()
+    arms.isolate([])
     # Nothing has wound up meanwhile: half a second later the tension is gone.
     arms.command = np.full((1, robot.muscle_count), 1e9)
     assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0

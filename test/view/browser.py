@@ -29,7 +29,7 @@ DEADLINE = 120.0  # [s]
 #: pictures a second are few: without a graphics card each takes a core for a while
 SLOWLY = """
 const soon = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 100);
+window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 300);
 """
 #: every text on the page, shadow trees excepted
 TEXT = 'document.body ? document.body.innerText : ""'
