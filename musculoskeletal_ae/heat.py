@@ -75,11 +75,11 @@ class Heat:
         """Estimated temperatures of the windings [°C] (M,); NaN where the housing's is unknown."""
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
-    def accept(self) -> None:
-        """Take the modules that have changed as they are now."""
-        muscles = list(self.changed)
-        self._reference[:, muscles] = self._state[[2, 4]][:, muscles]
-        self.changed = {}
+    def accept(self, *muscles: int) -> None:
+        """Take the modules of muscles that have changed as they are now."""
+        for m in self.changed.keys() & muscles:
+            self._reference[:, m] = self._state[[2, 4], m]
+            del self.changed[m]
 
     def limits(self, highest: float) -> tuple[Array, Array]:
         """Return the tensions [N] (M,) that bring no winding above so many °C within HELD, MOMENT.
@@ -102,7 +102,10 @@ class Heat:
 
         What is not finite is not known.
         """
-        known, measured = np.isfinite(housing), self._state[1]
+        known = np.isfinite(housing)
+        if dt > LONGEST:
+            self._miss(housing, known, dt)
+        measured = self._state[1]
         changed = known & (np.abs(housing - measured) > JUMP) | (known != self._known)
         if np.count_nonzero(changed):
             self._state[1] = np.where(known & changed, housing, measured)
@@ -118,6 +121,14 @@ class Heat:
         self._update(square, mean, known & ~self._spoilt, min(self._passed, LONGEST))
         self._limits, self._spoilt[:] = {}, False
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
+
+    def _miss(self, housing: Array, known: Bools, dt: float) -> None:
+        """Go on after dt [s] of which nothing is known: it says nothing of constants."""
+        self._state[0] *= np.exp(-dt / np.exp(self._state[3]))
+        self._state[1] = np.where(known, housing, self._state[1])
+        self._spoilt |= known
+        self._covariance[:, :2] = self._covariance[:, :, :2] = 0.0
+        self._covariance[:, [0, 1], [0, 1]] = SPREAD[:2] ** 2
 
     def _update(self, square: Array, housing: Array, told: Bools, dt: float) -> None:
         before, covariance = self._state, self._covariance

@@ -22,6 +22,7 @@ class Reception:
         self.last_rejected = ''  # what was wrong with the last one of them
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         self._received: Counter[str] = Counter()
+        self.numbers: Counter[str] = Counter()  # of the newest message, by topic; 0: not known
         #: how often a message was numbered lower than the one before, by topic: once where a
         #: publisher starts anew, all the time where two take turns
         self.turns: Counter[str] = Counter()
@@ -48,7 +49,8 @@ class Reception:
                 return False
             if number < last:
                 self.turns[topic] += 1
-            before, last = sent, number
+            before = sent
+            self.numbers[topic] = last = number
             return True
 
         def receive(message: Any, info: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the han
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] that an accelerometer reads on an arm
 LAST_VELOCITY = 1e-6  # [rad/s] at which a trajectory ends
 MOST_EFFORT = 1000.0  # [N·m] asked of one joint
+MOST_IGNORED = 1e6  # of what does not count; a power of more overflows
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
 
@@ -39,8 +40,8 @@ def read_array(
     """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
 
     Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
-    Of ignored columns nothing counts: what is not finite there is returned as `unknown`, a
-    temperature as NaN.
+    Of ignored columns nothing counts: what is not finite there, or as good as infinite, is returned
+    as `unknown`, a temperature as NaN.
     """
     count = len(message.data)
     if count > MOST_ENTRIES:
@@ -63,9 +64,10 @@ def read_array(
     values = np.array(message.data, dtype=float)
     finite = np.isfinite(values)
     shape = (rows, columns) if rows > 1 else columns
-    if np.count_nonzero(finite) == count:
+    if not len(ignored) and np.count_nonzero(finite) == count:
         return values.reshape(shape)
-    left_out = ~finite & np.tile(np.isin(np.arange(columns), ignored), rows)
+    sound = np.abs(values) < MOST_IGNORED
+    left_out = ~sound & np.tile(np.isin(np.arange(columns), ignored), rows)
     values[left_out], finite[left_out] = unknown, True
     if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
         values[2 * columns :][left_out[2 * columns :]] = np.nan

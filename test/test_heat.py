@@ -141,6 +141,8 @@ def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained,
     motors.run(600)
     assert set(motors.heat.changed) == {2}
     assert motors.core.cause.startswith(f'{ROBOT.muscles[2]}: its module ')
+    motors.core.heat.accept(3)  # another one
+    assert set(motors.heat.changed) == {2}
     motors.core.reset()  # it is as it is
     motors.run(60)
     assert motors.core.cause == ''
@@ -166,6 +168,19 @@ def test_hours_of_health_change_no_constant():
     motors.run(1800, TENSION.bias)
     motors.run(3600)
     assert motors.heat.changed == {}
+
+
+@pytest.mark.parametrize('most', [1.0, 1.3])
+def test_a_minute_of_which_nothing_is_known_changes_no_constant(most):
+    motors = Motors(3, most=most * TENSION.limit)
+    motors.run(1500)
+    arm = motors.arm
+    arm._muscle.tension[:] = motors.pulled = TENSION.bias
+    warm(motors.wound, arm._muscle, arm._command, round(60.0 / modules.STEP))
+    motors.heat.step(motors.pulled, arm._muscle.housing, 60.0)
+    for _ in range(10):
+        motors.run(60)
+        assert motors.heat.changed == {}
 
 
 def test_an_unknown_temperature_limits_nothing_and_comes_back():

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from robots import write_robot
 
+from musculoskeletal_ae.control.safety import Muscles
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.watch import Watch
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.plausibility import SLACK, WOUND, Plausibility, longest_lengths
 from musculoskeletal_ae.robot.robot import Robot
@@ -34,6 +37,17 @@ def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
     row[0] = 1.01 * -longest_lengths(ROBOT)[0]
     with pytest.raises(MessageError, match='length beyond what the joints allow'):
         Plausibility(ROBOT).check_muscles(tension, row, WARM, 0.0)
+
+
+def test_lengths_are_others_once_the_clock_has_jumped_back():
+    watch, there = Watch(ROBOT, Settings()), np.full(ROBOT.muscle_count, 0.05)
+    for length in (0.0 * there, there):
+        for n in range(2):
+            watch.muscles(Muscles(length, ROBOT.tension.bias, WARM), True, 0.01 * n)
+        watch.clock_jumped_back()
+    watch.muscles(Muscles(0.0 * there, ROBOT.tension.bias, WARM), True, 0.02)
+    with pytest.raises(MessageError, match='jumped'):
+        watch.muscles(Muscles(there, ROBOT.tension.bias, WARM), True, 0.03)
 
 
 @pytest.mark.parametrize('temperature', [500.0, np.inf, np.nan])

@@ -84,6 +84,9 @@ def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
         read_array(muscle_array([float('nan'), 2.0]), 1, 2)
     ignored = read_array(muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0]), 3, 2, [0])
     np.testing.assert_array_equal(ignored, [[0.0, 2.0], [3.0, 4.0], [math.nan, 25.0]])
+    absurd = muscle_array([1e80, 2.0, -1e300, 4.0, 1e7, 25.0])
+    np.testing.assert_array_equal(read_array(absurd, 3, 2, [0]), ignored * [[1, 1], [0, 1], [1, 1]])
+    np.testing.assert_array_equal(read_array(absurd, 3, 2).ravel(), absurd.data)
 
 
 def test_joints_are_matched_by_name_and_foreign_ones_ignored():

@@ -83,12 +83,13 @@ class Watch:
         self._came_at['estimated_joint_states'] = now - self._asleep
 
     def forget(self) -> None:
-        """Judge messages anew: lengths have another zero."""
+        """Judge messages anew, as where lengths have another zero."""
         self._plausibility = Plausibility(self._robot)
 
     def clock_jumped_back(self) -> None:
         """Count the messages' time from here."""
         self._time, self.pace = math.nan, 1.0
+        self.forget()
 
     def step(self, now: float, time: float, stopped: bool) -> tuple[float, float, bool]:
         """Return how long this step is on the messages' clock, and on the steady one [s].

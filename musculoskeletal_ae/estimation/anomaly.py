@@ -135,7 +135,8 @@ class AnomalyDetector:
         dead = self._dead(state.theta, tension, length, demand, dt)
         if dead is not None and self.whitened:
             return Verdict(size, distance, dead, 'no tension where the command demands it')
-        jammed = self._jam(tension, length, demand, dt)
+        asked = self._tension_command if demand is None else demand
+        jammed = self._jam(tension, length, asked, dt)
         if jammed is not None and self.whitened and self.judges:
             return Verdict(size, distance, jammed, 'its winch stands, whatever is commanded')
         # A muscle without tension is the one, whatever the others' residuals make of it.

@@ -85,7 +85,8 @@ class Estimator:
         self._read: Array | None = None  # l and T of the last message, and for how long so far [s]
         self._same: Array = np.zeros((2, robot.muscle_count))
         self._moved: tuple[Mae, float, float] | None = None  # without it: its l at least, at most
-        self._silent: tuple[int | None, float] = None, 0.0  # the one muscle without numbers, since
+        #: the one muscle without numbers; since when, and when last [s]
+        self._silent: tuple[int | None, float, float] = None, 0.0, 0.0
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self.heat = Heat(robot)
@@ -107,6 +108,8 @@ class Estimator:
         self.detector.use(less)
         self._external.use(less)
         self._whole, self.mae = mae, less
+        if self._zeroing is not None:  # what it found with another one is off by their difference
+            self._zeroing = Zeroing(self._robot, less, self._zeroing.posture)
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Go on without these muscles, places in T and l, and with all others.
@@ -119,11 +122,9 @@ class Estimator:
         suspect = self._verification
         if suspect is not None and self._robot.used[suspect.muscle]:
             self._verification = None
-        if self._whole is not None:
+        if self._whole is not None and self._robot.isolated != before:
             self.use(self._whole)
         self.detector.reset()
-        if self._zeroing is not None and self.mae is not None and self._robot.isolated != before:
-            self._zeroing = Zeroing(self._robot, self.mae, self._zeroing.posture)
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
@@ -159,6 +160,8 @@ class Estimator:
         self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
         self.zeros = Zeros.of(robot.muscle_count, UNKNOWN)
         self.detector.judges, self._verdict = False, None
+        self._external.reset()
+        self._touch = None
         self.reset()
 
     def step(
@@ -169,7 +172,7 @@ class Estimator:
 
         None without a network, or while nothing is known of the zeros of l.
         """
-        since, self._time = max(time - self._time, 0.0), time
+        since, self._time, self._silent = max(time - self._time, 0.0), time, (None, 0.0, 0.0)
         if temperature is not None:
             self.heat.step(tension, np.where(self._robot.used, temperature, np.nan), since)
         if self.mae is None:
@@ -177,7 +180,7 @@ class Estimator:
         dt = min(since, LONGEST_PERIOD)
         if since > SILENCE:
             self._forget_motion()
-        self._stepped_at, self._silent = now, (None, 0.0)
+        self._stepped_at = now
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
             self._command = None
@@ -206,7 +209,7 @@ class Estimator:
             self._begin_verification(verdict.suspect, now)
         before, self._touch = self._touch, None
         if self.zeros.known:
-            self._touch = touch = self._external.step(state.theta, end * self._robot.used, dt)
+            self._touch = touch = self._external.step(state.theta, end * self._robot.used, since)
             self._contacts += touch.contact and not (before is not None and before.contact)
         return Estimate(state, verdict.anomaly, detected, self._touch)
 
@@ -254,10 +257,11 @@ class Estimator:
         """
         broken = ~np.isfinite(states[:2]).all(axis=0) & self._robot.used
         muscle = int(broken.argmax()) if broken.sum() == 1 else None
-        if muscle != self._silent[0]:
-            self._silent = muscle, now
-        waits = muscle is None or now - self._silent[1] < SILENT
-        if waits or self.detector.settings.on_anomaly == 'stop':
+        before, since, last = self._silent
+        if muscle != before or now - last > SILENT:
+            since = now
+        self._silent = muscle, since, now
+        if muscle is None or now - since < SILENT or self.detector.settings.on_anomaly == 'stop':
             return False
         assert muscle is not None
         self.verified = f'{self._robot.muscles[muscle]}: a sensor says no number'
@@ -290,7 +294,8 @@ class Estimator:
             self._acquitted.append(now)
         else:
             self._verification = None
-        self.reset()
+        self.heat.accept(m)
+        self._clear()
 
     def _zero_on(
         self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
@@ -323,8 +328,11 @@ class Estimator:
 
     def reset(self) -> None:
         """Clear the anomaly."""
+        self.heat.accept(*self.heat.changed)
+        self._clear()
+
+    def _clear(self) -> None:
         self.cause = self._suspect = ''
-        self.heat.accept()
         suspect, self._verification = self._verification, None
         if suspect is not None:  # whoever resets it says that it is sound
             self.isolate(m for m in self._robot.isolated if m != suspect.muscle)

@@ -82,6 +82,7 @@ class Moments(NamedTuple):
     tension: Array  # T [N], (K, M)
     length: Array  # l as it was read [m], (K, M)
     direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (K, M)
+    read: Array  # l of all muscles, also of those that do not count [m], (K, M)
     theta: Array  # θ [rad] or NaN, (K, D)
 
     def some(self, rows: Ints) -> Moments:
@@ -109,7 +110,7 @@ class Zeroing:
         self._robot, self._mae, self.posture = robot, mae, posture
         self._rng = np.random.default_rng([0, 0x2E])
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, Array, Array]] = []  # T, l, s
+        self._window: list[tuple[Array, ...]] = []  # T, l, s, l as it was read
         self._angles: list[Array] = []  # θ in the same time, where measured
         self._moments: list[tuple[Array, ...]] = []
         muscles, joints = robot.muscle_count, robot.joint_count
@@ -169,8 +170,8 @@ class Zeroing:
         if self.done or (self.stands and self.trouble):
             return
         known = self.posture if self.stands else theta
-        tension, length = tension * self._used, length * self._used
-        self._window.append((tension, length, self._direction.step(length)))
+        tension, read, length = tension * self._used, length, length * self._used
+        self._window.append((tension, length, self._direction.step(length), read))
         self._angles += [] if known is None else [known]
         self._span += dt
         self._since += dt
@@ -215,8 +216,11 @@ class Zeroing:
     def _judge(self, fit: Fit, seen: Moments) -> None:
         """Take a fit as the guess, or as known when it rests on enough and explains that."""
         count, muscles = len(fit.theta), self._robot.muscle_count
-        offset = fit.constants[:muscles]
-        left = self._used * (seen.length - offset - self._mae.lengths(fit.theta, seen.tension))
+        # Who is commanded l of an isolated one is to mean what it reads, as well as that is known.
+        ideal = self._mae.lengths(fit.theta, seen.tension)
+        unheard = np.clip(np.median(seen.read - ideal, axis=0), -FARTHEST, FARTHEST)
+        offset = np.where(self._used, fit.constants[:muscles], unheard)
+        left = self._used * (seen.length - offset - ideal)
         typical = np.median(np.abs(left), axis=0)
         cost = fit.cost / (count * (len(self._noise) - self._robot.joint_count))
         self._fit, self.trouble, deviation = fit, '', np.full(muscles, UNKNOWN)
@@ -228,6 +232,7 @@ class Zeroing:
                 self.trouble = f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
             else:
                 deviation = 1.48 * typical / np.sqrt(max(1.0, count / 10.0))
+                deviation[~self._used] = LARGEST_LEFT
         self.zeros = Zeros(offset, deviation)
 
     # -- without joint angles -------------------------------------------------------------------

@@ -229,6 +229,12 @@ class Estimator(Shell):
         theta = self.core.see(read_pose(message, self.root_frame))
         self.seen.publish(joint_message(self.robot.joints, theta, message.header.stamp))
 
+    def clock_jumped_back(self) -> None:
+        """Forget what came before, also how long each muscle was; latches stay."""
+        super().clock_jumped_back()
+        if self.core:
+            self.plausibility = Plausibility(self.core.robot)
+
     def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
         self.core.reset()

@@ -112,7 +112,9 @@ class Learner(Shell):
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         # An estimator that has just started knows of none before it has our network.
-        if muscles or self.told or not self.core.isolated:
+        number = self._reception.numbers['isolated_muscles']
+        knows = number > 1 or (number == 0 and self.told)
+        if muscles or knows or not self.core.isolated:
             self.core.isolate(muscles)
         self.told = True
 

@@ -167,8 +167,9 @@ def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
     assert not any(verdict.cause for verdict in verdicts(slack, round(2 * DEAD_TIME / DT)))
 
 
+@pytest.mark.parametrize('kind', ['length', 'tension'])
 @pytest.mark.parametrize('wound', [-0.01, 0.01])
-def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound):
+def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound, kind):
     detector, rng, named = AnomalyDetector(robot), np.random.default_rng(0), []
     detector.use(mae)
     theta, tension = np.array([0.1, -1.0]), np.where(np.arange(6) == 3, 100.0, 60.0)
@@ -178,7 +179,8 @@ def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound):
         length = state.length + 1e-4 * rng.standard_normal(6)
         length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
         told[0] = 140.0 if n < 200 else 60.0
-        detector.commanded(length=length - (told - 30.0) / 1e4)
+        command = {'length': length - (told - 30.0) / 1e4, 'tension': told}
+        detector.commanded(**{kind: command[kind]})
         verdict = detector.step(state, tension, tension, length, 0.01)
         named += [(n, verdict.suspect)] * ('its winch stands' in verdict.cause)
     assert named

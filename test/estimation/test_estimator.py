@@ -7,7 +7,14 @@ import pinocchio as pin
 import pytest
 
 from musculoskeletal_ae.estimation.anomaly import DEAD_TIME
-from musculoskeletal_ae.estimation.estimator import COMMAND_AGE, LONGEST_PERIOD, SILENCE, Estimator
+from musculoskeletal_ae.estimation.estimator import (
+    COMMAND_AGE,
+    LONGEST_PERIOD,
+    SILENCE,
+    SILENT,
+    Estimator,
+)
+from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MessageError
 
 DT = 0.01
@@ -110,6 +117,29 @@ def test_a_pause_of_the_messages_is_no_time_without_tension(robot, mae, slack):
         assert not stepped.step(slack, dt=10.0)[0].detected
     stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
     assert any(estimate.detected for estimate in stepped.step(slack, 2, dt=10.0))
+
+
+@pytest.mark.parametrize('network', [True, False])
+def test_a_muscle_is_isolated_only_if_all_messages_of_a_moment_lack_it(
+    robot, mae, healthy, network
+):
+    core = Estimator(robot)
+    core.detector.settings = Detection(on_anomaly='isolate')
+    if network:
+        core.use(mae)
+    states = np.array([healthy.length, healthy.tension, np.full(6, 25.0)])
+    broken = np.where(np.arange(6) == 2, np.nan, states)
+    now = 0.0
+    for good, pause in ((3, 0.01), (0, 5.0)):  # between two bad ones
+        assert not core.unread(broken, now)
+        for _ in range(good):
+            now += pause
+            core.step(healthy.tension, healthy.length, now, now)
+        now += max(pause, SILENT)
+        assert not core.unread(broken, now)
+        now += 10.0
+    assert not core.unread(broken, now)
+    assert any(core.unread(broken, now + 0.01 * n) for n in range(1, 20))
 
 
 def test_a_marker_gives_the_joint_angles_that_put_it_there(stepped, robot, healthy):

@@ -8,7 +8,7 @@ import pytest
 from exact_mae import ExactMae
 
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.touch import ExternalTorque, HealthyTorque
+from musculoskeletal_ae.estimation.touch import CONTACT, ExternalTorque, HealthyTorque
 from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
@@ -124,6 +124,23 @@ def test_a_message_that_is_no_number_is_forgotten():
     np.testing.assert_allclose(felt(core, THETA, tension).force(), [20.0, 0.0, 0.0], atol=1.0)
 
 
+def test_an_arm_that_moved_unseen_was_not_pushed(robot, mae):
+    statistics = TouchStatistics(mae.friction, np.full(2, 0.25), LEAST_MOTION)
+    mae = replace(mae, touch=statistics)
+    core, middle, time = Estimator(robot), 0.5 * (robot.lower + robot.upper), 0.0
+    core.use(mae)
+    for n in range(200):
+        time += DT + 0.9 * (n == 100)
+        theta = middle + 0.8 * np.sin(1.2 * time)
+        acceleration = np.full(2, -1.152 * np.sin(1.2 * time))
+        velocity = np.full(2, 0.96 * np.cos(1.2 * time))
+        torque = robot.kinematics.inverse_dynamics(theta, velocity, acceleration)
+        jacobian = mae.muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
+        tension = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
+        touch = core.step(tension, mae.lengths(theta, tension), time, time).touch
+        assert n < 60 or touch.distance < CONTACT
+
+
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
 def test_it_is_stable_at_any_rate(dt):
     core, (tension, _) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
@@ -172,6 +189,10 @@ def test_the_estimator_says_what_touches_the_arm(robot, mae):
     assert estimate.touch.contact
     values = core.report(1.0).values
     assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
+    core.zero(tuple(theta.tolist()))
+    core.step(tension, length, 1.0, 1.0)
+    assert 'contact' not in core.report(1.0).values  # of zeros that count no longer
+    core = Estimator(robot)
     core.use(mae)
     core.step(tension, length, 1.0, 1.0)
     assert core.report(1.0).values['contact'] == 'not calibrated'

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.estimation import zeroing
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.zeroing import WINDOW, Zeroing
+from musculoskeletal_ae.estimation.zeroing import LARGEST_LEFT, WINDOW, Zeroing
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -132,6 +132,16 @@ def test_what_an_isolated_muscle_reads_is_in_nobody_s_way(monkeypatch, robot, ma
     np.testing.assert_allclose(found.zeros.offset[others], OFFSET[others], atol=4e-3)
 
 
+def test_a_module_of_an_isolated_muscle_is_told_l_as_it_reads_it(robot, mae, moment):
+    theta, *standing = moment(3.0)
+    zeroing = Zeroing(robot, mae.without((3,)), theta)
+    found = run(zeroing, lambda _: (theta, *standing), 2.0, sees=False)
+    assert found.done
+    off = np.abs(found.zeros.offset - OFFSET)
+    assert off[3] < found.zeros.deviation[3] == LARGEST_LEFT
+    assert np.delete(off, 3).max() < 1e-3
+
+
 @pytest.mark.usefixtures('seldom')
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_an_arm_that_carries_nothing_is_no_division_by_zero(mae):
@@ -153,5 +163,11 @@ def test_without_a_muscle_that_is_isolated_meanwhile_they_are_found_anew(robot, 
     assert re.search('finding the length zeros: [1-4] of', told)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == told
-    estimator.isolate((3,))
+    estimator.use(mae)  # another network, for all it knows
     assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))
+    for n in range(400, 800):
+        _, tension, length = moment(0.01 * n)
+        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+    assert re.search('finding the length zeros: [1-4] of', str(estimator.report(8.0)))
+    estimator.isolate((3,))
+    assert 'finding the length zeros: 0 of' in str(estimator.report(8.0))

@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
@@ -91,6 +92,26 @@ def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
     graph.wait(lambda: told, 'the list')
     assert told[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
+
+
+def test_what_an_estimator_says_before_it_knows_who_is_isolated_does_not_count(
+    graph, arm26, trained_file, tmp_path
+):
+    options = {'robot': 'arm26', 'checkpoint': trained_file}
+    learner = graph.host(Learner, state_directory=str(tmp_path), **options)
+    took = learner._reception.take_received
+
+    def tell(estimator, names):
+        estimator.publish(String(data=names))
+        graph.wait(lambda: took().get('isolated_muscles'), 'the learner to hear it')
+        return learner.core.isolated
+
+    estimator = graph.publisher(String, 'isolated_muscles', LATCHED)
+    assert tell(estimator, arm26.muscles[3]) == (3,)
+    graph.node.destroy_publisher(estimator)
+    successor = graph.publisher(String, 'isolated_muscles', LATCHED)
+    assert tell(successor, '') == (3,)
+    assert tell(successor, '') == ()
 
 
 def test_a_suspect_that_is_isolated_by_hand_while_it_is_verified_stays_so(graph, trained_file):
