@@ -25,6 +25,8 @@ def load(module: str) -> ModuleType:
 def main() -> int | None:
     """Run the node or tool that this process is named after; return its exit status."""
     name = Path(sys.argv[0]).stem
+    # MuJoCo would ask for the library of its windows, by a process that Ctrl-C makes talk.
+    os.environ.setdefault('MUJOCO_GL', 'disable')
     # What ends the interpreter itself says where, on stderr (there may be none).
     with suppress(AttributeError, ValueError, RuntimeError, OSError):
         faulthandler.enable()

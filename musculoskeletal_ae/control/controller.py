@@ -51,6 +51,7 @@ AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 #: causes of a stop that may be a broken muscle's doing
 BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
 APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
+SAME = 1e-6  # poses that differ by less are one
 ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
 
 
@@ -65,6 +66,8 @@ class Controller:
         self.torque = TorqueControl(robot, self.settings)
         self.motion = MotionControl(robot, self.settings)
         self.follows = False  # a trajectory, or holds where one ended
+        #: the last pose, whether its orientation counts, and the way to it
+        self._posed: tuple[pin.SE3, bool, Trajectory | None] = pin.SE3.Identity(), True, None
         self._approaches = 0  # of a target that are left, if the arm falls
         self._hand = Hand(robot)
         self.short = ''  # what the last target was out of reach by
@@ -74,7 +77,7 @@ class Controller:
         self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
         self.mae: Mae | None = None
         # One stream for the life of the controller: after a pause it brings new postures.
-        self._exploration = Exploration(robot, seed)
+        self._exploration = Exploration(robot, seed, PRESETS[self.settings.preset].to_limits)
         self.gentle = GentleMotion(robot, seed)
         self.estimate: Array | None = None
         self._direction = FrictionDirection()
@@ -103,6 +106,7 @@ class Controller:
         if settings.method == 'float':
             self.explore(False)
         another = (settings.method, settings.preset) != (before.method, before.preset)
+        self._exploration.to_limits = PRESETS[settings.preset].to_limits
         if another and not self.posture.exploring:
             self._starts, self.follows = True, False
         elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
@@ -191,7 +195,8 @@ class Controller:
     def _approach(self, theta: Array, effort: Array, left: int) -> None:
         kept, (start, mae) = (self.clamped, self.short), self._ready()
         way = reach.way(self.robot, mae, start.theta, theta)
-        self._follow(Trajectory.to(start, way, self.settings.target_duration), effort=effort)
+        planned = Trajectory.to(start, way, self.settings.target_duration)
+        self._follow(*self._within_limits(mae, planned), effort=effort)
         (self.clamped, self.short), self._approaches = kept, left
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
@@ -218,7 +223,7 @@ class Controller:
             slower = slowness(robot, mae, planned, self.settings)
             planned.scaled(slower).check(robot)
             self._within_reach(planned.end, nearest=False)
-            self._follow(planned, max(delay, 0.0), slower=slower)
+            self._follow(planned, slower, max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Bring the end effector to a pose in the root link's frame, or to its position only.
@@ -226,9 +231,20 @@ class Controller:
         A MessageError says why not: nothing changes then.
         """
         (start, mae), chosen = self._ready(), self.settings
+        if self._goes_to(pose, whole):
+            self._hand.again(now)
+            return
         theta, short = self._hand.posture(mae, pose, whole, start.theta, self._nearest)
-        self._follow(self._hand.towards(start, theta, chosen.hand_speed, now))
+        planned = self._hand.towards(start, theta, chosen.hand_speed, now)
+        self._follow(*self._within_limits(mae, planned))
+        self._posed = pose, whole, self.motion.latest
         self.short = short and f'{short}; nearest approached'
+
+    def _goes_to(self, pose: pin.SE3, whole: bool) -> bool:
+        """Whether the hand is on its way to a pose already."""
+        before, whole_before, way = self._posed
+        going = self.motion.moving and self.motion.latest is way and whole == whole_before
+        return going and bool(before.isApprox(pose, SAME))
 
     def twist(self, twist: Array) -> None:
         """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
@@ -236,7 +252,21 @@ class Controller:
         A MessageError says why not: nothing changes then.
         """
         start, mae = self._ready()
-        self._follow(self._hand.moved(mae, start, twist))
+        self._follow(*self._within_limits(mae, self._hand.moved(mae, start, twist)))
+
+    def _within_limits(self, mae: Mae, planned: Trajectory) -> tuple[Trajectory, float]:
+        """Return a way that does not leave the joint limits, and how much slower it has to be.
+
+        A MessageError says that there is none.
+        """
+        slower = slowness(self.robot, mae, planned, self.settings)
+        try:
+            planned.scaled(slower).check(self.robot)
+        except MessageError:
+            planned = planned.after_rest(self.robot)
+            slower = slowness(self.robot, mae, planned, self.settings)
+            planned.scaled(slower).check(self.robot)
+        return planned, slower
 
     def _within_reach(self, theta: Array, nearest: bool) -> tuple[Array, str]:
         """Return where to go for θ [rad] (D,) without the isolated muscles, and what θ lacks.
@@ -285,9 +315,9 @@ class Controller:
     def _follow(
         self,
         planned: Trajectory,
+        slower: float | None = None,
         delay: float = 0.0,
         effort: Array | None = None,
-        slower: float | None = None,
     ) -> None:
         if not self.follows or self._starts:
             self._explore(False)
@@ -318,7 +348,6 @@ class Controller:
     def _explore(self, wanted: bool) -> None:
         if wanted != self.posture.exploring:
             self.short = ''
-            self._exploration.to_limits = PRESETS[self.settings.preset].to_limits
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts, self.follows = True, False
@@ -440,7 +469,8 @@ class Controller:
         if self._starts and self.follows:  # after a pause: on from where it was
             self._starts = False
             self.motion.start()
-        if self.follows and self._approaches and self.motion.fallen:
+        again = self._approaches and self.settings.target_duration > 0.0
+        if self.follows and again and self.motion.fallen:
             assert posture.theta is not None  # what is followed has led there
             self._starts = True
             self._approach(posture.theta, posture.effort, self._approaches - 1)

@@ -53,11 +53,11 @@ class FollowedGoal:
             return INVALID, 'replaced by another target'
         if motion.trajectory is not trajectory:
             return None  # it is still to begin
-        late, off = motion.time - trajectory.duration, np.abs(motion.error)
-        if late < 0.0:
+        off = np.abs(motion.error)
+        if motion.time < trajectory.duration:
             return self._beyond(BEYOND_PATH, off, self._path)
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
-            return missed if 0.0 < self._patience < late else None
+            return missed if 0.0 < self._patience < motion.over else None
         return SUCCESSFUL, ''
 
     def _beyond(self, code: int, off: Array, bounds: Array) -> tuple[int, str] | None:

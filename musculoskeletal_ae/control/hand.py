@@ -71,11 +71,13 @@ class Hand:
         A single one is gone to at `speed` [m/s].
         """
         robot, last = self._robot, self._last
+        here = robot.kinematics.end_effector_pose(start.theta).translation
         where = robot.kinematics.end_effector_pose(theta).translation  # as near as it comes
         self._last = now, where, theta
         if last is not None and 0.0 < now - last[0] < FOLLOWING:
             interval, moved = now - last[0], float(np.linalg.norm(where - last[1]))
-            if moved < FASTEST * interval:
+            behind = float(np.linalg.norm(here - last[1]))
+            if max(moved, behind) < FASTEST * interval:
                 before = self._interval or interval
                 self._interval = before + MEMORY * (interval - before)
                 velocity = (theta - last[2]) / self._interval
@@ -87,9 +89,13 @@ class Hand:
                 time, every = np.array([ahead, ahead + RETURNING]), np.arange(len(theta))
                 return Trajectory.through(start, Points(every, time, path, rates, 0.0 * rates))
         self._interval = 0.0
-        here = robot.kinematics.end_effector_pose(start.theta).translation
         way = float(np.linalg.norm(where - here))
         return Trajectory.to(start, theta, max(SHORTEST, PEAK * way / speed))
+
+    def again(self, now: float) -> None:
+        """Take that the last pose came once more."""
+        if self._last is not None:
+            self._last = now, *self._last[1:]
 
     def moved(self, mae: Mae, start: Setpoint, twist: Array) -> Trajectory:
         """Return the trajectory that moves the hand by a twist [m/s], [rad/s] (6,) for a while."""

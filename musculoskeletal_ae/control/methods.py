@@ -131,6 +131,7 @@ def paper_terms(
     """Return the three terms of L_control, with G at (θ_target, T_current)."""
     joints, muscles = robot.joint_count, robot.muscle_count
     jacobian = mae.muscle_jacobian_difference(theta, tension)
+    jacobian[list(robot.isolated)] = 0.0
     rows = np.eye(joints + 2 * muscles)
     pull = rows[joints : joints + muscles]
     return (
@@ -164,7 +165,8 @@ class StiffnessModel(NamedTuple):
             levels = np.linspace(low, max(high, low + 1.0), LEVELS)  # isolated: all 0
             cubic[:, own] = np.polyfit(levels, -lengths[:, own], 3)
         slope = mae.muscle_jacobian(theta, tension)
-        bend = robot_stiffness.muscle_hessian(jacobian, theta, STEP)
+        step = STEP * robot.kinematics.radian
+        bend = robot_stiffness.muscle_hessian(jacobian, theta, step)
         slope[list(robot.isolated)] = bend[list(robot.isolated)] = 0.0
         return cls(
             jacobian=slope,

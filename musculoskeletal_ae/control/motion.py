@@ -100,6 +100,9 @@ class MotionControl:
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self.winches, self._feedback = Winches(robot), RestFeedback(robot)
         self._mae: Mae | None = None
+        self.time = self.over = (
+            0.0  # since the trajectory began and, whatever was planned anew, ended
+        )
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._blend: Ramp | None = None
         self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
@@ -122,6 +125,8 @@ class MotionControl:
     def start(self) -> None:
         """Go on from what something else commanded."""
         self._resting = self._blend = None
+        if self.trajectory is not None:  # held, or held anew: its tensions are planned again
+            self.time = min(self.time, self.trajectory.duration)
         # T at the far ends and at the motors [N], and s of each wire
         self._tension: Array = self._robot.tension.bias.copy()
         self._motor: Array = self._tension
@@ -148,6 +153,7 @@ class MotionControl:
 
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
+        self.over = 0.0
         if self._resting is not None:  # on the way, one goes over to the next by itself
             self.plan_anew()
 
@@ -173,7 +179,7 @@ class MotionControl:
     @property
     def fallen(self) -> bool:
         """Whether the arm lacks a muscle and rests elsewhere than where a trajectory has led."""
-        rested = self.trajectory is not None and self.time > self.trajectory.duration + FALLING
+        rested = self.trajectory is not None and self.over > FALLING
         rested = rested and self.next is None and not self._robot.used.all()
         return bool(rested and np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
 
@@ -204,6 +210,7 @@ class MotionControl:
         else:  # noise alone says nothing of λ
             self.winches.forget()
         self.time += dt
+        self.over += dt if self.time >= trajectory.duration else 0.0
         if self.next is not None:
             self.next = self.next[0], self.next[1] - dt
             if self.next[1] <= 0.0:

@@ -278,6 +278,7 @@ class PostureControl:
             bias = np.full(robot.muscle_count, robot.tension.bias)
             return Solution(methods.geometric_command(robot, theta), bias, nothing)
         if self._method in ('first', 'second'):
+            tension = np.minimum(tension, self._limit)
             return Solution(methods.first_command(robot, mae, theta, tension), tension, nothing)
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':

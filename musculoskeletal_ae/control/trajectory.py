@@ -134,8 +134,18 @@ class Trajectory:
     @classmethod
     def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:
         """Come to rest within a moment, where that leads."""
-        where = start.theta + 0.5 * STOPPING * start.velocity
-        return cls.to(start, np.clip(where, robot.lower, robot.upper), STOPPING)
+        return cls.to(start, _halt(start, robot), STOPPING)
+
+    def after_rest(self, robot: Robot) -> Trajectory:
+        """Return one through points of all joints that comes to rest before it passes them.
+
+        A start in motion carries a curve the farther, the longer it lasts.
+        """
+        points, still = self.points, np.zeros((1, len(self.end)))
+        time = np.append(STOPPING, STOPPING + points.time)
+        where = np.vstack([_halt(self.start, robot), points.position])
+        rates = (None if part is None else np.vstack([still, part]) for part in points[3:])
+        return self.through(self.start, Points(points.joints, time, where, *rates))
 
     def check(self, robot: Robot) -> None:
         """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
@@ -181,3 +191,8 @@ class Trajectory:
     def scaled(self, slower: float) -> Trajectory:
         """Return one whose points come so many times later."""
         return self._joined(self.start, self.points.later(slower), self.slowed * slower)
+
+
+def _halt(start: Setpoint, robot: Robot) -> Array:
+    """Return θ [rad] (D,) where a motion comes to rest within a moment."""
+    return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

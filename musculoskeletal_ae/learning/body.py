@@ -409,5 +409,8 @@ def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
     seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
     poses = body.poses(theta)
     for m, layout in enumerate(body.layouts):
-        prior = PRIOR.mean(layout), PRIOR.spread(layout)
+        mean = PRIOR.mean(layout)
+        if mae.touch is not None:  # of friction, lengths say nothing
+            mean[layout.friction] = mae.friction[m]
+        prior = mean, PRIOR.spread(layout)
         _fit_muscle(body, poses, seen, everything[:, m], *prior, NETWORK_ERROR, m)

@@ -153,9 +153,10 @@ class Learner:
         if self.isolated:
             tension, length = tension * self._used, length * self._used
         self._gate_time += dt
-        self.gate.message(tension, length, self._gate_time)
-        if self._mae is not None and not self._rests.anomaly:
-            self._torque.step(tension, length, dt)
+        if self._rests.plausible(tension, length):
+            self.gate.message(tension, length, self._gate_time)
+            if self._mae is not None and not self._rests.anomaly:
+                self._torque.step(tension, length, dt)
         before = self._healthy.time
         rests = self._rests.step(tension, length, dt, theta)
         if self._healthy.time > before:
@@ -181,7 +182,8 @@ class Learner:
         self._rests.set_anomaly(detected)
         before = self.gate.anomaly(detected, self._gate_time)
         if before is not None:
-            self._use(self._numbered(before))
+            # A calibrated detector may be of the arm before a muscle was changed.
+            self._use(self._numbered(before if self._statistics_hold else uncalibrated(before)))
         self._tell_isolated()
 
     @property
@@ -338,7 +340,9 @@ class Learner:
             self.gate.check(mae)
         if self._state is not None and (self.samples or self.checkpoint):
             self._state.back_up(self.samples, self.checkpoint)
-        successor = None if mae is None else self._numbered(mae)
+        successor = None
+        if mae is not None:  # whom the estimator isolated is so for every network
+            successor = self._numbered(mae.without({*mae.isolated, *self.isolated}))
         self.training.close()
         self.samples.clear()
         self._healthy.clear()

@@ -192,6 +192,10 @@ class RestCollector:
         self._time = self._skipped = 0.0
         self._closed_until = 0.0
 
+    def plausible(self, tension: Array, length: Array) -> bool:
+        """Whether muscles of this arm can say T [N] and l [m] (M,)."""
+        return self._plausibility.levels(tension, length) is None
+
     def step(
         self, tension: Array, length: Array, dt: float, theta: Array | None = None
     ) -> list[Sample]:

@@ -7,6 +7,7 @@ mae_checkpoint.
 """
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ class Learner(Shell):
         # What was learned comes back by no setter that is called again.
         self.follow_parameter('fresh', self._start, self._afresh)
         self.follow_parameter('checkpoint', self._start, self._network)
-        self.follow_parameter('relearn_muscles', core.relearn, self.robot.muscle_indices)
+        self.follow_parameter('relearn_muscles', self._name, self.robot.muscle_indices)
         self.running = True
         self.needed = ['muscle_states']
         if topic := JOINT_TOPICS.get(value('joint_source')):
@@ -103,6 +104,10 @@ class Learner(Shell):
 
     def _start(self, mae: Mae) -> None:
         (self.core.replace if self.running else self.core.begin)(mae)
+
+    def _name(self, muscles: Sequence[int]) -> None:
+        if self.running:  # given at every start, it would forget at every start
+            self.core.relearn(muscles)
 
     # -- messages -------------------------------------------------------------------------------
 

@@ -126,7 +126,10 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             legal=('sensor', 'marker', 'none'),
         ),
         'relearn_muscles': Parameter(
-            ('',), 'replaced or re-wired muscles, whose constants are learned anew', settable=True
+            ('',),
+            'replaced or re-wired muscles, whose constants are learned anew once it is set, or at '
+            'learner/relearn',
+            settable=True,
         ),
         'fresh': Parameter(
             False, 'drop the saved state and start from `checkpoint`', settable=True

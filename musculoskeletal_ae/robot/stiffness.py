@@ -21,11 +21,12 @@ def muscle_stiffness(module: Array, compliance: Array) -> Array:
 
 
 def muscle_hessian(
-    muscle_jacobian: Callable[[Array], Array], theta: Array, step: float = 1e-5
+    muscle_jacobian: Callable[[Array], Array], theta: Array, step: Array | float = 1e-5
 ) -> Array:
     """Return ∂²l/∂θ² [m/rad²] (M, D, D) at θ (D,), by central differences over ±step [rad] of G.
 
-    The callable maps θ (N, D) to G [m/rad] (N, M, D). With one of θ (..., D), θ may be (N, D).
+    The step is one for all joints, or of each (D,). The callable maps θ (N, D) to G [m/rad]
+    (N, M, D). With one of θ (..., D), θ may be (N, D).
     """
     offsets, middle = step * np.eye(theta.shape[-1]), theta[..., None, :]
     difference = muscle_jacobian(middle + offsets) - muscle_jacobian(middle - offsets)

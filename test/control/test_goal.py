@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from control_bench import OTHER, REST, ROBOT, Bench
+from control_bench import DT, OTHER, REST, ROBOT, Bench
 
 from musculoskeletal_ae.control.goal import (
     BEYOND_GOAL,
@@ -76,6 +76,21 @@ def test_an_arm_that_does_not_arrive_is_waited_for_as_long_as_asked():
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
     assert steps > 100.0 * (followed.bench.core.motion.trajectory.duration + 0.5) - 2.0
+
+
+def test_new_networks_make_nobody_wait_longer(monkeypatch):
+    followed = Followed(goal=TIGHT, patience=3.0)
+    step, bench = followed.bench.step, followed.bench
+
+    def learning():
+        if round(bench.now / DT) % 150 == 0:
+            bench.core.use(bench.mae)
+        step()
+
+    monkeypatch.setattr(bench, 'step', learning)
+    (code, _), steps = followed.run(moves=False)
+    assert code == BEYOND_GOAL
+    assert steps < 100.0 * (bench.core.motion.trajectory.duration + 3.5)
 
 
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])

@@ -227,7 +227,7 @@ def test_what_slides_is_led_along_its_stop_and_leans_on_none_in_between(sliding)
 def test_what_slides_has_fallen_15_mm_from_its_target(sliding):
     robot, (theta, *_), _ = sliding
     motion = MotionControl(robot, Settings())
-    motion.trajectory, motion.time = Trajectory.to(Setpoint.resting(theta), theta, 1.0), 60.0
+    motion.trajectory, motion.over = Trajectory.to(Setpoint.resting(theta), theta, 1.0), 60.0
     for off, fallen in ((0.01, False), (0.015, True)):
         motion.error = np.array([0.0, 0.0, 0.1, off])
         assert motion.fallen is fallen

@@ -153,6 +153,42 @@ def test_after_a_pause_of_the_controller_it_goes_on_from_where_it_was(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * 0.1 + 1e-9
 
 
+def test_after_a_pause_what_is_held_is_held_by_the_same_tensions(bench):
+    bench.configure(target_duration=0.5)
+    bench.target(OTHER, (2.0, 0.0))
+    moved(bench, 500)
+    held = bench.core.motion._tension
+    assert held.max() > 1.5 * ROBOT.tension.bias[0]
+    bench.now += 2.0
+    moved(bench, 200)
+    np.testing.assert_allclose(bench.core.motion._tension, held, rtol=0.25)  # friction is unknown
+
+
+@pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
+def test_an_arm_in_motion_is_not_carried_beyond_its_limits_by_a_slow_target(bench, duration):
+    bench.configure(target_duration=duration)
+    bench.core.trajectory(points(OTHER, 0.6))
+    moved(bench, 15)
+    assert np.abs(bench.core.motion.desired.velocity).max() > 0.3
+    bench.target(REST + 0.1)
+    bench.core.motion.trajectory.check(ROBOT)
+    np.testing.assert_allclose(bench.core.motion.trajectory.end, REST + 0.1)
+    assert bench.core.motion.trajectory.duration < duration + 1.0
+
+
+def test_a_slow_hand_in_motion_stays_within_the_limits(bench):
+    bench.configure(hand_speed=0.02, target_duration=1.2, unreachable='nearest')
+    rng = np.random.default_rng(0)
+    for theta in ROBOT.random_postures(6, rng):
+        bench.target(ROBOT.random_postures(1, rng)[0])
+        moved(bench, 40)
+        hand(bench, theta)
+        bench.core.motion.trajectory.check(ROBOT)
+        moved(bench, 30)
+        bench.core.twist(np.array([0.1, 0.0, 0.1, 0.0, 0.0, 0.0]))
+        bench.core.motion.trajectory.check(ROBOT)
+
+
 def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
@@ -392,6 +428,21 @@ def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
     assert np.linalg.norm(at - last) < 1e-3
+
+
+@pytest.mark.parametrize('every', [10, 20])
+def test_a_pose_that_comes_again_and_again_is_gone_to_at_hand_speed(bench, every):
+    bench.configure(hand_speed=0.1)
+    place, fastest, where = ROBOT.kinematics.end_effector_pose, 0.0, None
+    for n in range(600):
+        if n % every == 0:
+            hand(bench, OTHER)
+        moved(bench, 1)
+        before, where = where, place(bench.core.motion.desired.theta).translation
+        if before is not None:
+            fastest = max(fastest, float(np.linalg.norm(where - before)) / DT)
+    assert fastest < 0.15
+    np.testing.assert_allclose(where, place(OTHER).translation, atol=5e-3)
 
 
 def test_the_nearest_to_a_pose_is_gone_to_as_fast_however_far_that_lies(bench):

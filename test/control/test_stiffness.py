@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from robots import write_robot
 
 from bench.control_nominal import stiffness_ratios
 from musculoskeletal_ae.control.methods import MARGINS, StiffnessModel, stiffness_command
@@ -38,6 +39,19 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     # A hundredth: the cubic through the elongation, the wire's stretch, the wide step of the slope.
     np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
+
+
+def test_what_slides_is_asked_for_where_it_can_be(tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True))
+    theta, asked = 0.5 * (robot.lower + robot.upper), list[np.ndarray]()
+
+    class Asked(ExactMae):
+        def muscle_jacobian(self, theta, tension):
+            asked.extend(np.atleast_2d(theta))
+            return super().muscle_jacobian(theta, tension)
+
+    StiffnessModel.read(robot, Asked(robot), theta, robot.tension.bias)
+    assert ((np.array(asked) >= robot.lower) & (np.array(asked) <= robot.upper)).all()
 
 
 def test_its_slope_by_the_tension_is_the_difference_quotient(robot, mae):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.learning.body import CorrectedBody, Smooth, fit_body
+from musculoskeletal_ae.learning.body import CorrectedBody, Smooth, fit_body, fit_to_network
 from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -117,6 +118,15 @@ def test_samples_that_say_nothing_change_nothing(arm26, stage):
         arm26.muscle_lengths(states[0], states[1]),
         atol=1e-12,
     )
+
+
+def test_a_body_of_a_network_that_knows_friction_begins_with_it(arm26, initial):
+    friction = np.linspace(0.0, 0.4, 6)
+    statistics = TouchStatistics(friction, np.ones(2))
+    for touch, known in ((None, np.full(6, 0.05)), (statistics, friction)):
+        body = CorrectedBody(arm26)
+        fit_to_network(body, replace(initial, touch=touch))
+        np.testing.assert_allclose(body.frictions(), known, atol=1e-3)
 
 
 def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_know(arm26, stage):

@@ -238,6 +238,34 @@ def test_rests_count_as_often_as_they_differ_since_the_arm_was_changed(learner, 
     assert learner.training.jobs[-1].healthy.rests <= 1
 
 
+def test_going_back_brings_no_detector_of_the_arm_before(learner, initial, stage):
+    statistics = AnomalyStatistics(np.zeros(12), np.eye(12), True, 100)
+    learner.replace(replace(initial, anomaly=statistics))
+    arm = Arm(learner, stage)
+    arm.rest(15.0)
+    assert calibrated(learner)
+    learner.relearn([2])
+    arm.rest(3.0)
+    learner.anomaly(True)
+    arm.rest(0.5)
+    assert not calibrated(learner)
+
+
+def test_a_reading_that_no_muscle_can_have_is_not_felt(learner, stage):
+    arm = Arm(learner, stage)
+    arm.rest(2.0)
+    arm.rest(0.3, stage.sample()._replace(tension=np.full(6, 1e5)))
+    assert max(tension.max() for _, tension, *_ in learner.gate._messages) < 1e3
+    assert np.abs(learner._torque._observer._value).max() < 1e3
+    assert sum(learner.rejected.values()) > 20
+
+
+def test_a_network_that_is_put_in_leaves_out_who_is_isolated(learner, initial):
+    learner.isolate((3,))
+    learner.replace(initial)
+    assert learner.isolated == learner.mae.isolated == (3,)
+
+
 def test_a_replaced_network_starts_anew_and_counts_on(learner, initial, stage):
     accept(learner, stage, 3)
     version = learner.mae.version

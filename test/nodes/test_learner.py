@@ -238,6 +238,18 @@ def test_relearning_names_legal_muscles(host, graph, arm26):
     assert all(known[0] for known in learner.node.core.samples.known)
 
 
+def test_a_muscle_named_at_every_start_is_not_forgotten_at_every_start(
+    host, graph, arm26, tmp_path
+):
+    learner = host(state_directory=str(tmp_path))
+    learner.learn(lambda: learner.samples >= 2, 'samples')
+    graph.end(learner.node)
+    learner = host(state_directory=str(tmp_path), relearn_muscles=[arm26.muscles[1]])
+    assert all(known[1] for known in learner.node.core.samples.known)
+    assert graph.call(Trigger, 'learner/relearn').success
+    assert not any(known[1] for known in learner.node.core.samples.known)
+
+
 def test_parameters_that_are_refused_together_make_it_forget_nothing(
     host, arm26, trained_file, state
 ):
