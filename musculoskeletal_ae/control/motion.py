@@ -100,9 +100,8 @@ class MotionControl:
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self.winches, self._feedback = Winches(robot), RestFeedback(robot)
         self._mae: Mae | None = None
-        self.time = self.over = (
-            0.0  # since the trajectory began and, whatever was planned anew, ended
-        )
+        #: [s] since the trajectory began, and since it ended, whatever was planned anew meanwhile
+        self.time = self.over = 0.0
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._blend: Ramp | None = None
         self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held

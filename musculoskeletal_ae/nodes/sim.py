@@ -33,8 +33,9 @@ class Sim(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
         Markers(self, 'sim', self._lines)
-        self.hurried = self.as_robot = as_robot = self.parameter('as_robot')
-        self.advertise('' if as_robot else 'sim/', joint_sensors=True, description=as_robot)
+        self.hurried = self.as_robot = self.parameter('as_robot')
+        prefix = '' if self.as_robot else 'sim/'
+        self.advertise(prefix, joint_sensors=True, description=self.as_robot)
         self.arm: Simulation | None = None
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
@@ -43,7 +44,7 @@ class Sim(Arm):
         self.follow_checkpoints(self._use_checkpoint)
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        if not as_robot:  # which is the modules themselves
+        if not self.as_robot:  # which is the modules themselves
             self.follow_zeros(lambda *_: self.gate.forget())
             self.follow_muscle_states(self._note)
         self.follow_anomaly(self.take_anomaly)
