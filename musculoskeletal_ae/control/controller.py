@@ -219,9 +219,7 @@ class Controller:
             self._follow(Trajectory.stopping(start, robot))
         else:
             planned = Trajectory.through(start, points, max(-delay, 0.0))
-            # One that is slowed and starts in motion takes another way.
-            slower = slowness(robot, mae, planned, self.settings)
-            planned.scaled(slower).check(robot)
+            slower = self._slowed(mae, planned)
             self._within_reach(planned.end, nearest=False)
             self._follow(planned, slower, max(delay, 0.0))
 
@@ -254,19 +252,26 @@ class Controller:
         start, mae = self._ready()
         self._follow(*self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
+    def _slowed(self, mae: Mae, planned: Trajectory) -> float:
+        """Return how many times longer a way has to take.
+
+        A MessageError says that it then leaves the joint limits: one that is slowed and starts in
+        motion is another way.
+        """
+        slower = slowness(self.robot, mae, planned, self.settings)
+        planned.scaled(slower).check(self.robot)
+        return slower
+
     def _within_limits(self, mae: Mae, planned: Trajectory) -> tuple[Trajectory, float]:
-        """Return a way that does not leave the joint limits, and how much slower it has to be.
+        """Return a way within the joint limits, and how many times longer it has to take.
 
         A MessageError says that there is none.
         """
-        slower = slowness(self.robot, mae, planned, self.settings)
         try:
-            planned.scaled(slower).check(self.robot)
+            return planned, self._slowed(mae, planned)
         except MessageError:
             planned = planned.after_rest(self.robot)
-            slower = slowness(self.robot, mae, planned, self.settings)
-            planned.scaled(slower).check(self.robot)
-        return planned, slower
+            return planned, self._slowed(mae, planned)
 
     def _within_reach(self, theta: Array, nearest: bool) -> tuple[Array, str]:
         """Return where to go for θ [rad] (D,) without the isolated muscles, and what θ lacks.

@@ -257,13 +257,10 @@ def from_file(robot: Robot, file: Path) -> Any:
         spec.delete(thing)
     held = [joint for joint in spec.joints if joint.name not in followers]
     gone = {joint.name for joint in held if joint.name}
-    ties = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]
-    ties = [tie for tie in ties if not gone.isdisjoint([tie.name1, tie.name2])]
+    ties = _ties(spec, mujoco.mjtEq.mjEQ_JOINT, gone)
     bound = [t for t in spec.tendons if t not in tendons]
     bound = [t for t in bound if not gone.isdisjoint(wrap.target.name for wrap in t.path)]
-    less = {tendon.name for tendon in bound}
-    loose = [e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_TENDON]
-    loose = [tie for tie in loose if not less.isdisjoint([tie.name1, tie.name2])]
+    loose = _ties(spec, mujoco.mjtEq.mjEQ_TENDON, {tendon.name for tendon in bound})
     moved = list[tuple[Any, dict[str, Array]]]()
     if ties:
         with _loading(file):
@@ -282,6 +279,12 @@ def from_file(robot: Robot, file: Path) -> Any:
     if moved:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _ties(spec: Any, kind: Any, names: set[str]) -> list[Any]:
+    """Return the equalities of a kind that name one of some joints or tendons."""
+    ties = [tie for tie in spec.equalities if tie.type == kind]
+    return [tie for tie in ties if not names.isdisjoint([tie.name1, tie.name2])]
 
 
 def _moved_by(model: Any, spec: Any, held: list[Any]) -> list[tuple[Any, dict[str, Array]]]:

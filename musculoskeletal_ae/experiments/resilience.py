@@ -112,7 +112,7 @@ def broken(arm: Arm, mae: Mae, seed: int, muscle: int, fault: str) -> tuple[Guar
     loop.run(MOVING)
     name, errors = arm.robot.muscles[muscle], list[Array]()
     if fault:
-        arm.faults.set([f'dead_sensor:{fault}:{name}'])
+        arm.set_faults([f'dead_sensor:{fault}:{name}'])
     else:
         arm.set_ruptured([name])
     for _ in range(DECIDED):

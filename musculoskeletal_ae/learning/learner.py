@@ -153,12 +153,12 @@ class Learner:
         if self.isolated:
             tension, length = tension * self._used, length * self._used
         self._gate_time += dt
-        if self._rests.plausible(tension, length):
+        before = self._healthy.time
+        rests = self._rests.step(tension, length, dt, theta)
+        if self._rests.plausible:
             self.gate.message(tension, length, self._gate_time)
             if self._mae is not None and not self._rests.anomaly:
                 self._torque.step(tension, length, dt)
-        before = self._healthy.time
-        rests = self._rests.step(tension, length, dt, theta)
         if self._healthy.time > before:
             self._spoiled |= ~self._used
         for rest in rests:

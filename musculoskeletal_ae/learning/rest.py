@@ -187,14 +187,11 @@ class RestCollector:
         self._detector = RestDetector(settings, blind, robot.kinematics.radian)
         self._hole = max(HOLE, settings.rest_time)
         self._plausibility = Plausibility(robot)
+        self.plausible = True  # whether muscles of this arm can say what came last
         self._direction = FrictionDirection()
         self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
         self._time = self._skipped = 0.0
         self._closed_until = 0.0
-
-    def plausible(self, tension: Array, length: Array) -> bool:
-        """Whether muscles of this arm can say T [N] and l [m] (M,)."""
-        return self._plausibility.levels(tension, length) is None
 
     def step(
         self, tension: Array, length: Array, dt: float, theta: Array | None = None
@@ -209,6 +206,7 @@ class RestCollector:
             dt = self._hole
         judge = self._plausibility
         error = judge.levels(tension, length)
+        self.plausible = error is None
         if error is None and theta is not None:
             error = judge.outside(np.where(np.isnan(theta), self._robot.lower, theta))
         if error:

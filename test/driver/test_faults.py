@@ -19,7 +19,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 ROBOT = Robot.load('arm26')
-LOW = replace(ROBOT.description, tension=TensionRange(*np.outer([30.0, 55.0, 60.0], np.ones(6))))
 M, BICEPS = ROBOT.muscle_count, 4
 BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
 
@@ -149,7 +148,6 @@ def test_a_slow_a_halting_and_a_repeating_driver_are_heard():
 
 def test_a_driver_that_falls_silent_is_heard():
     driver = Driver(ROBOT)
-    driver.arm.faults.set(['drop:0'])
     listening = Listening(ROBOT, 100.0)
     for _ in range(50):
         for _, rows in driver.step():
@@ -303,10 +301,9 @@ def test_a_stiff_robot_that_hums_is_told_so():
     assert 'latency' not in verdict.wrong, str(verdict)
 
 
-def with_tension(limit, most):
-    bias = ROBOT.tension.bias
-    full = np.ones(ROBOT.muscle_count)
-    return Robot(replace(ROBOT.description, tension=TensionRange(bias, limit * full, most * full)))
+def with_tension(limit, most, bias=BIAS):
+    tension = TensionRange(*np.outer([bias, limit, most], np.ones(M)))
+    return Robot(replace(ROBOT.description, tension=tension))
 
 
 def test_a_sound_driver_may_be_asked_for_more_than_the_limit():
@@ -327,21 +324,20 @@ def test_no_muscle_is_asked_for_more_than_was_said_or_may_be(robot, highest, tol
         Winding(Verdict(robot), (1,), highest)
 
 
-def weak(bias, limit, most):
-    return Robot(
-        replace(ROBOT.description, tension=TensionRange(*np.outer([bias, limit, most], np.ones(M))))
-    )
+def unclipped(robot):
+    """Return a driver at rest; the module of the emulator would clip by itself."""
+    driver = Driver(robot)
+    driver.listen(2.0)
+    driver.arm._wound = driver.arm._wound._replace(tension_max=np.full(M, 500.0))
+    driver.arm._hand_over()
+    return driver
 
 
 @pytest.mark.parametrize(
     ('wrong', 'check'), [({'bias': 0.0}, 'law'), ({'clip': False}, 'clip'), ({'gain': 3.0}, 'law')]
 )
 def test_weak_muscles_are_not_pulled_far_beyond_what_they_bear(wrong, check):
-    robot = weak(5.0, 20.0, 26.0)
-    driver = Driver(robot)
-    driver.listen(2.0)
-    driver.arm._wound = driver.arm._wound._replace(tension_max=np.full(M, 500.0))
-    driver.arm._hand_over()
+    driver = unclipped(with_tension(20.0, 26.0, bias=5.0))
     driver.in_tension = law(**{'bias': 5.0, 'most': 26.0, **wrong})
     most = []
     driver.publish = lambda rows: most.append(rows[1].max()) or rows
@@ -351,12 +347,7 @@ def test_weak_muscles_are_not_pulled_far_beyond_what_they_bear(wrong, check):
 
 @pytest.mark.parametrize('clip', [True, False])
 def test_the_clip_is_tried_where_it_is_low_enough(clip):
-    robot = Robot(LOW)
-    driver = Driver(robot)
-    driver.listen(2.0)
-    # The module of the emulator clips by itself.
-    driver.arm._wound = driver.arm._wound._replace(tension_max=np.full(M, 500.0))
-    driver.arm._hand_over()
+    driver = unclipped(with_tension(55.0, 60.0))
     driver.in_tension = law(most=60.0, clip=clip)
     verdict = driver.wind((0, BICEPS))
     assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)
