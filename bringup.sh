@@ -77,12 +77,17 @@ duration= # until Ctrl-C
 
 while [ $# -gt 0 ]; do
   # Both "--seed 1" and "--seed=1".
-  if [[ $1 == --*=* ]]; then set -- "${1%%=*}" "${1#*=}" "${@:2}"; fi
+  value= # that comes with its option
+  if [[ $1 == --*=* ]]; then
+    value=$1
+    set -- "${1%%=*}" "${1#*=}" "${@:2}"
+  fi
   case $1 in
     --robot | --checkpoint | --bag | --preset | --seed | --reality | --joint-source | --namespace | --duration | --record | --port)
       if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
       option=${1#--}
       printf -v "${option//-/_}" %s "$2" && shift
+      value=
       ;;
     --view) view=view ;;
     --read-only) read_only=(--read-only) ;;
@@ -95,6 +100,7 @@ while [ $# -gt 0 ]; do
     -h | --help) usage && exit ;;
     *) refuse "unknown option '$1'; legal are $(usage | grep -o -e '--[a-z-]*' | sort -u | paste -sd ' ')" ;;
   esac
+  [ -z "$value" ] || refuse "$1 takes no value, and '$value' gives it one"
   shift
 done
 
@@ -156,8 +162,9 @@ if ! [[ $port =~ ^[0-9]{1,5}$ ]] || [ $((10#$port)) -lt 1 ] || [ $((10#$port)) -
   refuse "--port '$port' must be a whole number from 1 to 65535"
 fi
 namespace=${namespace#/}
-[[ -z $namespace || $namespace =~ ^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$ ]] ||
-  refuse "--namespace '$namespace' must be letters, digits and _ (and / between levels)"
+[[ -z $namespace ||
+  $namespace =~ ^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$ && $namespace != *__* && ${#namespace} -le 100 ]] ||
+  refuse "--namespace '$namespace' must be at most 100 letters, digits and single _ (and / between levels)"
 
 # --- environment ---------------------------------------------------------------------------------
 

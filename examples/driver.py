@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -88,7 +89,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(Driver())
-    except MusculoskeletalError as error:  # no such robot
+    except (MusculoskeletalError, ParameterException) as error:  # no such robot, not even a name
         sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -92,8 +92,10 @@ class McapFile:
     channels: dict[int, BagTopic] = field(default_factory=dict)  # by channel number
     blocks: list[Block] = field(default_factory=list)  # where the messages are
     backward: int = 0  # messages with an earlier log time than the one before them
+    set_back: int = 0  # [ns] how far the log times of one topic went back at most
     checked: bool = True  # whether checksums cover all messages
     summarised: bool = False  # whether the messages were compared with the file's own count
+    _newest: dict[str, int] = field(default_factory=dict)  # log time so far [ns], by topic
 
     @classmethod
     def read(cls, path: Path) -> McapFile:
@@ -193,6 +195,8 @@ class McapFile:
             raise ValueError('a message is not in CDR')
         topic.message_count += 1
         time, last = message.log_time, self.blocks[-1] if self.blocks else None
+        newest = self._newest[topic.name] = max(self._newest.get(topic.name, 0), time)
+        self.set_back = max(self.set_back, newest - time)
         if last and (
             self.end == last.offset
             if chunk
@@ -282,8 +286,8 @@ def _topic(channel: mcap.Channel, schemas: dict[int, mcap.Schema]) -> BagTopic:
     else:
         type_hash = channel.metadata.get('topic_type_hash', '')
         lie = message_types.contradiction(schema.name, schema.encoding, schema.data, type_hash)
-        if lie:
-            raise ValueError(f'the definition of {schema.name}, type of topic {name}, {lie}')
+        if lie:  # as of another distribution of ROS
+            refused = f'has a definition of {schema.name} that {lie}'
     qos = channel.metadata.get('offered_qos_profiles', '')
     encoding = channel.message_encoding
     return BagTopic(f'/{name.lstrip("/")}', schema.name, qos, refused, encoding, schema)

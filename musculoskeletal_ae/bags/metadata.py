@@ -18,6 +18,7 @@ from musculoskeletal_ae.files import parse_yaml, read_yaml
 
 FILE = 'metadata.yaml'
 VERSION = 9
+CONVERT = 'use `ros2 bag convert`, or rosbags-convert of the Python package rosbags'
 REMEDY = 'if the mcap file is sound, `record --recover` makes a new metadata.yaml'
 
 Qos = Mapping[str, Any]  # a profile as rosbag2 writes it in version 9
@@ -144,19 +145,20 @@ def read_metadata(directory: Path) -> Metadata | None:
         return None
     try:
         metadata = convert(read_yaml(file, _unusable), _Document).rosbag2_bagfile_information
-        _check(metadata)
+        _check(metadata, file)
         return metadata
     except ValueError as error:
         raise _unusable(file, str(error)) from error
 
 
-def _check(metadata: Metadata) -> None:
+def _check(metadata: Metadata, file: Path) -> None:
     if not 1 <= metadata.version <= VERSION:
         raise ValueError(f'version {metadata.version} is none of 1 … {VERSION}')
     if (storage := metadata.storage_identifier) != 'mcap':
-        raise ValueError(f'storage {storage[:40]!r} is not mcap: use `ros2 bag convert`')
-    if str(metadata.compression_mode or 'none')[:8].lower() != 'none':
-        raise ValueError('rosbag2 compressed the whole file: use `ros2 bag convert`')
+        raise BagError(file, f'storage {storage[:40]!r} is not mcap', CONVERT)
+    if (mode := str(metadata.compression_mode or 'none')[:8].lower()) != 'none':
+        whole = 'message' if mode == 'message' else 'file'
+        raise BagError(file, f'rosbag2 compressed each {whole} by itself', CONVERT)
     names = metadata.relative_file_paths
     # A bag names files beside its metadata.yaml and nothing else on this machine.
     if any(Path(name).name != name or name in ('', '.', '..') for name in names):

@@ -18,6 +18,9 @@ class Topic(NamedTuple):
 
 
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
+LONGEST_DISORDER = (
+    1_000_000_000  # [ns]: messages of a topic come that late, clocks are set back further
+)
 DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
@@ -28,8 +31,9 @@ def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
     `namespace` is the one that is meant where the bag has several; a BagError asks for it, or says
-    that a topic has a type other than the interface's.
+    that a topic has a type other than the interface's, or that the recorder's clock went back.
     """
+    _check_times(bag)
     names = _relative_names(bag, namespace)
     ours = {relative: name for name, relative in names.items() if relative in TOPICS}
     for relative, name in ours.items():
@@ -46,6 +50,7 @@ def select(
     the interface), or relative or recorded names, which may be foreign to the interface.
     `namespace` is the one that is meant where the bag has several.
     """
+    _check_times(bag)
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.
         names = {name: interface_name(name) for name in bag.topics}
@@ -112,7 +117,19 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
             remedy = 'choose one with --from-namespace (or replay all with --keep-names)'
             raise BagError(bag.path, problem, remedy)
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
+    if not any(name.startswith(prefix) for name in bag.topics):
+        there = ', '.join(name or '/' for name in namespaces(bag.topics)) or 'none'
+        raise BagError(bag.path, f'has no topic under {prefix!r}', f'namespaces in it: {there}')
     return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}
+
+
+def _check_times(bag: Bag) -> None:
+    """Refuse a recording whose clock went back: two motions would be one, taken in turns."""
+    for file in bag.files:
+        if file.set_back > LONGEST_DISORDER:
+            problem = f'the clock of the recorder went back by {file.set_back / 1e9:.3g} s'
+            remedy = 'record again, without a jump of time, --loop or another /clock meanwhile'
+            raise BagError(file.path, problem, remedy)
 
 
 def _compare_type(bag: Bag, name: str, relative: str) -> None:

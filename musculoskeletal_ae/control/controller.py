@@ -43,6 +43,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
+RESTORE = 'estimator/restore uses isolated muscles again'
 RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
 #: of the way from tension.limit to tension.max that may be demanded; `watch` stops at a half
 FED_BACK = 1.0 / 3.0
@@ -157,6 +158,7 @@ class Controller:
         """Go on without these muscles, places in T and l, and with all others."""
         muscles, before = set(muscles), set(self.robot.isolated)
         self.robot.isolate(muscles)
+        self.short = self.short if muscles == before else ''
         if added := muscles - before:
             self._isolated_at = max(added), self.watch.stepped_at
         if self.mae is not None:
@@ -346,13 +348,15 @@ class Controller:
             return f'stopped: {self.safety.cause}'
         if wanted and self.settings.method == 'float':
             return 'method float: a hand moves the arm; set another method first'
+        if wanted and len(self.robot.isolated) == self.robot.muscle_count:
+            return f'all muscles are isolated; {RESTORE}'
         self._explored = False
         self._explore(wanted)
         return ''
 
     def _explore(self, wanted: bool) -> None:
         if wanted != self.posture.exploring:
-            self.short = ''
+            self.short, self.clamped = '', ()
             self.posture.explore(iter(self._exploration) if wanted else None)
             self.posture.theta = None
             self._starts, self.follows = True, False
@@ -424,7 +428,8 @@ class Controller:
                 desired = self._slack(self._command(dt))
             except RobotDescriptionError as error:  # too little is left to explore with
                 self._explore(False)
-                self.short = f'{error}, without {self._left_out or "none"}'
+                left = f'what is left without {self._left_out} holds too few postures; {RESTORE}'
+                self.short = left if self._left_out else str(error)
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on

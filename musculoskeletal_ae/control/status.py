@@ -22,7 +22,7 @@ def report(core: Controller, now: float) -> Report:
     if core.clamped:
         values['target clamped at'] = ', '.join(core.clamped)
         warnings.append('target clamped to the joint limits')
-    if solution is not None and solution.stiffness is not None:
+    if chosen.method == 'stiffness' and solution is not None and solution.stiffness is not None:
         expected, *reachable = solution.stiffness
         desired = chosen.desired_stiffness(robot.joint_count)
         for row in zip(robot.joints, robot.units, desired, expected.diagonal(), *reachable):

@@ -29,6 +29,7 @@ from musculoskeletal_ae.robot.robot import Robot
 BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
 STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
 SAMPLES, WITHIN = 200, 5  # of a trajectory that are looked at, and of each piece at least
+AT_ONCE = 0.01  # [s]
 RESOLUTION = 1e-11  # share of a time that there is to the next, or doubles cannot tell any between
 #: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
@@ -89,9 +90,13 @@ class Trajectory:
     def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
         """Lead through points, `passed` [s] after the time that they count from.
 
-        A MessageError says that no point is left, or that two are as good as at the same time.
+        One at time 0 is gone to at once. A MessageError says that no point is left, or that two are
+        as good as at the same time.
         """
         kept = points.time > passed + 1e-9
+        if not kept.any() and passed == 0.0:  # at once: as fast as it is slowed to
+            at_once, kept = np.full(len(kept), AT_ONCE), np.arange(len(kept)) == len(kept) - 1
+            points = points._replace(time=at_once)
         if not kept.any():
             raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])

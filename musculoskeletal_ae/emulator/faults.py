@@ -33,6 +33,7 @@ class Kind(NamedTuple):
 #: sizes of spike and bias by quantity, [m], [N], [°C], of a joint [rad]: default, most
 SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3),
          'theta': (0.1, 3.2)}  # fmt: skip
+UNITS = {'length': 'm', 'tension': 'N', 'temperature': '°C', 'theta': 'rad'}
 KINDS = {
     'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
     'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),
@@ -98,7 +99,10 @@ def read_fault(line: str, robot: Robot) -> Fault:
         except ValueError:
             pass
     if not abs(size) <= most or (size < 0.0 and name not in ('spike', 'bias')):
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: sizes up to {most:g} {kind.unit}')
+        unit = f'{UNITS[quantities[0]]} of {quantities[0]}' if quantities else kind.unit
+        least = -most if quantities else 0.0
+        legal = f'sizes from {least:g} to {most:g} {unit}' if most else 'no size'
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if words and not kind.of_muscle:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {name}[:SIZE], which is of all readings')
     if quantities == ('theta',) and len(words) == 1:

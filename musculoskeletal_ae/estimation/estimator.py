@@ -60,6 +60,7 @@ SILENT = 0.15  # [s]
 ACQUITTALS, WITHIN = 2, 60.0
 # A winding below this may warm as it likes: the arm is not stopped for it.
 COOL = 60.0  # [°C]
+PAST_STOP = 0.01  # share of a joint's range
 
 
 class Estimate(NamedTuple):
@@ -141,7 +142,11 @@ class Estimator:
         """Raise a MusculoskeletalError unless an arm can stand in θ [rad] (D,); () is legal."""
         limits = [*zip(self._robot.lower, self._robot.upper, strict=True)]
         inside = len(posture) == len(limits)
-        inside = inside and all(low <= t <= high for t, (low, high) in zip(posture, limits))
+        # A joint that rests on its stop is read a little beyond it.
+        beyond = PAST_STOP * (self._robot.upper - self._robot.lower)
+        inside = inside and all(
+            low - past <= t <= high + past for t, past, (low, high) in zip(posture, beyond, limits)
+        )
         if posture and not inside:
             units = (unit.theta for unit in self._robot.units)
             legal = (f'{low:.2f} to {high:.2f} {u}' for u, (low, high) in zip(units, limits))

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, UndefinedError
 from msgspec import Struct
 from tqdm import tqdm
 
@@ -48,6 +48,8 @@ def measure(args: Namespace) -> None:
     """Measure as the options say and write results, plots and report."""
     start = time.perf_counter()
     names, robot = args.names, Robot.load(args.robot)
+    if args.readme:  # before the work, which takes hours
+        _around_table(args.readme)
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
         study = Study(
@@ -60,7 +62,7 @@ def measure(args: Namespace) -> None:
                 bar.set_description_str(running)
 
             parts = run(study, names, args.jobs, report)
-        files = [*write(study, parts, args.out), write_report(args.out)]
+        files = [*write(study, parts, args.out), write_report(args.out, names)]
     if args.readme:
         files += update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
@@ -87,7 +89,9 @@ def write(
         result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(result, indent=1, ensure_ascii=False)
-        (folder / 'result.json').write_text(text + '\n', encoding='utf-8')
+        begun = folder / 'result.json.begun'  # a kill leaves no half of a result
+        begun.write_text(text + '\n', encoding='utf-8')
+        begun.replace(folder / 'result.json')
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
             figure.set_layout_engine('none')  # it stays where it is now
@@ -99,13 +103,19 @@ def write(
 
 
 def read(folder: Path) -> Results:
-    """Return every result.json below a folder, by experiment."""
-    files = {name: folder / name / 'result.json' for name in EXPERIMENTS}
-    return {
-        name: json.loads(file.read_text(encoding='utf-8'))
-        for name, file in files.items()
-        if file.is_file()
-    }
+    """Return every result.json below a folder, by experiment; one that is none is left out."""
+    results: dict[str, Any] = {}
+    for name in EXPERIMENTS:
+        file = folder / name / 'result.json'
+        if file.is_file():
+            try:
+                result = json.loads(file.read_text(encoding='utf-8'))
+                results |= {name: result} if {'about', 'seeds'} <= result.keys() else {}
+            except (ValueError, AttributeError):
+                pass
+            if name not in results:
+                print(f'warning: {file} is no result of an experiment: left out', file=sys.stderr)
+    return results
 
 
 def combined(study: Study, rows: Rows) -> dict[str, Any]:
@@ -234,26 +244,49 @@ def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
     The result.json files of the folder `measured` are kept first.
 
     Raises:
-        MusculoskeletalError: If the README has no place between markers.
+        OSError, MusculoskeletalError: If the README has no place between markers.
     """
-    text, files = readme.read_text(encoding='utf-8'), list[Path]()
+    (head, rest), files = _around_table(readme), list[Path]()
     kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and one {END}')
     if measured is not None and measured.resolve() != kept.resolve():
         for name in read(measured):
             files.append(kept / name / 'result.json')
             files[-1].parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(measured / name / 'result.json', files[-1])
-    head, rest = text.split(BEGIN)
     table_text = readme_table(read(kept))
-    readme.write_text(f'{head}{BEGIN}{table_text}{END}{rest.split(END)[1]}', encoding='utf-8')
+    readme.write_text(f'{head}{BEGIN}{table_text}{END}{rest}', encoding='utf-8')
     return [*files, readme]
 
 
-def write_report(folder: Path) -> Path:
-    """Write report.html from all that is in a folder, of this call or an earlier one."""
-    results = read(folder)
+def _around_table(readme: Path) -> tuple[str, str]:
+    text = readme.read_text(encoding='utf-8')
+    head, _, rest = text.partition(BEGIN)
+    rest = rest.partition(END)[2]
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or END in head:
+        raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and then one {END}')
+    return head, rest
+
+
+def write_report(folder: Path, fresh: Sequence[str] = ()) -> Path:
+    """Write report.html from all that is in a folder, of this call or an earlier one.
+
+    What an earlier version measured may lack what is asked for here: then it has the `fresh` only.
+    """
+    results, file = read(folder), folder / 'report.html'
+    try:
+        page = _page(folder, results)
+    except (UndefinedError, LookupError, TypeError, AttributeError):
+        own = {name: result for name, result in results.items() if name in fresh}
+        if len(own) in (0, len(results)):
+            raise
+        older = ', '.join(results.keys() - own.keys())
+        print(f'warning: left out of {file}, of another version: {older}', file=sys.stderr)
+        page = _page(folder, own)
+    file.write_text(page, encoding='utf-8')
+    return file
+
+
+def _page(folder: Path, results: Results) -> str:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -262,7 +295,7 @@ def write_report(folder: Path) -> Path:
         lstrip_blocks=True,
     )
     environment.filters.update(flat=_flat, cell=_cell, individuals=individuals)
-    page = environment.get_template(TEMPLATE).render(
+    return environment.get_template(TEMPLATE).render(
         results=results,
         failures=failures(results),
         measured={name: result for name, result in results.items() if result['seeds']},
@@ -274,9 +307,6 @@ def write_report(folder: Path) -> Path:
             for file in folder.glob('*/*.png')
         },
     )
-    file = folder / 'report.html'
-    file.write_text(page, encoding='utf-8')
-    return file
 
 
 def _flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:

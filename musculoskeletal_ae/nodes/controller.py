@@ -231,9 +231,12 @@ class Controller(Shell):
         changing = self.core.follows and self.core.motion.moving
         held = {} if changing else report.values
         stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
-        for line in stopped + stiffness:
-            if line not in self.logged:
-                log = self.get_logger().warning if line in stopped else self.get_logger().info
-                log(line)
-        self.logged = stopped + stiffness
+        before, self.logged = self.logged, stopped + stiffness
+        # In two places: rclpy lets no line of code log with two severities.
+        for line in stopped:
+            if line not in before:
+                self.get_logger().warning(line)
+        for line in stiffness:
+            if line not in before:
+                self.get_logger().info(line)
         return report

@@ -89,12 +89,13 @@ def _record(options: Namespace, arguments: list[str]) -> None:
     with BagWriter(out, options.compression) as writer:
         node = Record(writer, options.topics)
         spinner = Spinner(node)
-        print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
-        spinner.spin_until(lambda: stop, options.duration or math.inf)
-        drained, before = time.monotonic() + DRAIN_TIME, -1
-        while time.monotonic() < drained and node.received != before:
-            before = node.received
-            spinner.look(0.05)
+        with spinner:
+            print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
+            spinner.spin_until(lambda: stop, options.duration or math.inf)
+            drained, before = time.monotonic() + DRAIN_TIME, -1
+            while time.monotonic() < drained and node.received != before:
+                before = node.received
+                spinner.look(0.05)
         node.destroy_node()
     if node.timeless:
         told = 'messages came before the first /clock, and are left out'

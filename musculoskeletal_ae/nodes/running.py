@@ -68,6 +68,12 @@ def interrupt(number: int, _: object) -> None:
     raise KeyboardInterrupt
 
 
+def raise_interrupt(error: Exception) -> None:
+    """Raise the KeyboardInterrupt that rclpy made an error of, if it did."""
+    if _interrupts:
+        raise KeyboardInterrupt from error
+
+
 def _note_interrupts() -> None:
     _interrupts.clear()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not one that is ignored
@@ -340,8 +346,7 @@ class Spinner(LeanExecutor):
             self.look(min(0.1, left))
 
     def _escaped(self, _entity: Any, error: Exception) -> None:
-        if _interrupts:
-            raise KeyboardInterrupt from error
+        raise_interrupt(error)
         raise error
 
 
@@ -373,7 +378,7 @@ def run_tool(
             print(printable(f'{name}: error: {told}'), file=sys.stderr)
             sys.exit(2)
     try:
-        refused = (InvalidTopicNameException, *PARAMETER_ERRORS)
+        refused = (InvalidTopicNameException, rclpy_implementation.RCLError, *PARAMETER_ERRORS)
         return exit_status(lambda: work(options, arguments), *refused)
     finally:
         rclpy.try_shutdown()

@@ -148,8 +148,13 @@ class Shell(Node):
     def parameter(self, name: str) -> Any:
         """Return a parameter's value, if it is legal; lists as tuples, without empty names."""
         with _blaming(name):
-            value = self._proposed.get(name, self.get_parameter(name).value)
+            value = self._proposed.get(name, self._held(name))
             return self._table[name].checked(value)
+
+    def _held(self, name: str) -> Any:
+        value = self.get_parameter_or(name, RosParameter(name)).value
+        # What rcl makes of an empty list that is given at the start.
+        return [] if value is None and isinstance(self._table[name].default, tuple) else value
 
     def follow_parameter(
         self,
@@ -167,7 +172,7 @@ class Shell(Node):
         self._setters[name] = setter
         if prepare is not None:
             self._prepare[name] = prepare
-        self._take({name: self.get_parameter(name).value})
+        self._take({name: self._held(name)})
 
     def _take(self, values: dict[str, Any]) -> None:
         """Call the setters of parameters, of all or, if one is refused, of none."""

@@ -78,7 +78,7 @@ class Sim(Arm):
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)
-        if message.name or message.position:
+        if message.name or message.position or message.velocity or message.effort:
             joints = self.robot.joints
             for name, (angle, _) in read_joints(message, joints, foreign_allowed=False).items():
                 fixed[joints.index(name)] = angle

@@ -8,6 +8,7 @@ is taken, at the rate of the picture: an executor would handle every one, at a t
 import math
 import queue
 import time
+import traceback
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
@@ -30,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.running import ROS_HELP, raise_interrupt, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
@@ -77,6 +78,7 @@ class View(Node):
         self.reception = Reception(lambda text: self.get_logger().warning(text))
         self.came: dict[str, tuple[float, Any]] = {}  # when, and what
         self.taken: list[Any] = []  # subscriptions
+        self.told = self.looked = -math.inf  # [s] of the monotonic clock
         self.ruptured: list[str] = []
         self.payload = 0.0
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
@@ -145,7 +147,6 @@ class View(Node):
 
     def run(self) -> None:
         """Show what comes until the process is asked to end."""
-        tell = look = 0.0
         while rclpy.ok():
             looked_at = self.page.looked_at.wait(timeout=1.0)
             while not self.asked.empty():  # also what the last visitor asked for
@@ -153,6 +154,7 @@ class View(Node):
                 try:
                     self._do(what, *value)
                 except Exception as error:  # noqa: BLE001 - a page may send anything
+                    raise_interrupt(error)
                     self.page.notify(printable(f'{what}: {error}'), False)
             if not looked_at:
                 for subscription in self.taken:
@@ -162,18 +164,28 @@ class View(Node):
             if not self.taken:
                 self._subscribe()
             begun = time.monotonic()
-            self._take()
-            self.situation.detected = bool(self._newest('detected', math.inf))
-            posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
-            states = self._newest('muscles')
-            self.page.draw(posture, None if states is None else states[1], self._kinds())
-            if begun >= tell:
-                tell = begun + TELL_PERIOD
-                self._tell(posture, states)
-            if begun >= look:
-                look = begun + LOOK_PERIOD
-                self._look()
+            try:
+                self._show(begun)
+            except Exception as error:  # noqa: BLE001 - topics and services may bring anything
+                raise_interrupt(error)
+                kind = type(error).__name__
+                if self.reception.reject('what is shown', kind, f'{kind}: {printable(error)}'):
+                    self.get_logger().error(printable(traceback.format_exc()))
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
+
+    def _show(self, now: float) -> None:
+        """Take what came, and show it; [s] of the monotonic clock."""
+        self._take()
+        self.situation.detected = bool(self._newest('detected', math.inf))
+        posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
+        states = self._newest('muscles')
+        self.page.draw(posture, None if states is None else states[1], self._kinds())
+        if now >= self.told + TELL_PERIOD:
+            self.told = now
+            self._tell(posture, states)
+        if now >= self.looked + LOOK_PERIOD:
+            self.looked = now
+            self._look()
 
     def _kinds(self) -> Ints:
         suspects = [self.situation.suspect] * self.situation.detected
@@ -214,9 +226,9 @@ class View(Node):
         self._ask(GET, self._emulated, names=['ruptured_muscles', 'payload'])
 
     def _emulated(self, answer: Any) -> None:
-        values = [parameter_value_to_python(value) for value in answer.values]
-        if len(values) == 2:
-            self.ruptured, self.payload = [name for name in values[0] or [] if name], values[1]
+        match [parameter_value_to_python(value) for value in answer.values]:
+            case [[*ruptured], float(payload)]:
+                self.ruptured, self.payload = [str(name) for name in ruptured if name], payload
 
     def _ask(self, name: str, then: Callable[[Any], object] | None = None, **fields: Any) -> None:
         """Call a service, tell the page what it said, and go on with the answer."""
@@ -280,7 +292,8 @@ def _view(options: Namespace, arguments: list[str]) -> int:
     robot = Robot.load(options.robot)
     start_ros(arguments)
     view = View(robot, options)
-    name = 'localhost' if options.host == '127.0.0.1' else options.host
+    host = f'[{options.host}]' if ':' in options.host else options.host
+    name = 'localhost' if options.host == '127.0.0.1' else host
     print(f'http://{name}:{options.port}', flush=True)
     try:
         view.run()

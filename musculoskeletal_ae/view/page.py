@@ -15,6 +15,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,6 +25,7 @@ import trimesh
 import viser
 from jinja2 import Environment, FileSystemLoader
 from scipy.spatial.transform import Rotation
+from viser._messages import GuiUpdateMessage
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -76,6 +78,8 @@ class Page:
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         sockets = server._websock_server
         sockets.on_client_connect(self._check_origin)
+        handlers = sockets._incoming_handlers[GuiUpdateMessage]
+        handlers[:] = [partial(_take_value, handler) for handler in handlers]
         for early in [*sockets._live_connections.values()]:  # a browser comes again by itself
             asyncio.run_coroutine_threadsafe(early.close(), server.get_event_loop())
         server.on_client_connect(lambda client: self._count(client.client_id, True))
@@ -93,11 +97,18 @@ class Page:
 
     async def _check_origin(self, connection: Any) -> None:
         """Turn away pages of other sites, which a browser lets connect to localhost."""
-        opened = self._server._websock_server._live_connections[connection.client_id]
+        sockets, visitor = self._server._websock_server, connection.client_id
+        opened = sockets._live_connections[visitor]
         asked, origin = (opened.request.headers.get(key, '') for key in ('Host', 'Origin'))
-        came = urlsplit(origin)
+        try:
+            came = urlsplit(origin)
+        except ValueError:
+            came = urlsplit('')
         foreign = self._host in LOCAL and came.hostname not in LOCAL
         if origin and (came.netloc != asked or foreign):
+            # viser forgets only whom it let in.
+            del sockets._live_connections[visitor]
+            sockets._client_state_from_id.pop(visitor).message_buffer.set_done()
             await opened.close(1008, 'another site')
             raise ConnectionError(f'a page of {origin} was turned away')
 
@@ -338,9 +349,8 @@ class Page:
         theta = self._posture.get('estimated')
         if theta is not None and not self._targeted:
             for angle, slider in zip(theta, self._sliders):
-                slider.value = float(
-                    np.clip(round(angle / slider.step) * slider.step, slider.min, slider.max)
-                )
+                near = round(np.clip(angle, slider.min, slider.max) / slider.step) * slider.step
+                slider.value = float(np.clip(near, slider.min, slider.max))
             self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
         self._payload.value = round(min(max(payload, 0.0), MOST_PAYLOAD), 1)
         if played is not None:
@@ -359,3 +369,9 @@ class Page:
         self._force.points = ends[None].astype(np.float32)
         size = float(np.linalg.norm(force))
         return force * min(1.0, MOST_PUSH / max(size, 1e-9)) * self._pushing
+
+
+async def _take_value(handler: Callable[..., Any], visitor: int, message: Any) -> None:
+    """Let a browser change the value of a control, and none of the control's own attributes."""
+    if message.updates.keys() <= {'value'}:
+        await handler(visitor, message)

@@ -12,7 +12,9 @@ from sensor_msgs.msg import JointState
 from bags.bare_file import FLOAT, write
 from bench import bag_samples as samples
 from musculoskeletal_ae.bags import message_types
+from musculoskeletal_ae.bags.check import check_bag
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError
 
 LINE = '=' * 80 + '\n'
@@ -56,9 +58,18 @@ def test_our_types_are_those_of_the_installed_ros_messages(end):
     ],
 )
 def test_definitions_that_lie_are_refused(options, problem, tmp_path):
-    file = write(tmp_path / 'a.mcap', **options)
+    bag = Bag.open(write(tmp_path / 'a.mcap', **options))
+    with pytest.raises(BagError, match='/anomaly has'):
+        interface_topics(bag)
     with pytest.raises(BagError, match=rf'a.mcap, byte \d+: .*{re.escape(problem)}'):
-        Bag.open(file)
+        bag.decode(*bag.messages())
+
+
+def test_a_type_of_another_distribution_costs_its_own_topic_only(tmp_path):
+    options = {'schema': 'sensor_msgs/msg/Range', 'text': 'float32 range\n', 'topic': '/sonar'}
+    bag = Bag.open(write(tmp_path / 'a.mcap', **options))
+    assert bag.message_count == 1 and interface_topics(bag) == {}
+    assert 'sensor_msgs/msg/Range' in str(check_bag(tmp_path / 'a.mcap'))
 
 
 def test_no_code_is_made_of_a_definition(tmp_path, monkeypatch):

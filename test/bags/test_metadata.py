@@ -23,8 +23,9 @@ def info(bag):
     [
         ({'version': 10}, 'version 10 is none of 1 … 9'),
         ({'version': True}, 'Expected `int`, got `bool`.*version'),
-        ({'storage_identifier': 'sqlite3'}, "storage 'sqlite3' is not mcap"),
-        ({'compression_mode': 'FILE'}, 'ros2 bag convert'),
+        ({'storage_identifier': 'sqlite3'}, "'sqlite3' is not mcap[^;]*; use `ros2 bag convert`"),
+        ({'compression_mode': 'FILE'}, 'compressed each file[^;]*; use `ros2 bag convert`, or'),
+        ({'compression_mode': 'MESSAGE'}, 'compressed each message[^;]*; use `ros2 bag convert`'),
         ({'relative_file_paths': ['../other.mcap']}, 'files in the same directory'),
         ({'relative_file_paths': ['/etc/passwd']}, 'files in the same directory'),
         ({'relative_file_paths': []}, 'name each file once'),

@@ -4,9 +4,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
+from bench import bag_samples as samples
 from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.bags.topics import select
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -36,6 +38,16 @@ def test_streams_are_what_was_recorded(arm, robot, tmp_path):
     assert_array_equal(found.length_commands.values, [arm.length[0]])
     assert found.tension_commands.values.shape == (0, robot.muscle_count)
     assert not found.rejected
+
+
+def test_two_motions_at_the_same_times_are_no_recording(arm, robot, tmp_path):
+    content = sorted(arm.content, key=lambda sample: sample.log_time)
+    samples.write_ours(tmp_path / 'bag', content * 2, 'zstd', True)
+    bag = Bag.open(tmp_path / 'bag')
+    for read in (lambda: read_streams(bag, robot), lambda: select(bag, ['default'], None, True)):
+        with pytest.raises(BagError, match=r'clock of the recorder went back by 1\.99 s'):
+            read()
+    assert any('went back' in fault for fault in check_bag(tmp_path / 'bag').faults)
 
 
 def test_theta_is_paired_with_the_nearest_muscle_state(arm, robot, tmp_path):

@@ -112,6 +112,12 @@ def test_topics_are_chosen_by_relative_or_recorded_name(tmp_path):
         select(bag, ['nothing'], None, False)
 
 
+def test_a_namespace_that_is_not_there_is_refused_with_those_that_are(tmp_path):
+    bag = make(tmp_path, *ours(('/left/anomaly', 'anomaly')))
+    with pytest.raises(BagError, match=r"no topic under '/right/'.* in it: /left"):
+        select(bag, ['default'], 'right', False)
+
+
 def test_names_outside_the_namespace_stay_absolute(tmp_path):
     names = ('/left/sim/markers', 'sim/markers'), ('/diagnostics', '/diagnostics')
     bag = make(tmp_path, *ours(*names), ('/left_foot/x', STRING))

@@ -148,6 +148,20 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     np.testing.assert_array_equal(bench.core.posture.theta, NOT_THERE)
 
 
+def test_without_any_muscle_nothing_is_explored_and_what_is_said_ends_with_its_cause():
+    bench = Bench()
+    bench.step()
+    bench.core.isolate(range(ROBOT.muscle_count))
+    assert 'estimator/restore' in bench.core.explore(True)
+    assert not bench.core.posture.exploring
+    bench.core.isolate(range(ROBOT.muscle_count - 1))
+    assert bench.core.explore(True) == ''
+    bench.step()
+    assert 'holds too few postures; estimator/restore' in bench.report().message
+    bench.core.isolate([])
+    assert 'too few' not in bench.report().message
+
+
 def test_an_arm_that_falls_on_its_way_goes_there_again_a_few_times():
     for lost, times in (([LOST], APPROACHES), ([], 0)):
         bench = Bench(target_duration=0.2)

@@ -101,6 +101,14 @@ def test_what_winches_cannot_follow_is_slowed_as_a_whole_and_said(bench):
     np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
 
 
+def test_what_is_to_be_there_at_once_is_there_as_soon_as_winches_can(bench):
+    bench.core.trajectory(points(OTHER, 0.0))
+    sent = values(moved(bench, 300))
+    assert np.abs(np.diff(sent, axis=0)).max() <= 0.3 * DT + 1e-9
+    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+    assert not bench.core.motion.moving
+
+
 def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
     bench.core.trajectory(points(OTHER, 2.0))
     moved(bench, 100)

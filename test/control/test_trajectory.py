@@ -104,6 +104,15 @@ def test_other_joints_stay_and_points_that_have_passed_are_left_out():
         Trajectory.through(Setpoint.resting(MIDDLE), points, passed=2.0)
 
 
+def test_a_point_at_time_zero_is_gone_to_at_once():
+    points = Points(BOTH, np.array([0.0]), MIDDLE[None] + 0.1, None, None)
+    trajectory = Trajectory.through(Setpoint.resting(MIDDLE), points)
+    assert 0.0 < trajectory.duration < 0.02
+    np.testing.assert_allclose(trajectory.end, MIDDLE + 0.1)
+    with pytest.raises(MessageError, match=r'all points have passed.*0\.3 s ago'):
+        Trajectory.through(Setpoint.resting(MIDDLE), points, passed=0.3)
+
+
 def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
     fast = np.array([[30.0, 0.0], [0.0, 0.0]])
     points = Points(BOTH, np.array([0.5, 1.0]), np.array([MIDDLE, MIDDLE]), fast, None)

@@ -190,6 +190,20 @@ def test_what_is_no_fault_is_refused_with_what_is_legal(line, arm):
     assert arm.faults.stuck.all()
 
 
+@pytest.mark.parametrize(
+    ('line', 'legal'),
+    [
+        ('drop:-1', 'sizes from 0 to 1 share'),
+        ('overheat:-300', 'sizes from 0 to 1000 °C'),
+        ('bias:40', 'sizes from -1 to 1 m of length'),
+        ('spike:tension:1e5', 'sizes from -10000 to 10000 N of tension'),
+    ],
+)
+def test_the_legal_sizes_are_told_with_their_unit(line, legal, robot):
+    with pytest.raises(MusculoskeletalError, match=f'{line}.*legal: {legal}'):
+        read_fault(line, robot)
+
+
 def test_a_muscle_may_be_called_like_a_number(robot):
     names = tuple(map(str, range(robot.muscle_count)))
     numbers = Robot(replace(robot.description, muscles=names))

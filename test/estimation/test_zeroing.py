@@ -93,6 +93,8 @@ def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
         with pytest.raises(MusculoskeletalError, match='legal'):
             estimator.zero(posture)
     assert estimator.zeros.known
+    estimator.zero(tuple(robot.upper + 0.002))  # as read of a joint that rests on its stop
+    assert not estimator.zeros.known
 
 
 def test_while_zeros_are_unknown_nothing_is_judged_but_a_muscle_without_tension(

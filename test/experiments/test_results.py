@@ -4,16 +4,25 @@
 import io
 import json
 import os
+import shutil
 import signal
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
+from jinja2 import UndefinedError
 
 from musculoskeletal_ae.emulator.reality import FOREIGN
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
-from musculoskeletal_ae.experiments import online_learning, robustness, runner
-from musculoskeletal_ae.experiments.results import combined, read, readme_table
+from musculoskeletal_ae.experiments import online_learning, results, robustness, runner
+from musculoskeletal_ae.experiments.results import (
+    KEPT,
+    combined,
+    read,
+    readme_table,
+    write_report,
+)
 from musculoskeletal_ae.experiments.study import Measured, Study
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.tools import experiment
@@ -40,6 +49,55 @@ def test_a_number_that_json_cannot_say_is_refused(arm26, tmp_path):
     study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
     with pytest.raises(MusculoskeletalError, match='finite'):
         combined(study, {0: Measured({'deep': {'list': [1.0, float('nan')]}}, {})})
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A copy of the committed results."""
+    return shutil.copytree(Path(__file__).parents[2] / KEPT, tmp_path / 'results')
+
+
+def changed(kept, name, **numbers):
+    """Change what an experiment brought."""
+    file = kept / name / 'result.json'
+    result = json.loads(file.read_text('utf-8')) | numbers
+    file.write_text(json.dumps(result), encoding='utf-8')
+
+
+@pytest.mark.parametrize('text', ['', '{"about": {}, "se', '[]', '{}'])
+def test_what_is_no_result_is_left_out_of_the_report(kept, text, capsys):
+    file = kept / 'estimation' / 'result.json'
+    file.write_text(text)
+    page = write_report(kept).read_text('utf-8')
+    assert 'id="control"' in page and 'id="estimation"' not in page
+    assert f'{file} is no result of an experiment' in capsys.readouterr().err
+
+
+def test_a_number_that_was_not_measured_is_a_dash(kept):
+    changed(kept, 'simulation', after_rad=None)
+    changed(kept, 'estimation', switched_off_detection_s=None)
+    assert 'after – s' in ' '.join(write_report(kept).read_text('utf-8').split())
+
+
+def test_results_of_another_version_cost_the_report_nothing_of_this_one(kept, capsys):
+    changed(kept, 'estimation', cuts=0)
+    with pytest.raises(UndefinedError):
+        write_report(kept)
+    page = write_report(kept, ['control']).read_text('utf-8')
+    assert 'id="control"' in page and 'id="estimation"' not in page
+    assert 'of another version: ' in capsys.readouterr().err
+
+
+def test_a_page_without_a_place_for_the_table_is_refused_before_the_work(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(results, 'run', lambda *_: pytest.fail('measured first'))
+    readme = tmp_path / 'README.md'
+    options = f'body_change --robot arm26 --quick --readme {readme} --out {tmp_path}'.split()
+    assert experiment.main(options) == 1
+    readme.write_text('no markers')
+    assert experiment.main(options) == 1
+    assert 'expected one <!-- results -->' in capsys.readouterr().err
 
 
 def fails(_study, seed):
@@ -123,9 +181,9 @@ def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
         f'{[*runner.EXPERIMENTS][-1]} of individual 1: InfeasibleError in'
         in capsys.readouterr().err
     )
-    results = read(tmp_path)
-    assert set(results) == set(runner.EXPERIMENTS)
-    assert all(set(result['failed']) == {'0', '1'} for result in results.values())
+    written = read(tmp_path)
+    assert set(written) == set(runner.EXPERIMENTS)
+    assert all(set(result['failed']) == {'0', '1'} for result in written.values())
     assert 'no tension at all' in (tmp_path / 'report.html').read_text('utf-8')
 
 

@@ -10,7 +10,7 @@ from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
@@ -77,6 +77,12 @@ def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_j
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e3, 0.0])[0]
     arm.says('clamped')
     assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0])[0]
+    # What is said of it, and what of a stop, stand beside each other.
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    for _ in range(2):
+        assert arm.state().message.startswith('stopped: controller/stop')
+    assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
+    assert not any('stiffness' in key for key in arm.state().values)
 
 
 def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm):

@@ -104,6 +104,26 @@ def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
 
 
 @pytest.mark.parametrize(
+    ('kind', 'name'),
+    [
+        (HardwareEmulator, 'faults'),
+        (Estimator, 'isolate_muscles'),
+        (Estimator, 'zero_posture'),
+        (Controller, 'joint_stiffness'),
+    ],
+)
+def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path):
+    file = tmp_path / 'nodes.yaml'
+    file.write_text(f'/**:\n  ros__parameters:\n    {name}: []\n')
+    options = ['--ros-args', '--params-file', str(file), '-p', 'robot:=arm26']
+    node = kind(context=graph.context, use_global_arguments=False, cli_args=options)
+    try:
+        assert node.parameter(name) == ()
+    finally:
+        node.destroy_node()
+
+
+@pytest.mark.parametrize(
     ('kind', 'parameters', 'kept'),
     [
         (

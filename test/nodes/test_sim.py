@@ -112,8 +112,12 @@ def test_joints_are_forced_and_released(arm, core):
     core.fixed[0] = [np.nan, -0.8]
     wait_for_posture(arm, core.settle().theta[0], 'the forced posture')
     arm.wait(lambda: 'forced joints' in str(arm.report('sim').values), 'the report')
-    for names, reason in ((['knee'], 'unknown joint'), (['elbow'] * 2, 'duplicate joint')):
-        force.publish(JointState(name=names, position=[0.0] * len(names)))
+    for names, extra, reason in (
+        (['knee'], {}, 'unknown joint'),
+        (['elbow'] * 2, {}, 'duplicate joint'),
+        ([], {'effort': [1.0]}, 'empty'),  # releases nothing
+    ):
+        force.publish(JointState(name=names, position=[0.0] * len(names), **extra))
         arm.wait(lambda reason=reason: reason in str(arm.report('sim').values), reason)
     assert abs(posture(arm)[1] + 0.8) < 0.01
     force.publish(JointState())

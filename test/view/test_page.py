@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
 
+import asyncio
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from graph import Process, executable, no_number_of
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters
 from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -17,6 +21,8 @@ from musculoskeletal_ae.nodes.messages import LATCHED
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
+import msgspec
+from viser._messages import GuiUpdateMessage
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -25,6 +31,12 @@ from musculoskeletal_ae.view.page import Page
 from view.browser import Browser, find_chromium
 
 SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
+#: what a browser says first: where its visitor looks from
+CAMERA = {
+    'wxyz': (1.0, 0.0, 0.0, 0.0), 'position': (1.0, 1.0, 1.0), 'fov': 0.8, 'near': 0.01,
+    'far': 100.0, 'image_height': 100, 'image_width': 100, 'look_at': (0.0, 0.0, 0.0),
+    'up_direction': (0.0, 0.0, 1.0),
+}  # fmt: skip
 chromium = pytest.mark.skipif(find_chromium() is None, reason='no chromium is installed')
 
 
@@ -145,6 +157,55 @@ def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
         np.testing.assert_allclose((slider.min, slider.max), limits, atol=near)
         assert limits[0] - 1e-12 <= slider.min < slider.max <= limits[1] + 1e-12
         assert slider.step <= near
+    finally:
+        page.close()
+
+
+def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
+    port, asked = view(), []
+
+    def answer(request, response):  # as a node without these parameters does
+        asked.append(request)
+        response.values = [ParameterValue() for _ in request.names]
+        return response
+
+    graph.node.create_service(GetParameters, 'hardware_emulator/get_parameters', answer)
+    with ThreadPoolExecutor(1) as aside, visit(port, f'http://localhost:{port}') as mine:
+        aside.submit(read, mine)
+        mine.send(msgspec.msgpack.encode({'type': 'ViewerCameraMessage', **CAMERA}))
+        joints = graph.publisher(JointState, 'estimated_joint_states')
+
+        def shown():
+            joints.publish(JointState(name=arm26.joints, position=[1e308, -1e308]))
+            return len(asked) > 2  # once a second, after the picture
+
+        graph.wait(shown, 'the page to go on')
+    assert graph.processes[-1].alive
+
+
+def test_whoever_is_turned_away_is_forgotten(arm26):
+    port = free_port()
+    page = Page(arm26, '127.0.0.1', port, False, lambda *_: None)
+    try:
+        for origin in ('http://evil.example', 'http://[bad') * 3:
+            with visit(port, origin) as other, pytest.raises(ConnectionClosed, match='1008'):
+                read(other)
+        sockets = page._server._websock_server
+        assert not sockets._live_connections and not sockets._client_state_from_id
+    finally:
+        page.close()
+
+
+def test_a_browser_changes_values_of_controls_and_nothing_else_of_them(arm26):
+    port, asked = free_port(), []
+    page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
+    try:
+        handlers = page._server._websock_server._incoming_handlers[GuiUpdateMessage]
+        for control in page._sliders:
+            for update in {'update_cb': []}, {'value': control.max}:
+                for handler in handlers:
+                    asyncio.run(handler(0, GuiUpdateMessage(control._impl.uuid, update)))
+            assert control._impl.update_cb and control.value == control.max
     finally:
         page.close()
 
