@@ -142,11 +142,11 @@ class ForeignArm(Arm):
         draw = self._draw = Draw(seed, self.effects)
         try:
             model = self._model = mjcf.from_file(robot, file) if file else _directory(robot, draw)
-        except ValueError as error:
+            data = self._data = mujoco.MjData(model)
+            self.individual = body = ForeignBody(robot, copy.copy(model), draw)
+        except (ValueError, mujoco.FatalError) as error:
             told = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
-        data = self._data = mujoco.MjData(model)
-        self.individual = body = ForeignBody(robot, copy.copy(model), draw)
         super().__init__(robot, seed, body.length_bias)
         if file is None:
             self._rub()

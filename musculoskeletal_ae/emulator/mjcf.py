@@ -19,7 +19,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.mjcf import resting_joints
+from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints
 from musculoskeletal_ae.importing.source import names_of_all, safe_name
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
@@ -228,7 +228,7 @@ def from_file(robot: Robot, file: Path) -> Any:
             in it.
     """
     with _loading(file):
-        spec = mujoco.MjSpec.from_file(str(file))
+        spec = open_mjcf(file)
     followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
     hand = _as_imported(spec, file, [*followers, *robot.muscles], robot.description.end_effector)
     tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
@@ -268,9 +268,13 @@ def from_file(robot: Robot, file: Path) -> Any:
         moved = _moved_by(whole, spec, held)
     for thing in [*ties, *loose, *bound, *held]:
         spec.delete(thing)
+    for pair in [*spec.pairs]:  # MuJoCo stops at a contact of two bodies that stand
+        if not any(map(_moves, (spec.geom(pair.geomname1), spec.geom(pair.geomname2)))):
+            spec.delete(pair)
     for joint in spec.joints:  # limits of what the file's own actuators do
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    _add_hand(spec.body(hand), pin.SE3.Identity())
+    # By name MuJoCo finds none that was named since it was compiled.
+    _add_hand(next(body for body in spec.bodies if body.name == hand), pin.SE3.Identity())
     with _loading(file):
         model = _pulled(spec, robot).compile()
     for thing, values in moved:
@@ -279,6 +283,13 @@ def from_file(robot: Robot, file: Path) -> Any:
     if moved:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _moves(geom: Any) -> bool:
+    body = geom.parent
+    while body.name != 'world' and not body.joints:
+        body = body.parent
+    return bool(body.joints)
 
 
 def _ties(spec: Any, kind: Any, names: set[str]) -> list[Any]:

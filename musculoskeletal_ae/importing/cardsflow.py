@@ -135,6 +135,8 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
     model = source.model
     source.links = [str(frame.name) for frame in body_frames(model)]
+    if shaped := [link for link in root.findall('link') if link.find('visual') is not None]:
+        source.note('dropped', f'meshes and other shapes: of {len(shaped)} links')
     for joint in root.findall('joint'):
         parent, child = joint.find('parent'), joint.find('child')
         if parent is not None and child is not None:

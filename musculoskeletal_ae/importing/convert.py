@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a file of another format to a robot directory: what `import_robot` does and says."""
 
+import os
 import re
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree as ET
 
+from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
@@ -43,7 +46,14 @@ def read_source(file: Path) -> Source:
     text = read_text(file, refuse, LARGEST)
     # OpenSim writes names of C++ as tags, as HuntCrossleyForce::ContactParameters.
     text = re.sub(r'</?\w+(?:::\w+)+', lambda tag: tag[0].replace('::', '.'), text)
-    root = parse_xml(file, text)
+    try:
+        root = parse_xml(file, text)
+    except RobotDescriptionError as error:
+        # MuJoCo reads some of what is no XML, as attributes without a space between.
+        loose = isinstance(error.__cause__, ET.ParseError)
+        if not (loose and re.match(r'(\s|<\?.*?\?>|<!--.*?-->)*<mujoco[\s/>]', text, re.DOTALL)):
+            raise
+        root = ET.Element('mujoco')
     if root.tag not in READERS:
         told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')
@@ -69,7 +79,7 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     cut(source, **chain)
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
-    if (there := out.exists()) and (not out.is_dir() or any(out.iterdir())):
+    if (there := os.path.lexists(out)) and (not out.is_dir() or any(out.iterdir())):
         raise refuse(out, 'expected a new or empty directory')
     try:
         write(source, out)

@@ -28,12 +28,15 @@ COUNTS = {
 STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stronger
 
 
-def read_mjcf(file: Path, _root: ET.Element) -> Source:
+def read_mjcf(file: Path, root: ET.Element) -> Source:
     """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
+    for name in [item.get('file', '') for item in root.iter('include')]:
+        if (included := file.parent / name).exists() and not included.is_file():
+            raise refuse(file, f'what it includes, {name!r}, is no regular file')
     warnings: list[str] = []
     mujoco.set_mju_user_warning(warnings.append)  # by default it writes a file where it was started
     try:
-        model = mujoco.MjModel.from_xml_path(str(file))
+        model = open_mjcf(file).compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
     finally:
@@ -42,6 +45,13 @@ def read_mjcf(file: Path, _root: ET.Element) -> Source:
     for warning in warnings:
         source.note('MuJoCo warns', ' '.join(warning.split()))
     return source
+
+
+def open_mjcf(file: Path) -> Any:
+    """Return an MJCF file's MjSpec, whose bodies all stay: MuJoCo may fuse a hand with its arm."""
+    spec = mujoco.MjSpec.from_file(str(file))
+    spec.compiler.fusestatic = False
+    return spec
 
 
 def resting_joints(model: Any) -> list[float]:
@@ -85,6 +95,8 @@ class _Reader:
         for kind, told, values in (
             ('joint', 'springs', m.jnt_stiffness),
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
+            ('joint', 'damping', m.dof_damping[m.jnt_dofadr]),
+            ('joint', 'friction', m.dof_frictionloss[m.jnt_dofadr]),
             ('tendon', 'springs', m.tendon_stiffness),
             ('tendon', 'limits', m.tendon_limited),
             ('tendon', 'damping', m.tendon_damping),

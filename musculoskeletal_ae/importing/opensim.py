@@ -142,7 +142,7 @@ class _Reader:
         for item in model.find('ForceSet/objects') or ():
             self._muscle(item)
         if any(self.wraps.values()):
-            told = 'lengths are compared round the wrap objects of the result'
+            told = 'lengths are compared round the wrap objects of the result, not round OpenSim’s'
             self.source.note('approximated', told)
         self.source.lengths = self._lengths
 
@@ -411,11 +411,15 @@ class _Reader:
     ) -> dict[int, Wrap]:
         """Return after which point each wrap object stands: where it is met most."""
         chosen: dict[int, Wrap] = {}
+        labels: dict[int, str] = {}
         for item in path.findall('PathWrapSet/objects/PathWrap'):
-            best, most, label = -1, 0.0, _word(item, 'wrap_object')
+            best, most, label, taken = -1, 0.0, _word(item, 'wrap_object'), ''
             first, last = numbers(item.findtext('range') or '-1 -1', 2, f'range of {label}')
             for i, k in pairwise(kept):
-                if i + 1 < first or k + 1 > last > 0 or i in chosen or label not in self.objects:
+                if i + 1 < first or k + 1 > last > 0 or label not in self.objects:
+                    continue
+                if i in chosen:
+                    taken = taken or labels[i]
                     continue
                 line = np.linalg.norm(places[:, k] - places[:, i], axis=1)
                 ends = places[:, i], places[:, k]
@@ -423,9 +427,10 @@ class _Reader:
                 if added > most:
                     best, most = i, added
             if best >= 0:
-                chosen[best] = self.objects[label]
+                chosen[best], labels[best] = self.objects[label], label
             else:
-                why = 'it does not meet' if label in self.objects else 'is none that is read'
+                why = 'as converted it does not touch' if label in self.objects else 'is not read'
+                why = f'would be a second one beside {taken}' if taken else why
                 told = f'muscle {muscle}: wrap round {label}, which {why}'
                 self.source.note('dropped', told)
         return chosen

@@ -93,6 +93,7 @@ class Shell(Node):
         self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
+        self.add_post_set_parameters_callback(self._keep_old_names)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=STEADY)
         self._reported_at = time.monotonic()
@@ -220,6 +221,14 @@ class Shell(Node):
         finally:
             self._proposed = {}
         return SetParametersResult(successful=True)
+
+    def _keep_old_names(self, parameters: list[RosParameter]) -> None:
+        """Let a parameter be the same by its old name and by its new one."""
+        others = RENAMED | {new: old for old, new in RENAMED.items()}
+        for parameter in parameters:
+            other = others.get(parameter.name, '')
+            if self.has_parameter(other) and self.get_parameter(other).value != parameter.value:
+                self.set_parameters([RosParameter(other, value=parameter.value)])
 
     # -- checkpoints ----------------------------------------------------------------------------
 

@@ -111,15 +111,21 @@ def write(robot: Robot, change: Array, out: Path) -> None:
     for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
         muscle['route'] = [written(item) for item in route]
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / 'muscles.yaml').write_text(text, encoding='utf-8')  # whatever becomes of the rest
     # Meshes come along, wherever they lie in the directory; what is written may lie there too.
-    skipped = out.resolve()
-    shutil.copytree(
-        here,
-        out,
-        ignore=lambda folder, names: [n for n in names if Path(folder, n).resolve() == skipped],
-        dirs_exist_ok=True,
-    )
-    (out / 'muscles.yaml').write_text(text, encoding='utf-8')
+    skipped = {out.resolve(), (here / 'muscles.yaml').resolve()}
+
+    def left(folder: str, names: list[str]) -> list[str]:
+        paths = {name: Path(folder, name) for name in names}
+        copied = [n for n, p in paths.items() if p.is_file() or p.is_dir()]  # no pipe, no dead link
+        return [name for name in names if name not in copied or paths[name].resolve() in skipped]
+
+    try:
+        shutil.copytree(here, out, ignore=left, dirs_exist_ok=True)
+    except shutil.Error as error:
+        told = '; '.join(f'{source}: {why}' for source, _, why in error.args[0])
+        raise refusal(out, f'muscles.yaml is written, but not copied was {told}') from error
     middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
     lines = []
     for was, now in zip(*(draw_arm(each, middle, bias) for each in (robot, after)), strict=True):

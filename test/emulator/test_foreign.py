@@ -431,3 +431,48 @@ def test_a_path_that_cannot_be_is_no_reality(robot, reality):
 def test_no_such_reality_is_refused(robot):
     with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
         make_arm(robot, 0, 'dream')
+
+
+#: an elbow with two wires and, in its places, what may go wrong
+ELBOW = """<mujoco>{options}<worldbody>
+  <site name="o" pos=".05 0 0"/><site name="o2" pos="-.05 0 0"/>
+  <body name="mount" pos="0 0 1">{held}<geom name="g1" size=".02"/>
+    <body name="arm"><joint name="elbow" axis="0 1 0" range="-60 60"/>
+      <geom type="capsule" size=".02 .1" pos="0 0 -.1"/>
+      <site name="i" pos=".03 0 -.1"/><site name="i2" pos="-.03 0 -.1"/>
+      <body {hand}pos="0 0 -.2"><geom size=".02"/></body></body></body>
+  <body name="beside" pos="0 0 1.01"><geom name="g2" size=".02"/></body></worldbody>
+  <contact><pair geom1="g1" geom2="g2"/></contact>
+  <tendon><spatial name="front"><site site="o"/><site site="i"/></spatial>
+    <spatial name="back"><site site="o2"/><site site="i2"/></spatial></tendon></mujoco>"""
+AS_IT_IS = {'options': '', 'held': '', 'hand': 'name="hand" '}
+HINGE = '<joint name="held" axis="1 0 0" range="-60 60"/>'
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'options': '<compiler fusestatic="true"/>'},
+        {'options': '<compiler fusestatic="true"/>', 'hand': ''},
+        {'hand': ''},
+        {'held': HINGE},  # beside a body that stands, once the joint is left out
+    ],
+)
+def test_a_file_plays_the_robot_that_was_imported_from_it(tmp_path, change):
+    file = tmp_path / 'elbow.xml'
+    file.write_text(ELBOW.format(**AS_IT_IS | change), encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'own', joints=['elbow']).robot
+    arm = make_arm(robot, 0, str(file))
+    assert arm.warnings == ()
+    arm.step(0.1)
+    theta = np.array([[0.3]])
+    lengths = arm.individual.absolute_lengths(theta)
+    np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
+
+
+def test_a_file_that_mujoco_cannot_step_is_refused_by_name(tmp_path):
+    file = tmp_path / 'elbow.xml'
+    file.write_text(ELBOW.format(**AS_IT_IS | {'options': '<size memory="1K"/>'}), encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'own').robot
+    with pytest.raises(MusculoskeletalError, match=r'reality .*elbow\.xml: .*out of memory'):
+        make_arm(robot, 0, str(file))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every format: lengths against the source's own, cut chains, and files that are damaged."""
 
+import os
 import re
 from contextlib import suppress
 
@@ -110,6 +111,33 @@ def test_what_pushes_is_no_strength_and_what_pulls_together_adds(mjcf, tmp_path,
     given = result.robot.tension.limit[result.robot.muscles.index('out')]
     assert given == pytest.approx(limit or TENSION_DEFAULT['limit'])
     assert any('it can only push' in note for note in result.notes) == (limit is None)
+
+
+def test_what_resists_in_joints_is_said_to_be_dropped(mjcf, tmp_path):
+    more = '<joint name="elbow" damping="5" frictionloss="2" '
+    mjcf.write_text(mjcf.read_text().replace('<joint name="elbow" ', more, 1))
+    notes = import_robot(mjcf, tmp_path / 'out').notes
+    assert {'dropped: damping: joint elbow', 'dropped: friction: joint elbow'} <= {*notes}
+
+
+def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
+    """As of an unmodified file of MyoHub, which has no space between two attributes."""
+    expected = import_robot(mjcf, tmp_path / 'sound')
+    mjcf.write_text('<!-- own -->\n' + mjcf.read_text().replace('ball" type=', 'ball"type='))
+    result = import_robot(mjcf, tmp_path / 'loose')
+    assert result.robot.muscles == expected.robot.muscles
+    other = put(tmp_path, 'other.xml', '<robot name="a"type="b"/>')
+    with pytest.raises(MusculoskeletalError, match='not valid XML'):
+        import_robot(other, tmp_path / 'other')
+
+
+def test_what_is_included_must_be_a_regular_file(mjcf, tmp_path):
+    os.mkfifo(tmp_path / 'more.xml')
+    mjcf.write_text(
+        mjcf.read_text().replace('<worldbody>', '<include file="more.xml"/><worldbody>')
+    )
+    with pytest.raises(SourceError, match=r"'more.xml', is no regular file"):
+        import_robot(mjcf, tmp_path / 'out')
 
 
 def test_what_tendons_and_contacts_do_beside_pulling_is_said_to_be_dropped(mjcf, tmp_path):
@@ -348,14 +376,17 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
     assert main([str(file), '--out', str(tmp_path / 'out')]) == 0
-    assert 'coupled: wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert 'coupled: wrist = -0.5 · shoulder +0.1' in told and 'meshes' not in told
     robot = Robot.load(tmp_path / 'out')
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
     named = bodies.URDF.format(mimic=mimic).replace('"shoulder"', '"shoulder, left"')
-    put(tmp_path, 'named.urdf', named)
+    shape = '<visual><geometry><mesh filename="package://own/a.stl"/></geometry></visual>'
+    put(tmp_path, 'named.urdf', named.replace('<link name="base">', f'<link name="base">{shape}'))
     assert main([str(tmp_path / 'named.urdf'), '--out', str(tmp_path / 'named')]) == 0
+    assert 'dropped: meshes and other shapes: of 1 links' in capsys.readouterr().out
     assert Robot.load(tmp_path / 'named').muscles == ('muscle_of_shoulder_left', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
     with pytest.raises(SourceError, match="there is no joint 'moon'"):
@@ -491,7 +522,9 @@ def test_a_wrong_option_names_what_is_legal(mjcf, options, told):
 
 def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsys):
     assert main([str(mjcf), '--out', str(tmp_path)]) == 1
-    assert 'expected a new or empty directory' in capsys.readouterr().err
+    (tmp_path / 'link').symlink_to('/nowhere')
+    assert main([str(mjcf), '--out', str(tmp_path / 'link')]) == 1
+    assert capsys.readouterr().err.count('expected a new or empty directory') == 2
     other = put(tmp_path, 'other.xml', '<html/>')
     assert main([str(other), '--out', str(tmp_path / 'out')]) == 1
     assert 'none of the formats read: mujoco, cardsflow' in capsys.readouterr().err

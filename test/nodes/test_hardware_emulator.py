@@ -188,7 +188,10 @@ def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):
     emulator = graph.host(HardwareEmulator, robot='arm26', marker_rate=30.0)
     assert emulator.parameter('marker_pose_rate') == 30.0
     graph.next('marker_pose', 2)
-    assert graph.set_parameter('hardware_emulator', 'marker_rate', 0.0)[0]
+    for name, other in ('marker_pose_rate', 'marker_rate'), ('marker_rate', 'marker_pose_rate'):
+        for rate in 10.0, 0.0:
+            assert graph.set_parameter('hardware_emulator', name, rate)[0]
+            assert emulator.get_parameter(other).value == rate
     assert emulator.marker_pose_rate == 0.0
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_robot --suggest`: via points that make an arm sound."""
 
+import os
 import re
 
 import numpy as np
@@ -89,6 +90,18 @@ def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(t
     assert 'better: not sound' in printed
     lacks = [suggestion.lacking(check_robot(Robot.load(d), 40, seed=1)) for d in (arm, out)]
     assert 0.0 < lacks[1] < lacks[0]
+
+
+def test_what_cannot_be_copied_costs_no_suggestion(tmp_path):
+    robot = Robot.load(copy_robot('arm26', tmp_path / 'arm'))
+    (tmp_path / 'arm' / 'log').symlink_to('/nowhere')
+    os.mkfifo(tmp_path / 'arm' / 'pipe')
+    change = np.full((len(points(tmp_path / 'arm')), 3), 0.001)
+    suggestion.write(robot, change, tmp_path / 'out')
+    moved = points(tmp_path / 'out') - points(tmp_path / 'arm')
+    np.testing.assert_allclose(moved, change, atol=1e-6)
+    kept = {file.name for file in (tmp_path / 'out').iterdir()}
+    assert {'robot.urdf', 'muscles.yaml', 'suggestion.png'} <= kept and not kept & {'log', 'pipe'}
 
 
 def test_a_sound_arm_is_left_as_it_is(tmp_path):
