@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
-from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -81,7 +80,7 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        means = (fmean(values or [math.nan]) for values in (self.errors, self.anomalies))
+        means = (sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies))
         told, known = self.situation, figures(self.theta is not None, *means)
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  {known}'
