@@ -48,19 +48,18 @@ def free_port() -> int:
 
 @pytest.fixture
 def view(graph):
-    """Start the page of arm26 with options; return its port once it answers."""
+    """Start the page of arm26 with options; return its port once it lets visitors in.
+
+    It says so: who comes before that is turned away, and a browser would come again.
+    """
 
     def start(*options: str) -> int:
         port = free_port()
         command = [*executable('view'), '--robot', 'arm26', '--port', str(port), *options]
         process = Process('view', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
         graph.processes.append(process)
-
-        def answers() -> bool:
-            with socket.socket() as probe:
-                return probe.connect_ex(('127.0.0.1', port)) == 0
-
-        graph.wait(answers, 'the page')
+        lines = iter(process.process.stdout.readline, '')
+        assert any(line.startswith(f'http://localhost:{port}') for line in lines)
         return port
 
     return start
