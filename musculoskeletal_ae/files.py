@@ -9,6 +9,7 @@ functions take `refuse`, which makes the error that they raise of a file and wha
 import csv
 import os
 import stat
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -173,6 +174,23 @@ def _check(text: str) -> None:
             raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases included')
         if len(within) > DEEPEST:
             raise ValueError(f'{where}: more than {DEEPEST} levels')
+
+
+def write_whole(file: Path, data: bytes) -> None:
+    """Write a file so that a reader sees the old one or the new one, never a part."""
+    descriptor, temporary = tempfile.mkstemp(dir=file.parent, prefix=f'.{file.name}.')
+    try:
+        with os.fdopen(descriptor, 'wb') as stream:
+            stream.write(data)
+            stream.flush()
+            os.fchmod(stream.fileno(), 0o644)  # mkstemp makes it private
+            os.fsync(stream.fileno())
+        Path(temporary).replace(file)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    # The new name survives a power cut only once the directory is on disk too.
+    sync_directory(file.parent)
 
 
 def sync_directory(directory: Path) -> None:

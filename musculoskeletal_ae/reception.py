@@ -6,7 +6,7 @@ from collections.abc import Callable
 from inspect import iscoroutinefunction
 from typing import Any
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
 # A source time that lies further back than this is another publisher's clock, not a reordering.
@@ -81,6 +81,11 @@ class Reception:
         if first:
             self._warn(f'rejected {self.last_rejected}')
         return first
+
+    def reject_error(self, source: str, error: Exception) -> bool:
+        """Count what a callback let out; say whether it is the first of its kind."""
+        kind = type(error).__name__
+        return self.reject(source, kind, f'{kind}: {printable(error)}')
 
     def take_received(self) -> dict[str, int]:
         """Return how many messages were used since the last call, by topic."""

@@ -39,8 +39,9 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
     if start > length:
         raise BagError(bag.path, f'is {length:.3f} s long', 'give a smaller --start')
     first = bag.start + round(start * 1e9)
-    longest = length if duration is None else min(duration, length)
-    return first, min(bag.end, first + round(longest * 1e9))
+    if duration is None or duration > length:
+        return first, bag.end
+    return first, min(bag.end, first + round(duration * 1e9))
 
 
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:

@@ -18,9 +18,8 @@ class Topic(NamedTuple):
 
 
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
-LONGEST_DISORDER = (
-    1_000_000_000  # [ns]: messages of a topic come that late, clocks are set back further
-)
+# Messages of a topic may be written that late; a clock is set back further.
+LONGEST_DISORDER = 1_000_000_000  # [ns]
 DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])

@@ -158,7 +158,8 @@ class Controller:
         """Go on without these muscles, places in T and l, and with all others."""
         muscles, before = set(muscles), set(self.robot.isolated)
         self.robot.isolate(muscles)
-        self.short = self.short if muscles == before else ''
+        if muscles != before:
+            self.short = ''
         if added := muscles - before:
             self._isolated_at = max(added), self.watch.stepped_at
         if self.mae is not None:
@@ -428,8 +429,9 @@ class Controller:
                 desired = self._slack(self._command(dt))
             except RobotDescriptionError as error:  # too little is left to explore with
                 self._explore(False)
-                left = f'what is left without {self._left_out} holds too few postures; {RESTORE}'
-                self.short = left if self._left_out else str(error)
+                self.short = str(error)
+                if without := self._left_out:
+                    self.short = f'what is left without {without} holds too few postures; {RESTORE}'
             except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
                 self.stop(f'fault of control: {type(error).__name__}: {error}')
         waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on

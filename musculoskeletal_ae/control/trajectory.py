@@ -95,8 +95,8 @@ class Trajectory:
         """
         kept = points.time > passed + 1e-9
         if not kept.any() and passed == 0.0:  # at once: as fast as it is slowed to
-            at_once, kept = np.full(len(kept), AT_ONCE), np.arange(len(kept)) == len(kept) - 1
-            points = points._replace(time=at_once)
+            points = points._replace(time=points.time + AT_ONCE)
+            kept = points.time >= AT_ONCE
         if not kept.any():
             raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])

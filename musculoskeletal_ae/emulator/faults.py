@@ -30,10 +30,9 @@ class Kind(NamedTuple):
     of_quantity: bool = False
 
 
-#: sizes of spike and bias by quantity, [m], [N], [°C], of a joint [rad]: default, most
-SIZES = {'length': (0.05, 1.0), 'tension': (100.0, 1e4), 'temperature': (60.0, 1e3),
-         'theta': (0.1, 3.2)}  # fmt: skip
-UNITS = {'length': 'm', 'tension': 'N', 'temperature': '°C', 'theta': 'rad'}
+#: sizes of spike and bias by quantity, theta of a joint: default, most, unit
+SIZES = {'length': (0.05, 1.0, 'm'), 'tension': (100.0, 1e4, 'N'),
+         'temperature': (60.0, 1e3, '°C'), 'theta': (0.1, 3.2, 'rad')}  # fmt: skip
 KINDS = {
     'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
     'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),
@@ -82,7 +81,7 @@ def read_fault(line: str, robot: Robot) -> Fault:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
     kind = KINDS[name]
     quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
-    size, most = kind.size, kind.most
+    size, most, unit, least = kind.size, kind.most, kind.unit, 0.0
     if kind.of_quantity and words and words[0] in QUANTITIES:
         quantities = (words.pop(0),)
     elif kind.of_quantity and words and words[0] in robot.joints:
@@ -90,7 +89,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
     elif kind.size:
         quantities = quantities[:1]  # of a spike or bias: length
     if quantities and kind.size:
-        size, most = SIZES[quantities[0]]
+        size, most, unit = SIZES[quantities[0]]
+        unit, least = f'{unit} of {quantities[0]}', -most
     # A muscle may be called like a number.
     if words and most and ':'.join(words) not in robot.muscles:
         try:
@@ -98,9 +98,7 @@ def read_fault(line: str, robot: Robot) -> Fault:
             words.pop()
         except ValueError:
             pass
-    if not abs(size) <= most or (size < 0.0 and name not in ('spike', 'bias')):
-        unit = f'{UNITS[quantities[0]]} of {quantities[0]}' if quantities else kind.unit
-        least = -most if quantities else 0.0
+    if not least <= size <= most:
         legal = f'sizes from {least:g} to {most:g} {unit}' if most else 'no size'
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if words and not kind.of_muscle:

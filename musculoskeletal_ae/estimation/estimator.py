@@ -140,16 +140,14 @@ class Estimator:
 
     def check_posture(self, posture: tuple[float, ...]) -> None:
         """Raise a MusculoskeletalError unless an arm can stand in θ [rad] (D,); () is legal."""
-        limits = [*zip(self._robot.lower, self._robot.upper, strict=True)]
-        inside = len(posture) == len(limits)
+        lower, upper, theta = self._robot.lower, self._robot.upper, np.array(posture)
         # A joint that rests on its stop is read a little beyond it.
-        beyond = PAST_STOP * (self._robot.upper - self._robot.lower)
-        inside = inside and all(
-            low - past <= t <= high + past for t, past, (low, high) in zip(posture, beyond, limits)
-        )
+        past = PAST_STOP * (upper - lower)
+        inside = theta.shape == lower.shape
+        inside = inside and bool(((theta >= lower - past) & (theta <= upper + past)).all())
         if posture and not inside:
-            units = (unit.theta for unit in self._robot.units)
-            legal = (f'{low:.2f} to {high:.2f} {u}' for u, (low, high) in zip(units, limits))
+            limits = zip(self._robot.units, lower, upper, strict=True)
+            legal = (f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
             raise MusculoskeletalError(f'{list(posture)}; legal: none, or {", ".join(legal)}')
 
     def zero(self, posture: tuple[float, ...] = ()) -> None:

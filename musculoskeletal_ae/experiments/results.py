@@ -27,7 +27,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
-from musculoskeletal_ae.files import read_table
+from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.robot.robot import Robot
 
 #: result.json of every experiment that was run, by name
@@ -89,9 +89,7 @@ def write(
         result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(result, indent=1, ensure_ascii=False)
-        begun = folder / 'result.json.begun'  # a kill leaves no half of a result
-        begun.write_text(text + '\n', encoding='utf-8')
-        begun.replace(folder / 'result.json')
+        write_whole(folder / 'result.json', f'{text}\n'.encode())
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
             figure.set_layout_engine('none')  # it stays where it is now
@@ -107,14 +105,16 @@ def read(folder: Path) -> Results:
     results: dict[str, Any] = {}
     for name in EXPERIMENTS:
         file = folder / name / 'result.json'
-        if file.is_file():
-            try:
-                result = json.loads(file.read_text(encoding='utf-8'))
-                results |= {name: result} if {'about', 'seeds'} <= result.keys() else {}
-            except (ValueError, AttributeError):
-                pass
-            if name not in results:
-                print(f'warning: {file} is no result of an experiment: left out', file=sys.stderr)
+        if not file.is_file():
+            continue
+        try:
+            result = json.loads(file.read_text(encoding='utf-8'))
+        except ValueError:
+            result = None
+        if isinstance(result, dict) and {'about', 'seeds'} <= result.keys():
+            results[name] = result
+        else:
+            print(f'warning: {file} is no result of an experiment: left out', file=sys.stderr)
     return results
 
 

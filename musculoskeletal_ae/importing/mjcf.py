@@ -30,8 +30,9 @@ STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stron
 
 def read_mjcf(file: Path, root: ET.Element) -> Source:
     """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
-    for name in [item.get('file', '') for item in root.iter('include')]:
-        if (included := file.parent / name).exists() and not included.is_file():
+    for item in root.iter('include'):
+        included = file.parent / (name := item.get('file', ''))
+        if included.exists() and not included.is_file():
             raise refuse(file, f'what it includes, {name!r}, is no regular file')
     warnings: list[str] = []
     mujoco.set_mju_user_warning(warnings.append)  # by default it writes a file where it was started

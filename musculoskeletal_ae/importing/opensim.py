@@ -410,8 +410,7 @@ class _Reader:
         self, muscle: str, path: ET.Element, places: Array, kept: list[int]
     ) -> dict[int, Wrap]:
         """Return after which point each wrap object stands: where it is met most."""
-        chosen: dict[int, Wrap] = {}
-        labels: dict[int, str] = {}
+        chosen: dict[int, str] = {}
         for item in path.findall('PathWrapSet/objects/PathWrap'):
             best, most, label, taken = -1, 0.0, _word(item, 'wrap_object'), ''
             first, last = numbers(item.findtext('range') or '-1 -1', 2, f'range of {label}')
@@ -419,7 +418,7 @@ class _Reader:
                 if i + 1 < first or k + 1 > last > 0 or label not in self.objects:
                     continue
                 if i in chosen:
-                    taken = taken or labels[i]
+                    taken = taken or chosen[i]
                     continue
                 line = np.linalg.norm(places[:, k] - places[:, i], axis=1)
                 ends = places[:, i], places[:, k]
@@ -427,13 +426,13 @@ class _Reader:
                 if added > most:
                     best, most = i, added
             if best >= 0:
-                chosen[best], labels[best] = self.objects[label], label
+                chosen[best] = label
             else:
                 why = 'as converted it does not touch' if label in self.objects else 'is not read'
                 why = f'would be a second one beside {taken}' if taken else why
                 told = f'muscle {muscle}: wrap round {label}, which {why}'
                 self.source.note('dropped', told)
-        return chosen
+        return {i: self.objects[label] for i, label in chosen.items()}
 
     # -- OpenSim's own lengths -------------------------------------------------------------------
 

@@ -6,9 +6,7 @@ Nothing of a checkpoint is used before all of it has been checked, and every fau
 """
 
 import json
-import os
 import re
-import tempfile
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +20,7 @@ from safetensors.numpy import save as save_tensors
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.files import read_bytes, sync_directory
+from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS
@@ -323,20 +321,7 @@ def save(mae: Mae, path: str | Path) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    path = Path(path)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-    try:
-        with os.fdopen(descriptor, 'wb') as file:
-            file.write(to_bytes(mae))
-            file.flush()
-            os.fchmod(file.fileno(), 0o644)  # mkstemp makes it private
-            os.fsync(file.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    # The new name survives a power cut only once the directory is on disk too.
-    sync_directory(path.parent)
+    write_whole(Path(path), to_bytes(mae))
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:

@@ -121,10 +121,9 @@ class Shell(Node):
 
     def survive(self, source: str, error: Exception) -> None:
         """Count what a callback let out, by topic or service, and go on."""
-        kind = type(error).__name__
         if source == 'Timer':  # no message did it
-            self._fault = f'fault of its own: {kind}: {error}'
-        if self._reception.reject(source, kind, f'{kind}: {printable(error)}'):
+            self._fault = f'fault of its own: {type(error).__name__}: {error}'
+        if self._reception.reject_error(source, error):
             self.get_logger().error(printable(traceback.format_exc()))
 
     def create_service(  # type: ignore[override]

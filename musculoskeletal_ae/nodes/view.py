@@ -168,8 +168,7 @@ class View(Node):
                 self._show(begun)
             except Exception as error:  # noqa: BLE001 - topics and services may bring anything
                 raise_interrupt(error)
-                kind = type(error).__name__
-                if self.reception.reject('what is shown', kind, f'{kind}: {printable(error)}'):
+                if self.reception.reject_error('what is shown', error):
                     self.get_logger().error(printable(traceback.format_exc()))
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 

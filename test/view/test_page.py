@@ -179,7 +179,7 @@ def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
             return len(asked) > 2  # once a second, after the picture
 
         graph.wait(shown, 'the page to go on')
-    assert graph.processes[-1].alive
+    assert graph.processes[-1].alive()
 
 
 def test_whoever_is_turned_away_is_forgotten(arm26):
