@@ -4,9 +4,10 @@
     python -m bench timings [--robot NAME|DIR] [--preset NAME] [--device cuda]
 
 The torch side is the same algorithm with the same numbers going in; only the network runs in torch,
-and its gradients come from autograd. The bound is what the network's multiply-adds alone take, at
-the rate of this machine's products of matrices of that size: one row for a single call, a batch for
-many arms.
+and its gradients come from autograd. Of the simulator there are also rows with mechanics in torch,
+too (`eager_simulation`), as a user of torch would write it. The bound is what the network's
+multiply-adds alone take, at the rate of this machine's products of matrices of that size: one row
+for a single call, a batch for many arms.
 """
 
 import time
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bench.eager_simulation import EagerSimulation
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.control.methods import first_command, msc_compensation, stiffness_command
@@ -33,6 +35,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 MANY, LONGEST = 4096, 0.05  # arms, [s] of a round
+ALL_TORCH = 'beside all of it in torch'
 
 
 class Row(NamedTuple):
@@ -232,25 +235,30 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
     mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
-    def step(arms: int, body: Any, device: str | None = None) -> Callable[[], object]:
-        simulated = Simulation(robot, body, arms=arms, device=device)
-        theta = robot.random_postures(arms, rng)
-        tension = rng.uniform(robot.tension.bias, robot.tension.limit, (arms, robot.muscle_count))
+    def arms(count: int, body: Any = mae, device: str | None = None) -> Simulation:
+        simulated = Simulation(robot, body, arms=count, device=device)
+        theta = robot.random_postures(count, rng)
+        tension = rng.uniform(robot.tension.bias, robot.tension.limit, (count, robot.muscle_count))
         simulated.command = first_command(robot, mae, theta, tension)
         simulated.wrench[:, 2] = -10.0
+        return simulated
+
+    def step(simulated: Any) -> Callable[[], object]:
         # The last one's angles are there when all of them are.
         return lambda: simulated.step(0.01).theta[-1].tolist()
 
-    eager, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
-    many = f'the same, each of {MANY} in one batch'
+    network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     there = [
-        Row(f'the same, each of {arms} on {device}', step(arms, mae, device), None, arms)
-        for arms in (MANY, 16 * MANY)
+        Row(f'the same, each of {n} on {device}', step(arms(n, device=device)), None, n)
+        for n in (MANY, 16 * MANY)
         if device is not None
     ]
+    one, many = 'simulation step', f'the same, each of {MANY} in one batch'
     return [
-        Row('simulation step', step(1, mae), step(1, eager), 1, work),
-        Row(many, step(MANY, mae), step(MANY, eager), MANY, work),
+        Row(one, step(arms(1)), step(arms(1, network)), 1, work),
+        Row(many, step(arms(MANY)), step(arms(MANY, network)), MANY, work),
+        Row(f'{one}, {ALL_TORCH}', step(arms(1)), step(EagerSimulation(arms(1)))),
+        Row(f'{many}, {ALL_TORCH}', step(arms(MANY)), step(EagerSimulation(arms(MANY))), MANY),
         *there,
         Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
     ]
@@ -295,11 +303,11 @@ def show(robot: Robot, preset: str, device: str | None = None) -> None:
     """Print the table."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}, µs of one call (median), torch on one thread')
-    print(f'{"":<42}{"ours":>10}{"torch eager":>14}{"bound":>10}')
+    print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')
     for row in measure(robot, preset, device):
         numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))
         told = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
-        print(f'{row.name:<42}{"".join(told)}')
+        print(f'{row.name:<64}{"".join(told)}')
 
 
 def main(argv: list[str]) -> None:

@@ -290,7 +290,7 @@ class QuasiStatics:
     """The equations above for one robot, and for the network that was given to `use` last."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._tree, self._slopes = robot, Load(robot.kinematics).tree, Slopes(robot)
+        self._robot, self.tree, self.slopes = robot, Load(robot.kinematics).tree, Slopes(robot)
         postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
         levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
         self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY)
@@ -300,16 +300,15 @@ class QuasiStatics:
 
         A FloatingPointError says that the network has no finite lengths somewhere.
         """
-        self._slopes.fit(mae)
+        self.slopes.fit(mae)
         robot, elastic, self._mae = self._robot, self._robot.series_elastic, mae
         # A noisy fit may find a little less than none, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
         joints = robot.lower, robot.upper, self._viscosity
-        body = Body(*map(np.array, (*muscles, *units, *joints)))
-        self._friction = body.friction
-        self._handle = handed(body, self._tree, self._slopes.limbs)
+        self.body = Body(*map(np.array, (*muscles, *units, *joints)))
+        self._handle = handed(self.body, self.tree, self.slopes.limbs)
 
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
@@ -319,7 +318,7 @@ class QuasiStatics:
         A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
         forced to the angles `fixed` (N, D) [rad], nan for a free joint.
         """
-        passed = np.exp(-self._friction * state.slid)
+        passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
         pulled = np.ascontiguousarray(pullback(end))  # as of one arm, of many: compiled once

@@ -9,6 +9,7 @@ import torch
 from robots import write_robot
 from torch.overrides import TorchFunctionMode
 
+from bench.eager_simulation import EagerSimulation
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.network import TorchLengths
 from musculoskeletal_ae.mae.residuals import TouchStatistics
@@ -70,6 +71,16 @@ def test_torch_computes_what_numpy_does(robot, mae):
         one.isolate([1])
         other.isolate([1])
     assert (other.state.tension[:, 1] == 0.0).all()
+
+
+def test_a_step_written_all_in_torch_is_the_same(robot, mae):
+    arms = pushed(robot, mae, None)
+    other = EagerSimulation(arms)
+    for _ in range(5):  # later, one may come to a stop a step before the other
+        ours, theirs = arms.step(0.01), other.step(0.01)
+    for name, atol in {'theta': 1e-4, 'tension': 0.1, 'length': 1e-5, 'followed': 1e-5}.items():
+        np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), atol=atol)
+    np.testing.assert_allclose(theirs.holding, ours.holding, atol=0.02)
 
 
 def test_the_network_is_on_the_device(robot, mae):

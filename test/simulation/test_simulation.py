@@ -14,6 +14,7 @@ from bench.simulation_nominal import (
     responses,
     rest_errors,
 )
+from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation import simulation
 from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED
@@ -259,8 +260,11 @@ def test_on_a_network_one_arm_and_a_batch_agree(arm26, mae):
     for i in (0, 17, 299):
         single = Simulation(arm26, mae)
         single.command, single.wrench = commands[[i]], batch.wrench[[i]]
-        for ours, theirs in zip(single.step(0.3), batch.state, strict=True):
-            np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-5, atol=1e-5)
+        for name, ours in single.step(0.3)._asdict().items():
+            theirs = getattr(batch.state, name)[i]
+            # A micrometre, which single precision allows, is more of a way to slide than of others.
+            atol = 1e-6 / REVERSAL if name == 'slid' else 1e-5
+            np.testing.assert_allclose(ours[0], theirs, rtol=1e-5, atol=atol)
 
 
 def test_more_or_fewer_arms_are_not_pushed_by_what_pushed_others(arm26, mae):
