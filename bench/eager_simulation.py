@@ -63,10 +63,13 @@ class EagerSimulation:
         parts = limbs.joints, limbs.muscles, limbs.first, limbs.second
         for d, m in limbs.counts:
             pairs = np.array([*combinations_with_replacement(range(d), 2)]).T
-            sizes = d, m, (1 + d + len(pairs[0])) * m * d, m * (1 + d) * d * d
+            sizes = d, m, (1 + d + len(pairs[0])) * m * d, m * (1 + d) * len(pairs[0])
             joints, muscles, first, second = (p[:n] for p, n in zip(parts, sizes, strict=True))
             parts = tuple(p[n:] for p, n in zip(parts, sizes, strict=True))
-            tables = _single(first.reshape(-1, m * d)), _single(second.reshape(m, -1))
+            rows, columns = np.tril_indices(d)
+            bends = np.zeros((m, 1 + d, d, d))
+            bends[..., rows, columns] = bends[..., columns, rows] = second.reshape(m, 1 + d, -1)
+            tables = _single(first.reshape(-1, m * d)), _single(bends.reshape(m, -1))
             self.limbs.append((*map(torch.as_tensor, (joints, muscles, pairs)), *tables))
 
     def step(self, h: float) -> ArmState:

@@ -97,7 +97,7 @@ def microseconds(function: Callable[[], object], calls: int = 100, rounds: int =
 
 def row_time(row: Row, function: Callable[[], object]) -> float:
     """Return the time [µs] of one side of a row."""
-    return microseconds(function, max(1, 100 // row.several)) / row.several
+    return microseconds(function) / row.several
 
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:

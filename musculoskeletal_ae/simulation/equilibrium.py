@@ -82,7 +82,7 @@ class Limbs(NamedTuple):
     joints: Ints  # places in θ
     muscles: Ints  # places in T and l
     first: Array  # of each, G (M, D) by each member of the basis 1, θ_j, θ_j θ_k with j ≤ k
-    second: Array  # of each, and each muscle, ∂²l_i/∂θ² (D, D) by 1 and each θ_j
+    second: Array  # of each, and each muscle, the lower half of ∂²l_i/∂θ² by 1 and each θ_j
 
 
 @njit(cache=True)
@@ -110,180 +110,227 @@ def follow(command: float, followed: float, length: float, span: float, most: fl
 
 
 @njit(cache=True)
-def add(share: float, row: Array, total: Array) -> None:
-    """Add a multiple of the beginning of a row."""
-    for i in range(len(total)):
-        total[i] += share * row[i]
+def combine(shares: Array, rows: Array, total: Array) -> None:
+    """Fill the sums (W, N) of rows (K, W), each times its share (K, N)."""
+    terms, width = rows.shape
+    total[:] = 0.0
+    if total.shape[1] == 1:  # a core computes several numbers at once: of one arm those of a row
+        row = total.reshape(width)
+        for k in range(terms):
+            for w in range(width):
+                row[w] += shares[k, 0] * rows[k, w]
+        return
+    for w in range(width):
+        for k in range(terms):
+            for n in range(total.shape[1]):
+                total[w, n] += rows[k, w] * shares[k, n]
 
 
 @njit(cache=True)
 def add_slopes(
     limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
 ) -> None:
-    """Add G [m/rad] to (M, D), and Σ T_i ∂²l_i/∂θ² [N·m/rad] to (D, D)."""
+    """Fill G [m/rad] (M, D, N); add Σ T_i ∂²l_i/∂θ² [N·m/rad] to the lower half of (D, D, N)."""
+    arms = theta.shape[1]
+    jacobian[:] = 0.0
     joints, muscles, first, second = limbs.joints, limbs.muscles, limbs.first, limbs.second
-    for count, lines in limbs.counts:
-        slope, bend = np.zeros(lines * count), np.zeros((1 + count) * count * count)
-        add(1.0, first, slope)
-        first = first[len(slope) :]
+    for limb in range(len(limbs.counts)):
+        count, lines = limbs.counts[limb, 0], limbs.counts[limb, 1]
+        pairs = count * (count + 1) // 2
+        terms, bends = 1 + count + pairs, (1 + count) * pairs
+        basis, pull = np.ones((terms, arms)), np.empty((lines, arms))
+        slope, bend = np.empty((lines * count, arms)), np.empty((bends, arms))
+        term = 1 + count
         for j in range(count):
-            add(theta[joints[j]], first, slope)
-            first = first[len(slope) :]
+            for n in range(arms):
+                basis[1 + j, n] = theta[joints[j], n]
         for j in range(count):
             for k in range(j, count):
-                add(theta[joints[j]] * theta[joints[k]], first, slope)
-                first = first[len(slope) :]
+                for n in range(arms):
+                    basis[term, n] = basis[1 + j, n] * basis[1 + k, n]
+                term += 1
         for m in range(lines):
-            add(tension[muscles[m]], second, bend)
-            second = second[len(bend) :]
+            for n in range(arms):
+                pull[m, n] = tension[muscles[m], n]
+        combine(basis, first[: terms * len(slope)].reshape(terms, len(slope)), slope)
+        combine(pull, second[: lines * bends].reshape(lines, bends), bend)
+        for m in range(lines):
+            for j in range(count):
+                for n in range(arms):
+                    jacobian[muscles[m], joints[j], n] = slope[m * count + j, n]
+        pair = 0
         for j in range(count):
-            for m in range(lines):
-                jacobian[muscles[m], joints[j]] += slope[m * count + j]
-            for k in range(count):
-                value = bend[j * count + k]
-                for b in range(count):
-                    value += theta[joints[b]] * bend[((b + 1) * count + j) * count + k]
-                curvature[joints[j], joints[k]] += value
+            for k in range(j + 1):
+                for b in range(1 + count):
+                    for n in range(arms):
+                        part = basis[b, n] * bend[b * pairs + pair, n]
+                        curvature[joints[j], joints[k], n] += part
+                pair += 1
         joints, muscles = joints[count:], muscles[lines:]
+        first, second = first[terms * len(slope) :], second[lines * bends :]
 
 
 @njit(cache=True, error_model='numpy')
 def turn(
     body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
 ) -> None:
-    """Fill θ after a step of at most `most` [rad] each; the matrix (D, D) is used up.
+    """Fill θ (D, N) after a step of at most `most` [rad] each.
 
-    Joints at a stop stay, forced joints go where they are forced.
+    Joints at a stop stay, forced joints go where they are forced. Of the matrix (D, D, N), which is
+    symmetric, the lower half is read, and used up.
     """
-    joints = len(theta)
-    way, turned, held = np.zeros(joints), np.zeros(joints), np.empty(joints, np.bool_)
+    joints, arms = theta.shape
+    way, turned, held = np.zeros((joints, arms)), push.copy(), np.empty((joints, arms), np.bool_)
+    largest, factor = np.full(arms, most), np.empty(arms)
     for d in range(joints):
-        held[d] = theta[d] <= body.lower[d] and push[d] < 0.0
-        held[d] |= theta[d] >= body.upper[d] and push[d] > 0.0
-        if math.isfinite(fixed[d]):
-            held[d] = True
-            way[d] = clip(clip(fixed[d], body.lower[d], body.upper[d]) - theta[d], -most, most)
+        low, high = body.lower[d], body.upper[d]
+        for n in range(arms):
+            at, pushed, forced = theta[d, n], push[d, n], math.isfinite(fixed[d, n])
+            stopped = (at <= low and pushed < 0.0) or (at >= high and pushed > 0.0)
+            held[d, n] = forced or stopped
+            if forced:
+                way[d, n] = clip(clip(fixed[d, n], low, high) - at, -most, most)
     for d in range(joints):
-        if not held[d]:
-            turned[d] = push[d]
-            for e in range(joints):
-                turned[d] -= matrix[d, e] * way[e]
+        for e in range(joints):
+            for n in range(arms):
+                turned[d, n] -= matrix[max(d, e), min(d, e), n] * way[e, n]
     for d in range(joints):
-        if held[d]:
-            for e in range(joints):
-                matrix[d, e] = matrix[e, d] = 0.0
-            matrix[d, d] = 1.0
+        for e in range(d + 1):
+            for n in range(arms):
+                if held[d, n] or held[e, n]:
+                    matrix[d, e, n] = 1.0 if d == e else 0.0
+        for n in range(arms):
+            if held[d, n]:
+                turned[d, n] = 0.0
     # Gauss; no pivoting where viscosity is on the diagonal.
     for d in range(joints):
         for e in range(d + 1, joints):
-            factor = matrix[e, d] / matrix[d, d]
-            turned[e] -= factor * turned[d]
-            for k in range(d + 1, joints):
-                matrix[e, k] -= factor * matrix[d, k]
-    largest = most
+            for n in range(arms):
+                factor[n] = matrix[e, d, n] / matrix[d, d, n]
+                turned[e, n] -= factor[n] * turned[d, n]
+            for k in range(d + 1, e + 1):
+                for n in range(arms):
+                    matrix[e, k, n] -= factor[n] * matrix[k, d, n]
     for d in range(joints - 1, -1, -1):
         for k in range(d + 1, joints):
-            turned[d] -= matrix[d, k] * turned[k]
-        turned[d] /= matrix[d, d]
-        largest = max(largest, abs(turned[d]))
+            for n in range(arms):
+                turned[d, n] -= matrix[k, d, n] * turned[k, n]
+        for n in range(arms):
+            turned[d, n] /= matrix[d, d, n]
+            largest[n] = max(largest[n], abs(turned[d, n]))
     for d in range(joints):
-        reached = theta[d] + turned[d] * (most / largest) + way[d]
-        arrived[d] = clip(reached, body.lower[d], body.upper[d])
+        low, high = body.lower[d], body.upper[d]
+        for n in range(arms):
+            reached = theta[d, n] + turned[d, n] * (most / largest[n]) + way[d, n]
+            arrived[d, n] = clip(reached, low, high)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def advance(
-    robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, length: Array,
-    pulled: Array, command: Array, wrench: Array, fixed: Array,
+    robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, pulled: Array,
+    command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
     """Fill the arms h [s] after a state, of a robot: Body, Tree and Limbs.
 
-    Of the network: the lengths at θ and T_end (N, M), and Gᵀ T_end there (N, D). `passed` is what
-    friction lets through from the motor to the elastic unit, T_end / T (N, M).
+    Arms stand last, as in `load`. Of the network: the lengths at θ
+    and T_end, which are the state's (M, N), and Gᵀ T_end there (D, N). `passed` is what friction
+    lets through from the motor to the elastic unit, T_end / T (M, N).
     """
     body, tree, limbs = robot.held
-    muscles, joints = len(body.stiffness), len(body.lower)
-    load, push = np.empty(joints), np.empty(joints)
-    slope, matrix = np.empty((joints, joints)), np.empty((joints, joints))
-    jacobian, end = np.empty((muscles, joints)), np.empty(muscles)
-    compliance, wanted = np.empty(muscles), np.empty(muscles)
-    give, soft, lost = np.empty(muscles), np.empty(muscles), np.empty(muscles)
-    for n in range(len(length)):
-        theta, tension, slid, arrived = (
-            state.theta[n],
-            state.tension[n],
-            state.slid[n],
-            after.theta[n],
-        )
-        passing, turning = passed[n], after.slid[n]
-        hold(tree, theta, wrench[n], load, slope)
-        jacobian[:] = 0.0
-        rough = False
-        for m in range(muscles):
-            end[m], turning[m] = passing[m] * tension[m], slid[m]
-            rough |= body.friction[m] * end[m] != 0.0
-            span = (body.most[m] - body.bias[m]) / body.stiffness[m]
-            after.followed[n, m] = follow(
-                command[n, m], state.followed[n, m], length[n, m], span, MODULE_SPEED * h
+    theta, tension, length, slid = state.theta, state.tension, state.length, state.slid
+    (muscles, arms), joints = tension.shape, len(theta)
+    load, slope = np.empty((joints, arms)), np.empty((joints, joints, arms))
+    push, matrix = np.empty_like(load), np.empty_like(slope)
+    jacobian, end = np.empty((muscles, joints, arms)), passed * tension
+    compliance, wanted, give = np.empty_like(end), np.empty_like(end), np.empty_like(end)
+    soft, lost, turning = np.empty_like(end), np.empty_like(end), slid.copy()
+    change, spring, stiff = np.empty(arms), np.empty(arms), np.empty(arms)
+    arrived, way = np.empty_like(load), np.empty(arms)
+    done, rough = np.zeros(arms, np.bool_), False
+    hold(tree, theta, wrench, load, slope)
+    add_slopes(limbs, theta, end, jacobian, slope)
+    for m in range(muscles):
+        stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
+        span = (most - bias) / stiffness
+        for n in range(arms):
+            after.followed[m, n] = follow(
+                command[m, n], state.followed[m, n], length[m, n], span, MODULE_SPEED * h
             )
-            stretch = body.wire_stretch[m] * (body.length_at_zero[m] + length[n, m])
-            unit = body.rate[m] * (body.force[m] + max(end[m], 0.0))
-            compliance[m] = 1.0 / unit + stretch
-        add_slopes(limbs, theta, end, jacobian, slope)
-        for _ in range(ROUNDS):
-            for d in range(joints):
-                push[d] = -(load[d] + pulled[n, d])
-                for e in range(joints):
-                    matrix[d, e] = slope[d, e]
-                matrix[d, d] += body.viscosity[d] / h
-            for m in range(muscles):
+            stretch = body.wire_stretch[m] * (body.length_at_zero[m] + length[m, n])
+            unit = body.rate[m] * (body.force[m] + max(end[m, n], 0.0))
+            compliance[m, n] = 1.0 / unit + stretch
+    for _ in range(ROUNDS):
+        for d in range(joints):
+            for n in range(arms):
+                push[d, n] = -(load[d, n] + pulled[d, n])
+            for e in range(d + 1):
+                for n in range(arms):
+                    matrix[d, e, n] = slope[d, e, n]
+            for n in range(arms):
+                matrix[d, d, n] += body.viscosity[d] / h
+        for m in range(muscles):
+            stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
+            friction = body.friction[m]
+            rough |= friction != 0.0
+            for n in range(arms):
                 # Where a wire slides, friction is like a stiff spring until it has turned round:
                 # one of constant stiffness, where the arm's lets go little by little.
-                rub, lost[m] = 0.0, 0.0
-                if abs(turning[m]) < 1.0:
-                    rub = body.friction[m] * end[m] / REVERSAL
-                else:
-                    lost[m] = body.friction[m] * end[m] * (turning[m] - slid[m])
+                rubbed, turns = friction * end[m, n], abs(turning[m, n]) < 1.0
+                rub = rubbed / REVERSAL if turns else 0.0
+                lost[m, n] = 0.0 if turns else rubbed * (turning[m, n] - slid[m, n])
                 # MSC, friction and the elastic unit in series: at rest posture T moves to `wanted`,
                 # and with the posture by `soft` K G Δθ.
-                wound = body.stiffness[m] * (length[n, m] - after.followed[n, m])
-                by_motor, aim = passing[m] * compliance[m], body.bias[m] + wound
-                give[m] = 1.0 + compliance[m] * rub
-                soft[m] = body.stiffness[m] / (give[m] + body.stiffness[m] * by_motor)
-                slack = compliance[m] * lost[m] - by_motor * (aim - tension[m])
-                wanted[m] = aim + soft[m] * slack
+                wound = stiffness * (length[m, n] - after.followed[m, n])
+                by_motor, aim = passed[m, n] * compliance[m, n], bias + wound
+                give[m, n] = 1.0 + compliance[m, n] * rub
+                soft[m, n] = stiffness / (give[m, n] + stiffness * by_motor)
+                slack = compliance[m, n] * lost[m, n] - by_motor * (aim - tension[m, n])
+                wanted[m, n] = aim + soft[m, n] * slack
                 # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
                 # Newton).
-                settled = clip(wanted[m], body.bias[m], body.most[m])
-                rise = settled - tension[m]
-                moved = (compliance[m] * lost[m] - by_motor * rise) / give[m]
-                change = passing[m] * rise + rub * moved - lost[m]
-                spring = rub / give[m]
-                if settled == wanted[m]:
-                    spring = (passing[m] + rub / body.stiffness[m]) * soft[m]
-                for d in range(joints):
-                    push[d] -= change * jacobian[m, d]
-                    stiff = spring * jacobian[m, d]
-                    for e in range(joints):
-                        matrix[d, e] += stiff * jacobian[m, e]
-            turn(body, theta, push, matrix, JOINT_SPEED * h, fixed[n], arrived)
-            settled_now = True
-            for m in range(muscles):
-                stretch = 0.0
-                for d in range(joints):
-                    stretch += jacobian[m, d] * (arrived[d] - theta[d])
-                pull = clip(wanted[m] + soft[m] * stretch, body.bias[m], body.most[m])
-                rise = passing[m] * compliance[m] * (pull - tension[m])
-                moved = (stretch + compliance[m] * lost[m] - rise) / give[m]
-                before, turning[m] = turning[m], clip(slid[m] - moved / REVERSAL, -1.0, 1.0)
-                settled_now &= (abs(before) < 1.0) == (abs(turning[m]) < 1.0)
-                after.tension[n, m], after.length[n, m] = pull, length[n, m] + moved
-            if settled_now or not rough:
-                break
+                settled = clip(wanted[m, n], bias, most)
+                rise = settled - tension[m, n]
+                moved = (compliance[m, n] * lost[m, n] - by_motor * rise) / give[m, n]
+                change[n] = passed[m, n] * rise + rub * moved - lost[m, n]
+                wholly = (passed[m, n] + rub / stiffness) * soft[m, n]
+                spring[n] = wholly if settled == wanted[m, n] else rub / give[m, n]
+            for d in range(joints):
+                for n in range(arms):
+                    push[d, n] -= change[n] * jacobian[m, d, n]
+                    stiff[n] = spring[n] * jacobian[m, d, n]
+                for e in range(d + 1):
+                    for n in range(arms):
+                        matrix[d, e, n] += stiff[n] * jacobian[m, e, n]
+        turn(body, theta, push, matrix, JOINT_SPEED * h, fixed, arrived)
+        again = np.zeros(arms, np.bool_)
         for d in range(joints):
-            stopped = arrived[d] == body.lower[d] and push[d] < 0.0
-            stopped |= arrived[d] == body.upper[d] and push[d] > 0.0
-            after.holding[n, d] = -push[d] if stopped or math.isfinite(fixed[n, d]) else 0.0
+            for n in range(arms):
+                stopped = arrived[d, n] == body.lower[d] and push[d, n] < 0.0
+                stopped |= arrived[d, n] == body.upper[d] and push[d, n] > 0.0
+                held = -push[d, n] if stopped or math.isfinite(fixed[d, n]) else 0.0
+                if not done[n]:
+                    after.theta[d, n], after.holding[d, n] = arrived[d, n], held
+        for m in range(muscles):
+            stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
+            way[:] = 0.0
+            for d in range(joints):
+                for n in range(arms):
+                    way[n] += jacobian[m, d, n] * (arrived[d, n] - theta[d, n])
+            for n in range(arms):
+                pull = clip(wanted[m, n] + soft[m, n] * way[n], bias, most)
+                rise = passed[m, n] * compliance[m, n] * (pull - tension[m, n])
+                moved = (way[n] + compliance[m, n] * lost[m, n] - rise) / give[m, n]
+                before, now = turning[m, n], clip(slid[m, n] - moved / REVERSAL, -1.0, 1.0)
+                again[n] |= (abs(before) < 1.0) != (abs(now) < 1.0)
+                if not done[n]:
+                    turning[m, n], after.slid[m, n] = now, now
+                    after.tension[m, n], after.length[m, n] = pull, length[m, n] + moved
+        left = False
+        for n in range(arms):
+            done[n] |= not again[n]
+            left |= not done[n]
+        if not (rough and left):
+            break
 
 
 class QuasiStatics:
@@ -321,10 +368,16 @@ class QuasiStatics:
         passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
-        pulled = np.ascontiguousarray(pullback(end))  # as of one arm, of many: compiled once
-        after = ArmState(*map(np.empty_like, state))
-        advance(self._handle, state, after, h, passed, length, pulled, command, wrench, fixed)
-        return after
+        before = ArmState(*map(arms_last, (*state[:2], length, *state[3:])))
+        others = map(arms_last, (passed, pullback(end), command, wrench, fixed))
+        after = ArmState(*map(np.empty_like, before))
+        advance(self._handle, before, after, h, *others)
+        return ArmState(*[part.T for part in after])
+
+
+def arms_last(part: Array) -> Array:
+    """Return what is given by arm, (N, …), with arms last, in one piece."""
+    return np.ascontiguousarray(part.T)
 
 
 class Slopes:
@@ -377,7 +430,9 @@ class Cubics:
         """Fit lengths of the body at those postures (N, M) [m]; return its part of `Limbs`."""
         cubic = self._inverse @ lengths[:, self._muscles]  # (basis, M)
         first = np.einsum('dqb,bm->qmd', self._slope, cubic)
-        return first.ravel(), np.einsum('elq,qmd->mlde', self._bend, first).ravel()
+        bend = np.einsum('elq,qmd->mlde', self._bend, first)
+        rows, columns = np.tril_indices(first.shape[-1])
+        return first.ravel(), bend[..., rows, columns].ravel()
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gravity and a push ask of the joints of one arm, and how that changes, compiled by numba.
+"""What gravity and a push ask of the joints of N arms, and how that changes, compiled by numba.
 
     load(θ) = g(θ) − Jᵀ F
 
@@ -10,6 +10,8 @@ needs only sums over what it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
+
+Arms stand last in memory, (…, N): a core then computes several at once.
 """
 
 import math
@@ -20,7 +22,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.robot.kinematics import Kinematics
-from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus, turned
+from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 
 
 class Tree(NamedTuple):
@@ -53,65 +55,96 @@ def vector(a: Array) -> Vector:
 
 
 @njit(cache=True)
+def of(arm: int, vectors: Array) -> Vector:
+    """Return one arm's of vectors (3, N), without taking memory."""
+    return vectors[0, arm], vectors[1, arm], vectors[2, arm]
+
+
+@njit(cache=True)
 def place(tree: Tree, theta: Array, pose: Array) -> None:
-    """Fill the joints' poses in the root link's frame, axes, and m c of their bodies, (J, 3, 6)."""
+    """Fill the axes and origins of joints in the root link's frame, and vectors of theirs.
+
+    (J, 6, 3, N): three axes of its frame, its origin, the axis that it turns about, m c of its body
+    """
+    arms = theta.shape[1]
+    sine, rest, column = np.empty(arms), np.empty(arms), np.empty((3, arms))
     pose[0] = 0.0
     pose[0, 0, 0] = pose[0, 1, 1] = pose[0, 2, 2] = 1.0
     for i in range(1, len(tree.parent)):
-        up, angle = pose[tree.parent[i]], tree.ratio[i] * theta[tree.master[i]] + tree.offset[i]
-        sine, rest = math.sin(angle), 1.0 - math.cos(angle)
-        if tree.slides[i]:
-            sine, rest = angle, 0.0
-        own = tree.placement[i], tree.first[i], tree.second[i]
+        up, own, given = pose[tree.parent[i]], pose[i], theta[tree.master[i]]
+        for n in range(arms):
+            angle = tree.ratio[i] * given[n] + tree.offset[i]
+            sine[n], rest[n] = math.sin(angle), 1.0 - math.cos(angle)
+            if tree.slides[i]:
+                sine[n], rest[n] = angle, 0.0
+        fixed, first, second = tree.placement[i], tree.first[i], tree.second[i]
         for c in range(4):
-            x = own[0][0, c] + sine * own[1][0, c] + rest * own[2][0, c]
-            y = own[0][1, c] + sine * own[1][1, c] + rest * own[2][1, c]
-            z = own[0][2, c] + sine * own[1][2, c] + rest * own[2][2, c]
             for r in range(3):
-                pose[i, r, c] = up[r, 0] * x + up[r, 1] * y + up[r, 2] * z
+                for n in range(arms):
+                    column[r, n] = fixed[r, c] + sine[n] * first[r, c] + rest[n] * second[r, c]
+            for r in range(3):
+                shift = 1.0 if c == 3 else 0.0
+                for n in range(arms):
+                    x, y, z = of(n, column)
+                    own[c, r, n] = up[0, r, n] * x + up[1, r, n] * y + up[2, r, n] * z
+                    own[c, r, n] += shift * up[3, r, n]
+        axis, centre, mass = vector(tree.axis[i]), vector(tree.centre[i]), tree.mass[i]
         for r in range(3):
-            pose[i, r, 3] += up[r, 3]
-            pose[i, r, 4] = dot(pose[i, r], tree.axis[i])
-            pose[i, r, 5] = tree.mass[i] * (dot(pose[i, r], tree.centre[i]) + pose[i, r, 3])
+            for n in range(arms):
+                frame = own[0, r, n], own[1, r, n], own[2, r, n]
+                own[4, r, n] = dot(frame, axis)
+                own[5, r, n] = mass * (dot(frame, centre) + own[3, r, n])
 
 
 @njit(cache=True)
 def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
-    """Fill load [N·m] (D,) and ∂load/∂θ [N·m/rad] (D, D) at θ [rad] (D,).
+    """Fill load [N·m] (D, N) and ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
 
-    The wrench (6,) [N, N·m] acts on the end effector's origin, in axes of the root link; its
+    The wrench (6, N) [N, N·m] acts on the end effector's origin, in axes of the root link; its
     torque's share in the gradient is left out.
     """
-    joints = len(tree.parent)
-    pose = np.empty((joints, 3, 6))
+    joints, arms = len(tree.parent), theta.shape[1]
+    pose, bend = np.empty((joints, 6, 3, arms)), np.empty((3, arms))
     place(tree, theta, pose)
     for i in range(joints - 1, 0, -1):
         for r in range(3):
-            pose[tree.parent[i], r, 5] += pose[i, r, 5]
+            for n in range(arms):
+                pose[tree.parent[i], 5, r, n] += pose[i, 5, r, n]
     load[:], gradient[:] = 0.0, 0.0
-    down, hand = vector(tree.gravity), pose[tree.effector_joint]
-    tip = plus(turned(hand, tree.effector), vector(hand[:, 3]))
+    down, tip, hand = vector(tree.gravity), vector(tree.effector), pose[tree.effector_joint]
+    tips = hand[3].copy()
+    for c in range(3):
+        for r in range(3):
+            for n in range(arms):
+                tips[r, n] += tip[c] * hand[c, r, n]
     for k in range(1, joints):
-        push, twist = vector(wrench[:3]), vector(wrench[3:])
-        if not tree.carries[k]:
-            push = twist = 0.0, 0.0, 0.0
-        at, axis, moment = vector(pose[k, :, 3]), vector(pose[k, :, 4]), vector(pose[k, :, 5])
-        if tree.slides[k]:
-            force = plus(push, down, tree.carried[k])
-            torque, bend = dot(axis, force), cross(axis, force)
-        else:
-            weight, arm = plus(moment, at, -tree.carried[k]), plus(tip, at, -1.0)
-            turning = plus(plus(cross(weight, down), cross(arm, push)), twist)
-            bending = cross(down, cross(weight, axis)), cross(push, cross(arm, axis))
-            torque, bend = dot(axis, turning), plus(bending[0], bending[1])
-        load[tree.master[k]] -= tree.ratio[k] * torque
+        origins, axes, moments = pose[k, 3], pose[k, 4], pose[k, 5]
+        master, weighs, slides = tree.master[k], tree.carried[k], tree.slides[k]
+        held = 1.0 if tree.carries[k] else 0.0
+        for n in range(arms):
+            at, axis = of(n, origins), of(n, axes)
+            push = held * wrench[0, n], held * wrench[1, n], held * wrench[2, n]
+            twist = held * wrench[3, n], held * wrench[4, n], held * wrench[5, n]
+            weight, arm = plus(of(n, moments), at, -weighs), plus(of(n, tips), at, -1.0)
+            if slides:
+                force = plus(push, down, weighs)
+                torque, bent = dot(axis, force), cross(axis, force)
+            else:
+                turning = plus(plus(cross(weight, down), cross(arm, push)), twist)
+                bending = cross(down, cross(weight, axis)), cross(push, cross(arm, axis))
+                torque, bent = dot(axis, turning), plus(bending[0], bending[1])
+            load[master, n] -= tree.ratio[k] * torque
+            for r in range(3):
+                bend[r, n] = bent[r]
         j = k
         while j > 0:
             if not tree.slides[j]:
-                slope = tree.ratio[j] * tree.ratio[k] * dot(pose[j, :, 4], bend)
-                gradient[tree.master[j], tree.master[k]] -= slope
-                if j != k:
-                    gradient[tree.master[k], tree.master[j]] -= slope
+                ratio, other, axes = tree.ratio[j] * tree.ratio[k], tree.master[j], pose[j, 4]
+                for n in range(arms):
+                    slope = ratio * dot(of(n, axes), of(n, bend))
+                    gradient[other, master, n] -= slope
+                    if j != k:
+                        gradient[master, other, n] -= slope
             j = tree.parent[j]
 
 
@@ -144,8 +177,8 @@ class Load:
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
         """Return what `hold` fills, (N, D) and (N, D, D), for θ (N, D) and wrenches (N, 6)."""
-        load, gradient = np.empty_like(theta), np.empty((*theta.shape, theta.shape[1]))
         pushes = np.zeros((len(theta), 6)) if wrench is None else wrench
-        for arm in zip(theta, pushes, load, gradient, strict=True):
-            hold(self.tree, *arm)
-        return load, gradient
+        theta, pushes = np.ascontiguousarray(theta.T), np.ascontiguousarray(pushes.T)
+        load, gradient = np.empty_like(theta), np.empty((len(theta), *theta.shape))
+        hold(self.tree, theta, pushes, load, gradient)
+        return load.T, gradient.transpose(2, 0, 1)

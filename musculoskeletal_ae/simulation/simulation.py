@@ -31,7 +31,7 @@ from musculoskeletal_ae.simulation.paper import PaperDescent
 
 LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
 #: arms whose arrays fit into a core's cache together
-CHUNK = 256
+CHUNK = 384
 SETTLING_STEP, SETTLING_STEPS = 0.1, 300  # [s], for `settle`
 SETTLED = 1e-6  # [rad] moved in a step
 
