@@ -227,7 +227,9 @@ class Estimator(Shell):
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.root_frame))
-        self.seen.publish(joint_message(self.robot.joints, theta, message.header.stamp))
+        known = np.isfinite(theta)
+        joints = [joint for joint, is_known in zip(self.robot.joints, known) if is_known]
+        self.seen.publish(joint_message(joints, theta[known], message.header.stamp))
 
     def clock_jumped_back(self) -> None:
         """Forget what came before, also how long each muscle was; latches stay."""
