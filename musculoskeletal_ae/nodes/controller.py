@@ -99,7 +99,7 @@ class Controller(Shell):
     def _check_stiffness(self, value: Any) -> Any:
         # Before any other that is set with it: what those end would not come back.
         checked = replace(self.core.settings, joint_stiffness=value)
-        checked.desired_stiffness(self.robot.joint_count)
+        checked.desired_stiffness(self.robot.kinematics.radian)
         return value
 
     def _check_method(self, value: Any) -> Any:
