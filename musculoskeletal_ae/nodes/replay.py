@@ -25,9 +25,12 @@ from musculoskeletal_ae.bags.playback import LEAD, SHOWN, Timeline, lap, shown, 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
+from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.report import Report
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -69,6 +72,8 @@ class Replay(Node):
         self.declare_parameter('position', self._before, told)
         self.add_post_set_parameters_callback(self._seek)
         self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
+        reception = Reception(self.get_logger().warning)  # of nothing: it only sends
+        self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -124,7 +129,10 @@ class Replay(Node):
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.look(wait)
                 if now > self._next_report:
-                    self._next_report = now + 1.0
+                    self._next_report = now + PERIOD
+                    doing = 'paused' if self._timeline.paused else 'playing'
+                    report = Report('ok', doing, {'position': self._position()})
+                    self._diagnostics.tell(report)
                     seconds = self._before + np.array([self._done(), self.length])
                     self._told.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))

@@ -9,6 +9,7 @@ from array import array
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
@@ -38,7 +39,9 @@ def record(tool, graph, out, *options):
 
 
 def messages(path, namespace):
-    return [(m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages()]
+    """Return topic and data of all but what a replay said of itself."""
+    every = ((m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages())
+    return [(topic, data) for topic, data in every if b'/replay: state' not in data]
 
 
 def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
@@ -151,11 +154,13 @@ def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_pa
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     told = graph.listen(Float64MultiArray, 'replay/position')
+    graph.listen(DiagnosticArray, '/diagnostics')
     begin = '--start', str(start * length)
     tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
     graph.wait(lambda: told, 'where it is')
     where, whole = read_array(told[-1], 1, 2)  # as the page's timeline does
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
+    graph.wait(lambda: graph.report('replay').message == 'paused', 'its diagnostics')
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
     graph.wait(lambda: told[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
