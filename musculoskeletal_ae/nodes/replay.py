@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -39,6 +40,8 @@ SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 # A publisher sees its subscriber a little before the subscriber sees it and takes messages.
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
+TRAJECTORY = 'joint_trajectory'
+ANSWER_TIME, NO_RATE = 2.5 * PERIOD, '0.0 Hz'  # [s] for two reports; how those say that none came
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
 # Recorded time between two messages on /clock, but not more often than nodes can bear.
 CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
@@ -184,7 +187,7 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
 
 
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish what a hand showed as one trajectory."""
+    """Publish what a hand showed as one trajectory, and say whether the controller took it."""
     names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
     if len(names) > 1:  # all arms' names are kept
         problem = f'has the motion of several arms: {", ".join(names)}'
@@ -198,13 +201,31 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
         message.points.append(point)
     start_ros(arguments)
     node = Node('replay')
-    topic = name.removesuffix(SHOWN) + 'joint_trajectory'
+    topic, spinner = name.removesuffix(SHOWN) + TRAJECTORY, Spinner(node)
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
-    _await_subscribers(Spinner(node), [publisher], options.wait)
+    listeners, reports = set[str](), list[dict[str, str]]()
+
+    def hear(message: DiagnosticArray) -> None:
+        said = (status for status in message.status if status.name in listeners)
+        reports.extend({value.key: value.value for value in status.values} for status in said)
+
+    node.create_subscription(DiagnosticArray, '/diagnostics', hear, RELIABLE)
+    _await_subscribers(spinner, [publisher], options.wait)
+    for each in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)):
+        listeners.add(f'{each.node_namespace.rstrip("/")}/{each.node_name}: state')
+    if not listeners:
+        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-    if not publisher.get_subscription_count():
-        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
+
+    def is_taken() -> bool:
+        return any(values.get(f'{TRAJECTORY} rate', NO_RATE) != NO_RATE for values in reports)
+
+    spinner.spin_until(is_taken, ANSWER_TIME)
+    # The first report may have been on its way; others than our controller may say nothing.
+    if len(reports) > 1 and not is_taken():
+        why = reports[-1].get('last rejected', 'it says nothing of it')
+        raise MusculoskeletalError(f'the controller did not take it: {why}')
     told = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
     print(f'{topic}: {told}, the first {LEAD:g} s of it to where it begins')
     return 0

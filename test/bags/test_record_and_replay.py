@@ -21,6 +21,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 from musculoskeletal_ae.nodes import record as record_tool
 from musculoskeletal_ae.nodes import replay as replay_tool
+from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.validity import read_array
 
 from .arm_bag import JOINTS, joints
@@ -273,6 +274,26 @@ def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
     short = tool('replay', tmp_path / 'bag', '--as-trajectory', '--duration', '0.2', *ros(graph))
     assert 'holds no motion' in short.output()
     assert short.process.returncode == 1
+
+
+@pytest.mark.parametrize('takes', [True, False])
+def test_what_the_controller_makes_of_a_shown_motion_is_told(tool, graph, tmp_path, takes):
+    controller = graph.host(Controller, robot='arm26')
+    names = controller.robot.joints
+    if takes:
+        controller.core.trajectory = lambda *_: None
+    content = []
+    for n in range(300):
+        now = samples.START + n * 10_000_000
+        data = joints(names, [0.1 * np.sin(0.01 * n), -1.0])
+        content.append(samples.Sample('/estimated_joint_states', JOINTS, now, now, data))
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    replay = tool('replay', tmp_path / 'bag', '--as-trajectory', '--wait', '20', *ros(graph))
+    graph.wait(lambda: replay.process.poll() is not None, 'its end')
+    output = replay.output()
+    assert replay.process.returncode == (0 if takes else 1), output
+    why = 'the controller did not take it: joint_trajectory: no posture yet'
+    assert ('joint_trajectory: 31 points' if takes else why) in output
 
 
 def test_of_two_arms_that_were_shown_a_motion_one_is_asked_for(tmp_path):
