@@ -60,7 +60,7 @@ def camera(robot: Robot, stream: Recording, seed: int) -> See:
             return None
         pose = seen_by_camera(robot.kinematics.end_effector_pose(true), rng)
         estimate = learner.mae.estimate(stream.tension[n], stream.length[n]).theta
-        return inverse_kinematics(robot, pose, estimate).theta
+        return inverse_kinematics(robot, pose, estimate).seen
 
     return see
 

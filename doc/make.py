@@ -63,9 +63,9 @@ def _class(node: ast.ClassDef) -> list[str]:
     fields = [ast.unparse(m.target) for m in node.body if isinstance(m, ast.AnnAssign)]
     for member in methods:
         plain = any(ast.unparse(mark) == 'property' for mark in member.decorator_list)
-        if not member.name.startswith('_'):
-            fields.append(member.name + '()' * (not plain))
-    return [*lines[:1], ' '.join(f'`{name}`' for name in fields), ''] if fields else lines
+        fields.append(member.name + '()' * (not plain))
+    public = ' '.join(f'`{name}`' for name in fields if not name.startswith('_'))
+    return [*lines[:1], public, ''] if public else lines
 
 
 def api() -> str:

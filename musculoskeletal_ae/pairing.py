@@ -2,11 +2,14 @@
 """Which θ belongs to which (T, l): the nearest in time, within half a period.
 
 A θ between two messages of the muscle modules belongs to the nearer one, the earlier one if it lies
-in the middle, so none is used twice. The rule is the same on a live arm and on a recording.
+in the middle, so none is used twice. That holds joint by joint: several nodes may publish some of
+them each, at times of their own. The rule is the same on a live arm and on a recording.
 """
 
 import math
 from typing import NamedTuple
+
+import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
@@ -18,7 +21,7 @@ class Paired(NamedTuple):
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
     dt: float  # time since the message before [s], 0 for the first
-    theta: Array | None  # θ [rad], (D,)
+    theta: Array | None  # θ [rad], (D,); NaN of joints of which none is
 
 
 class Pairing:
@@ -31,17 +34,21 @@ class Pairing:
 
     def reset(self) -> None:
         """Forget, as after a backward jump of the clock."""
-        # The last θ before the muscle message that waits, the first one after it, the latest one.
-        self._angles: list[tuple[float, Array]] = []
+        # Of each joint the last θ before the muscle message that waits, the first one after it, and
+        # the latest one: when it came [s], and what it is, (2, D); NaN: none.
+        self._last = self._next = self._latest = np.full((2, 1), np.nan)
+        self._came = -math.inf
         self._pending: tuple[float, Array, Array] | None = None
         self._before: float | None = None
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take a θ [rad] (D,) that came at `time` [s]."""
-        if self._angles and time < self._angles[-1][0]:
+        """Take a θ [rad] (D,) that came at `time` [s]; NaN of joints that it says nothing of."""
+        if time < self._came:
             self.reset()
-        del self._angles[2:]
-        self._angles.append((time, theta))
+        self._came = time
+        new = np.where(np.isnan(theta), np.nan, [np.full(len(theta), time), theta])
+        self._latest = np.where(np.isnan(new), self._latest, new)
+        self._next = np.where(np.isnan(self._next), new, self._next)
 
     def muscles(self, time: float, tension: Array, length: Array) -> Paired | None:
         """Take T [N] and l [m] that came at `time` [s]; return the message before, paired.
@@ -58,16 +65,18 @@ class Pairing:
             dt = 0.0 if self._before is None else came - self._before
             paired = Paired(*pending, dt, self._nearest(came, time))
             self._before = came
-        del self._angles[:-1]
+        self._last, self._next = self._latest, np.full((2, 1), np.nan)
         return paired
 
     def _nearest(self, came: float, following: float) -> Array | None:
         """Return the θ nearest to the message that waits, unless it is nearer to a neighbour."""
         before = -math.inf if self._before is None else self._before
-        mine = [
-            (distance, theta)
-            for time, theta in self._angles
-            if (distance := abs(time - came)) <= min(self._half, abs(time - following))
-            and distance < abs(time - before)
-        ]
-        return min(mine, key=lambda entry: entry[0])[1] if mine else None
+        time, theta = np.stack(np.broadcast_arrays(self._last, self._next), axis=1)
+        distance = np.abs(time - came)
+        mine = distance <= np.minimum(self._half, np.abs(time - following))
+        mine &= distance < np.abs(time - before)
+        if not mine.any():
+            return None
+        last, first = np.where(mine, distance, math.inf)
+        nearest: Array = np.where(first < last, theta[1], theta[0])
+        return np.where(mine.any(axis=0), nearest, np.nan)

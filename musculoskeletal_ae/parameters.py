@@ -52,7 +52,8 @@ class Parameter:
     @property
     def is_number_list(self) -> bool:
         """Whether it is a list of numbers."""
-        return isinstance(self.default, tuple) and not isinstance(self.default[0], str)
+        values = self.default if isinstance(self.default, tuple) else ('',)
+        return not any(isinstance(value, str) for value in values)
 
     def field(self) -> Any:
         """Return the dataclass field that this parameter sets."""

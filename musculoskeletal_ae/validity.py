@@ -148,6 +148,8 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
         told = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
         raise MessageError('wrong frame', told)
     acceleration = np.array([read.x, read.y, read.z])
+    if not np.isfinite(acceleration).all():
+        raise MessageError('not finite', 'an acceleration')
     norm = float(np.linalg.norm(acceleration))
     if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
         raise MessageError('no gravity', f'{norm:.3g} m/s², an arm at rest has 9.81')

@@ -69,8 +69,21 @@ def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, mus
     assert paired_live(joints, muscles, period) == paired_by_definition(joints, muscles, period)
 
 
-def test_what_is_kept_does_not_grow_while_one_stream_is_silent():
-    pairing = Pairing(0.01)
-    for n in range(1000):
-        pairing.joints(n * 0.001, np.zeros(1))
-        assert len(pairing._angles) <= 3
+@given(st.lists(st.tuples(times, st.integers(1, 7)), max_size=3), times, st.integers(2, 40))
+def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
+    """Several nodes publish some of three joints each."""
+    sent = {}  # when and what, no two at once
+    for moments, joints in publishers:
+        for time in moments:
+            sent.setdefault(time, np.array([joints >> j & 1 for j in range(3)], dtype=bool))
+    pairing, found = Pairing(period), []
+    for time, kind in sorted([(time, 0) for time in sent] + [(m, 1) for m in [*muscles, math.inf]]):
+        if kind == 0:
+            pairing.joints(time, np.where(sent[time], float(time), np.nan))
+        elif paired := pairing.muscles(time, np.ones(1), np.ones(1)):
+            found.append(np.full(3, np.nan) if paired.theta is None else paired.theta)
+    for j in range(3):
+        own = sorted(time for time, which in sent.items() if which[j])
+        alone = paired_by_definition(own, muscles, period)
+        alone = [np.nan if n is None else own[n] for n in alone]
+        np.testing.assert_array_equal([theta[j] for theta in found], alone)

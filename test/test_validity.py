@@ -8,7 +8,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -16,6 +16,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.validity import (
     read_array,
+    read_imu,
     read_joints,
     read_names,
     read_pose,
@@ -271,3 +272,16 @@ def test_a_twist_is_in_the_root_link_finite_and_not_absurd():
         message.twist.angular.z = value
         with pytest.raises(MessageError, match=reason):
             read_twist(message, 'base')
+
+
+@pytest.mark.parametrize(
+    ('acceleration', 'reason'),
+    [(math.nan, 'not finite'), (math.inf, 'not finite'), (0.1, 'no gravity'), (40.0, 'no gravity')],
+)
+def test_an_acceleration_that_is_no_gravity_is_refused_with_the_reason(acceleration, reason):
+    message = Imu()
+    message.header.frame_id = 'hand'
+    message.linear_acceleration.z = acceleration
+    with pytest.raises(MessageError) as refused:
+        read_imu(message, ['hand'])
+    assert refused.value.reason == reason

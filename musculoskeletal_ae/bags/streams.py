@@ -57,19 +57,20 @@ class Streams(NamedTuple):
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
         # A muscle message at the end of time gives out the last one.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
-        rows = []  # of θ and (T, l), which stand for them here
+        theta, muscle = [], []  # θ, and the row of (T, l), which stands for them here
         for came, kind, number in heapq.merge(joints, muscles):
             row = np.array(number)
             if kind == 0:
-                pairing.joints(came, row)
+                pairing.joints(came, self.joints.values[number])
             elif (paired := pairing.muscles(came, row, row)) and paired.theta is not None:
-                rows.append((paired.theta, paired.length))
-        theta, muscle = np.array(rows, dtype=int).reshape(-1, 2).T
+                theta.append(paired.theta)
+                muscle.append(int(paired.length))
         values, time = self.muscles.values[muscle], time[muscle]
         isolated = np.full(values[:, 0].shape, -1)
         if len(self.isolated.time):
             isolated[:] = self.isolated.values[_latched(self.isolated.time, time)]
-        return Pairs(time, self.joints.values[theta], values[:, 0], values[:, 1], isolated)
+        postures = np.array(theta).reshape(-1, self.joints.values.shape[1])
+        return Pairs(time, postures, values[:, 0], values[:, 1], isolated)
 
 
 @dataclass

@@ -99,8 +99,8 @@ class Controller:
 
         A MusculoskeletalError says that the joint stiffness does not fit the robot.
         """
-        before, joints = self.settings, self.robot.joint_count
-        stiffness = settings.desired_stiffness(joints)
+        before, radian = self.settings, self.robot.kinematics.radian
+        stiffness = settings.desired_stiffness(radian)
         self.settings = settings
         self.posture.settings = self.torque.settings = self.safety.settings = settings
         self.motion.settings = self.floating.settings = self.watch.settings = settings
@@ -110,7 +110,7 @@ class Controller:
         self._exploration.to_limits = PRESETS[settings.preset].to_limits
         if another and not self.posture.exploring:
             self._starts, self.follows = True, False
-        elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(joints):
+        elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(radian):
             (self.motion.plan_anew if self.follows else self.posture.start)()
 
     def use(self, mae: Mae) -> None:

@@ -52,7 +52,7 @@ class Hand:
         A MessageError says why there is none, unless the `nearest` is wished.
         """
         robot = self._robot
-        theta, distance, angle = inverse_kinematics(
+        theta, distance, angle, _ = inverse_kinematics(
             robot, pose, start, WHOLE if whole else POSITION
         )
         short = ''

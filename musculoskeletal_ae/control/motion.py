@@ -268,7 +268,7 @@ class MotionControl:
         if solution is None or self._solved >= AHEAD:
             at, self._solved = trajectory.sample(self.time + AHEAD), 0.0
             torque = robot.kinematics.inverse_dynamics(*at) + self.effort
-            desired = np.array(self.settings.desired_stiffness(robot.joint_count))
+            desired = np.array(self.settings.desired_stiffness(robot.kinematics.radian))
             near = None if solution is None else self._near
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near

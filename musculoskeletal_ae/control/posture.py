@@ -282,7 +282,7 @@ class PostureControl:
             return Solution(methods.first_command(robot, mae, theta, tension), tension, nothing)
         torque = robot.kinematics.holding_torque(theta) + self.effort
         if self._method == 'stiffness':
-            desired = np.array(self.settings.desired_stiffness(robot.joint_count))
+            desired = np.array(self.settings.desired_stiffness(robot.kinematics.radian))
             return stiffness_command(robot, mae, theta, torque, desired, self._limit)
         if PRESETS[self.settings.preset].equilibrium:
             return methods.proposed(robot, mae, theta, torque, tension, self._limit)

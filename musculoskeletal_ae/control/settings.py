@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user may choose about control: one table for the core and the node's parameters."""
 
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.parameters import PRESET, settable
+from musculoskeletal_ae.parameters import PRESET, UNBOUNDED, settable
 
 UNREACHABLE = ('refuse', 'nearest')
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 BY_TENSION = ('tension', 'float')  # which command tensions, the others lengths
+MOST_STIFFNESS = 1000.0  # [N·m/rad] that may be desired of a joint
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,11 @@ class Settings:
     preset: str = replace(PRESET, settable=True).field()
     joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
-        'desired diagonal of the joint stiffness, one for each joint (0 or []: as it comes)',
+        f'desired diagonal of the joint stiffness, one for each joint, at most {MOST_STIFFNESS:g}, '
+        'over 0.06² where it slides (0 or []: as it comes)',
         'N·m/rad or N/m',
         0.0,
-        1000.0,
+        float(UNBOUNDED),
     )
     first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = settable(
@@ -85,13 +87,16 @@ class Settings:
         20.0, 'a tension above tension.limit for this long stops the arm', 's', 0.1, 3600.0
     )
 
-    def desired_stiffness(self, joints: int) -> tuple[float, ...]:
-        """Return `joint_stiffness` for so many joints; nothing, or one 0, is all as they come."""
-        values = self.joint_stiffness
+    def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
+        """Return `joint_stiffness`, one for each joint; nothing, or one 0, is all as they come.
+
+        `radian` is what counts as one of each joint, as in `Kinematics` [rad or m].
+        """
+        values, most = self.joint_stiffness, [MOST_STIFFNESS / each**2 for each in radian]
         if values in ((), (0.0,)):
-            return (0.0,) * joints
-        if len(values) != joints or not all(0.0 <= value < math.inf for value in values):
-            raise MusculoskeletalError(
-                f'{list(values)}; legal: {joints} numbers of at least 0 [N·m/rad or N/m], or []'
-            )
+            return (0.0,) * len(most)
+        if len(values) != len(most) or not all(0.0 <= v <= high for v, high in zip(values, most)):
+            ends = ', '.join(f'{high:g}' for high in most)
+            legal = f'{len(most)} numbers of at least 0, at most {ends}'
+            raise MusculoskeletalError(f'{list(values)}; legal: {legal} [N·m/rad or N/m], or []')
         return values

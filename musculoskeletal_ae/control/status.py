@@ -24,7 +24,7 @@ def report(core: Controller, now: float) -> Report:
         warnings.append('target clamped to the joint limits')
     if chosen.method == 'stiffness' and solution is not None and solution.stiffness is not None:
         expected, *reachable = solution.stiffness
-        desired = chosen.desired_stiffness(robot.joint_count)
+        desired = chosen.desired_stiffness(robot.kinematics.radian)
         for row in zip(robot.joints, robot.units, desired, expected.diagonal(), *reachable):
             name, unit, wanted, planned, low, high = row
             text = f'{planned:.2f} {unit.stiffness}, reachable {low:.2f} to {high:.2f}'

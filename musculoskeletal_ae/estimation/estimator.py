@@ -321,13 +321,16 @@ class Estimator:
         return guess
 
     def see(self, pose: pin.SE3) -> Array:
-        """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame."""
+        """Return θ [rad] (D,) that brings the end effector to a pose in the root link's frame.
+
+        NaN of joints that do not move it.
+        """
         posture = inverse_kinematics(self._robot, pose, self._theta)
         if posture.distance > MARKER_DISTANCE or posture.angle > MARKER_ANGLE:
             raise MessageError(
                 'out of reach', f'{posture.distance:.3f} m and {posture.angle:.2f} rad are left'
             )
-        return posture.theta
+        return posture.seen
 
     def reset(self) -> None:
         """Clear the anomaly."""

@@ -185,7 +185,7 @@ def circles(
 
         at, far = theta, False
         for time in np.linspace(0.0, LAP, 25):
-            at, distance, _ = inverse_kinematics(robot, place(time), at, POSITION)
+            at, distance, *_ = inverse_kinematics(robot, place(time), at, POSITION)
             far = far or distance > NEAR or bool(lacking(robot, mae, at))
         if not far:
             found.append((theta, place))

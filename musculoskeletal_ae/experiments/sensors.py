@@ -46,7 +46,7 @@ def measure(study: Study, seed: int) -> Measured:
             return None
         pose = seen_by_camera(robot.kinematics.end_effector_pose(theta), rng)
         guess = learner.mae.estimate(tension[n], length[n]).theta
-        return inverse_kinematics(robot, pose, guess).theta
+        return inverse_kinematics(robot, pose, guess).seen
 
     def tilt(learner: Learner, n: int, theta: Array, _: Array) -> None:
         if n % CAMERA == 0:

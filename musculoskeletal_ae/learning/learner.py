@@ -42,7 +42,6 @@ LEAST_INTERVAL = 1.0
 #: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 SPREAD = 0.02  # of θ as a camera sees it [rad]; where it slides, times RACK [m]
-TILT_AGE = 0.5  # [s] that what an IMU says holds
 LEAST_BLIND = 20  # samples to begin with where no θ is known
 
 
@@ -83,9 +82,8 @@ class Learner:
         spread = SPREAD * radian if joint_source == MARKER else NOTHING
         blind = joint_source != SENSOR
         self._rests = RestCollector(robot, settings, self._healthy, blind, spread)
-        # What IMUs said of gravity, see `Sample`, and when each was heard last [s]
-        self._gravity = np.full((len(robot.kinematics.parent), 3), np.nan)
-        self._tilted: Array = np.full(len(self._gravity), -math.inf)
+        # Nothing of θ, and nothing of gravity (see `Sample`): one array, which is paired as θ is
+        self._unseen = np.full(robot.joint_count + 3 * len(robot.kinematics.parent), np.nan)
         self._torque = HealthyTorque(robot)
         self.rejected = self._rests.rejected  # what was not learned from, by reason
         least = self.training.preset.least_samples
@@ -128,33 +126,36 @@ class Learner:
 
     def joints(self, time: float, theta: Array) -> None:
         """Take a θ [rad] (D,) that came at `time` [s]."""
-        self._pairing.joints(time, theta)
+        self._see(time, 0, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
         """Take what an accelerometer in a link's axes read at `time` [m/s²] (3,).
 
-        At rest that is what holds it against gravity, so that it tells where down is.
+        At rest that is what holds it against gravity, so that it tells where down is; of readings
+        in motion nothing is learned.
         """
         joint, placement = self.robot.kinematics.placement(link)
         down = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
-        self._gravity[joint], self._tilted[joint] = down, time
+        self._see(time, self.robot.joint_count + 3 * joint, down)
+
+    def _see(self, time: float, first: int, values: Array) -> None:
+        seen = self._unseen.copy()
+        seen[first : first + len(values)] = values
+        self._pairing.joints(time, seen)
 
     def muscles(self, time: float, tension: Array, length: Array) -> None:
         """Take T [N] and l [m] (M,) that came at `time` [s]."""
         paired = self._pairing.muscles(time, tension, length)
         if paired is None or not (self.enabled and self._zeroed):
             return
-        _, tension, length, dt, theta = paired
-        age = time - self._tilted
-        heard = (age >= 0.0) & (age < TILT_AGE)
-        self._rests.gravity = (
-            np.where(heard[:, None], self._gravity, np.nan).ravel() if heard.any() else NOTHING
-        )
+        _, tension, length, dt, seen = paired
+        known = self._unseen if seen is None else seen
+        theta, gravity = np.split(known, [self.robot.joint_count])
         if self.isolated:
             tension, length = tension * self._used, length * self._used
         self._gate_time += dt
         before = self._healthy.time
-        rests = self._rests.step(tension, length, dt, theta)
+        rests = self._rests.step(tension, length, dt, theta, gravity)
         if self._rests.plausible:
             self.gate.message(tension, length, self._gate_time)
             if self._mae is not None and not self._rests.anomaly:

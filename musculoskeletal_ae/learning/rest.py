@@ -4,7 +4,9 @@
 The arm rests while the means of the two halves of a short window differ by no more than the given
 rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
 sensor's). The rest is averaged until it ends, or for `LONGEST` at a time. An arm without joint
-sensors (`blind`) rests while its muscles do, and θ is averaged where there is any.
+sensors (`blind`) rests while its muscles do, and θ is averaged where there is any. A motion begins
+and ends too slowly to be told from rest, but not to bend what an accelerometer reads of gravity:
+that counts where the whole windows before and after it were still.
 
 What comes within `MARGIN` before an anomaly is noticed was already wrong; rests and healthy
 messages therefore wait that long before they count.
@@ -49,6 +51,8 @@ class RestDetector:
         self._window.clear()
         self._read_at, self._periods = 0.0, (0.0, 0.0)  # of messages that count, the last two [s]
         self._rest: list[Sample] = []
+        self._gravity: list[Array] = []  # what counts of it in the rest
+        self._since = 0.0  # when the arm was found still [s]
         self._span = self._time = 0.0
         self._still = False
 
@@ -74,11 +78,18 @@ class RestDetector:
         if self._still:
             new = [reading] if was_still else [reading for _, reading in self._window]
             self._rest += new if self.blind else filter(_measured, new)
+            self._since = self._since if was_still else self._time
+            time, earlier = self._window[0]
+            self._gravity += [earlier.gravity] * (time >= self._since)
             self._span = self._span + dt if was_still else self._needed
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
         rest, self._rest, self._span = self._rest, [], 0.0
-        return Sample(*(_mean(np.array(column)) for column in zip(*rest))) if rest else None
+        gravity, self._gravity = self._gravity, []
+        if not rest:
+            return None
+        mean = Sample(*(_mean(np.array(column)) for column in zip(*rest)))
+        return mean._replace(gravity=_mean(np.array(gravity)) if gravity else NOTHING)
 
     def _append(self, reading: Sample) -> None:
         held = min(len(self._window), MOST - 1)  # of which one goes when the window is full
@@ -179,8 +190,6 @@ class RestCollector:
         A `blind` one rests without joint angles, too; those that there are spread by `spread`.
         """
         self._robot, self._healthy, self._spread = robot, healthy, spread
-        self._no_gravity = np.full(3 * len(robot.kinematics.parent), np.nan)
-        self.gravity: Array = NOTHING  # what an IMU says now, see `Sample`
         self.anomaly = False  # closes the gate
         # Messages that no sensor measures, and rests that are not learned from, by reason.
         self.rejected: Counter[str] = Counter()
@@ -194,11 +203,16 @@ class RestCollector:
         self._closed_until = 0.0
 
     def step(
-        self, tension: Array, length: Array, dt: float, theta: Array | None = None
+        self,
+        tension: Array,
+        length: Array,
+        dt: float,
+        theta: Array | None = None,
+        gravity: Array = NOTHING,
     ) -> list[Sample]:
         """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
 
-        Returns the rests that count from now on.
+        And what IMUs read of gravity, see `Sample`. Returns the rests that count from now on.
         """
         dt += self._skipped
         if dt > self._hole:
@@ -218,7 +232,6 @@ class RestCollector:
         direction = self._direction.step(length)
         nothing = np.full(self._robot.joint_count, np.nan)
         theta = nothing if theta is None else theta
-        gravity = self.gravity if self.gravity.size else self._no_gravity
         reading = Sample(theta, tension, length, direction, self._spread, gravity)
         rest = self._detector.step(reading, dt)
         if rest is not None and np.isnan(rest.gravity).all():

@@ -77,9 +77,10 @@ def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
 
     The operator begins 0.4 µs later than the method, which takes as long for a row as a layer.
     """
-    if x.ndim > 2 or type(weight) is BlockDiagonal:
+    if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
-    return x.dot(weight)
+    result: Singles = x.dot(weight)
+    return result
 
 
 class Activation(NamedTuple):
@@ -161,12 +162,13 @@ class Stack:
         """Return the output and the function that maps a gradient by it to one by the input."""
         x, slopes = given.astype(np.float32), list[Singles | float]()
         for i, (weight, bias) in enumerate(self.layers[:-1]):
-            x, slope = product(x, weight), 1.0
+            x = product(x, weight)
             if i == self.latent:
                 x += bias
+                slopes.append(1.0)
             else:
                 x, slope = self.activation.with_slope(x, bias)
-            slopes.append(slope)
+                slopes.append(slope)
         last, last_bias = self.layers[-1]
 
         def pullback(by_output: Array) -> Array:

@@ -32,6 +32,7 @@ from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.plausibility import SETTLED
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import (
     read_joints,
@@ -99,7 +100,7 @@ class Controller(Shell):
     def _check_stiffness(self, value: Any) -> Any:
         # Before any other that is set with it: what those end would not come back.
         checked = replace(self.core.settings, joint_stiffness=value)
-        checked.desired_stiffness(self.robot.joint_count)
+        checked.desired_stiffness(self.robot.kinematics.radian)
         return value
 
     def _check_method(self, value: Any) -> Any:
@@ -198,7 +199,8 @@ class Controller(Shell):
 
     def _reset(self, _: Trigger.Request) -> str:
         if reason := self.core.reset(time.monotonic()):
-            raise MusculoskeletalError(f'refused: {reason}')
+            again = f'call again once that is over, {SETTLED:g} s after it is mended'
+            raise MusculoskeletalError(f'refused: {reason}; {again}')
         return 'going on to the last target, if any; controller/explore explores again'
 
     def _watch(self) -> None:

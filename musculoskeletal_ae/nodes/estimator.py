@@ -118,7 +118,8 @@ class Estimator(Shell):
         detector.settings = replace(detector.settings, **{name: value})
 
     def _take_posture(self, posture: tuple[float, ...]) -> None:
-        posture = () if posture == (0.0,) else posture
+        if posture == (0.0,) and self.robot.joint_count > 1:
+            posture = ()  # what was the default once stands in files
         self.core.check_posture(posture)
         self.posture = posture
 
@@ -161,6 +162,7 @@ class Estimator(Shell):
         detected, before = bool(self.core.cause), self.latched
         if detected != before:
             self.latched, self.chosen = detected, True
+            self._report()  # what is known of the suspect comes with the news, not a second later
             told = f'anomaly detected: {self.core.cause}' if detected else self.core.verified
             self.get_logger().warning(told)
             self.detected.publish(Bool(data=detected))
@@ -227,7 +229,9 @@ class Estimator(Shell):
 
     def _see(self, message: PoseStamped) -> None:
         theta = self.core.see(read_pose(message, self.root_frame))
-        self.seen.publish(joint_message(self.robot.joints, theta, message.header.stamp))
+        known = np.isfinite(theta)
+        joints = [joint for joint, is_known in zip(self.robot.joints, known) if is_known]
+        self.seen.publish(joint_message(joints, theta[known], message.header.stamp))
 
     def clock_jumped_back(self) -> None:
         """Forget what came before, also how long each muscle was; latches stay."""

@@ -50,9 +50,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     'estimator': {
         **NETWORK,
         'zero_posture': Parameter(
-            (0.0,),
-            'where the arm stands when estimator/zero is called, one angle for each joint (0 or '
-            '[]: unknown, zeros are found while it moves gently)',
+            (),
+            'where the arm stands when estimator/zero is called, one angle for each joint ([]: '
+            'unknown, zeros are found while it moves gently)',
             'rad or m',
             (-100.0, 100.0),
             settable=True,

@@ -15,6 +15,8 @@ from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_
 from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
+BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
+
 
 def _line(strip: Marker) -> Line:
     """Return a line strip of a marker array."""
@@ -25,25 +27,38 @@ def _line(strip: Marker) -> Line:
 def _render(options: Namespace, arguments: list[str]) -> int:
     start_ros(arguments)
     node = Node('render')
-    received: list[MarkerArray] = []
-    node.create_subscription(MarkerArray, options.topic, received.append, SENSOR)
-    Spinner(node).spin_until(lambda: received, options.timeout)
-    kind = Marker.LINE_STRIP, Marker.ADD
-    markers = received[0].markers if received else []
-    lines = [_line(m) for m in markers if (m.type, m.action) == kind and m.points]
-    if not lines:
-        told = f'no markers on {options.topic} within {options.timeout:g} s; is the node running'
-        raise MusculoskeletalError(f'{told}, and in this namespace (--ros-args -r __ns:=/NAME)?')
-    save_picture(lines, options.out)
-    print(options.out)
+    topics = [options.topic] if options.topic else [BODY, ESTIMATE]
+    drawn: dict[str, list[Line]] = {}
+    for topic in topics:
+        take = partial(_take, drawn, topic)
+        node.create_subscription(MarkerArray, topic, take, SENSOR)
+    first = node.resolve_topic_name(topics[0])
+    Spinner(node).spin_until(
+        lambda: topics[0] in drawn or (drawn and not node.count_publishers(first)), options.timeout
+    )
+    if not drawn:
+        told = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
+        told += '; is the node running, and in this namespace (--ros-args -r __ns:=/NAME)?'
+        raise MusculoskeletalError(told)
+    topic = topics[0] if topics[0] in drawn else topics[-1]
+    save_picture(drawn[topic], options.out)
+    print(f'{options.out}: {topic}')
     return 0
+
+
+def _take(drawn: dict[str, list[Line]], topic: str, message: MarkerArray) -> None:
+    kind = Marker.LINE_STRIP, Marker.ADD
+    lines = [_line(m) for m in message.markers if (m.type, m.action) == kind and m.points]
+    if lines:  # an estimator that waits has none
+        drawn[topic] = lines
 
 
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     add = parser.add_argument
-    add('--topic', default='hardware_emulator/markers', help='MarkerArray to draw')
+    told = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} where nobody publishes them)'
+    add('--topic', help=told)
     add('--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]')
     return parser.parse_args(arguments)
 

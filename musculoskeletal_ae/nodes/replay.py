@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -25,9 +26,12 @@ from musculoskeletal_ae.bags.playback import LEAD, SHOWN, Timeline, lap, shown, 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
+from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.report import Report
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -36,6 +40,8 @@ SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 # A publisher sees its subscriber a little before the subscriber sees it and takes messages.
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
+TRAJECTORY = 'joint_trajectory'
+ANSWER_TIME, NO_RATE = 2.5 * PERIOD, '0.0 Hz'  # [s] for two reports; how those say that none came
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
 # Recorded time between two messages on /clock, but not more often than nodes can bear.
 CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
@@ -69,6 +75,8 @@ class Replay(Node):
         self.declare_parameter('position', self._before, told)
         self.add_post_set_parameters_callback(self._seek)
         self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
+        reception = Reception(self.get_logger().warning)  # of nothing: it only sends
+        self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
         if options.paused:
@@ -124,7 +132,10 @@ class Replay(Node):
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.look(wait)
                 if now > self._next_report:
-                    self._next_report = now + 1.0
+                    self._next_report = now + PERIOD
+                    doing = 'paused' if self._timeline.paused else 'playing'
+                    report = Report('ok', doing, {'position': self._position()})
+                    self._diagnostics.tell(report)
                     seconds = self._before + np.array([self._done(), self.length])
                     self._told.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
@@ -176,7 +187,7 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
 
 
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish what a hand showed as one trajectory."""
+    """Publish what a hand showed as one trajectory, and say whether the controller took it."""
     names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
     if len(names) > 1:  # all arms' names are kept
         problem = f'has the motion of several arms: {", ".join(names)}'
@@ -190,13 +201,31 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
         message.points.append(point)
     start_ros(arguments)
     node = Node('replay')
-    topic = name.removesuffix(SHOWN) + 'joint_trajectory'
+    topic, spinner = name.removesuffix(SHOWN) + TRAJECTORY, Spinner(node)
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
-    _await_subscribers(Spinner(node), [publisher], options.wait)
+    listeners, reports = set[str](), list[dict[str, str]]()
+
+    def hear(message: DiagnosticArray) -> None:
+        said = (status for status in message.status if status.name in listeners)
+        reports.extend({value.key: value.value for value in status.values} for status in said)
+
+    node.create_subscription(DiagnosticArray, '/diagnostics', hear, RELIABLE)
+    _await_subscribers(spinner, [publisher], options.wait)
+    for each in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)):
+        listeners.add(f'{each.node_namespace.rstrip("/")}/{each.node_name}: state')
+    if not listeners:
+        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-    if not publisher.get_subscription_count():
-        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
+
+    def is_taken() -> bool:
+        return any(values.get(f'{TRAJECTORY} rate', NO_RATE) != NO_RATE for values in reports)
+
+    spinner.spin_until(is_taken, ANSWER_TIME)
+    # The first report may have been on its way; others than our controller may say nothing.
+    if len(reports) > 1 and not is_taken():
+        why = reports[-1].get('last rejected', 'it says nothing of it')
+        raise MusculoskeletalError(f'the controller did not take it: {why}')
     told = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
     print(f'{topic}: {told}, the first {LEAD:g} s of it to where it begins')
     return 0

@@ -14,7 +14,6 @@ from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -42,6 +41,7 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
 from musculoskeletal_ae.nodes.running import give_way
@@ -94,9 +94,9 @@ class Shell(Node):
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
         self.add_post_set_parameters_callback(self._keep_old_names)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_timer(1.0, self._report, clock=STEADY)
-        self._reported_at = time.monotonic()
+        hardware = self.robot.description.directory.name
+        self._diagnostics = Diagnostics(self, self._reception, hardware)
+        self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
         self.needed: list[str] = []  # topics without which the node has nothing to do
         backward = JumpThreshold(
@@ -446,26 +446,8 @@ class Shell(Node):
             report = Report('error', self._fault, {})
         if self._fault:
             report, self._fault = Report('error', self._fault, report.values), ''
-        now = time.monotonic()
-        elapsed, self._reported_at = now - self._reported_at, now
-        received = self._reception.take_received()
+        received = self._diagnostics.tell(report)
         self._tell_waiting([topic for topic in self.needed if topic not in received])
-        values = dict(report.values)
-        values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
-        values['rejected'] = str(sum(self.rejected.values()))
-        values |= {f'rejected {reason}': str(n) for reason, n in self.rejected.items()}
-        if self._reception.last_rejected:
-            values['last rejected'] = self._reception.last_rejected
-        status = DiagnosticStatus(
-            level=getattr(DiagnosticStatus, report.level.upper()),
-            name=f'{self.get_fully_qualified_name()}: state',
-            message=printable(report.message),
-            hardware_id=self.robot.description.directory.name,
-            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
 
 
 def _recorded(

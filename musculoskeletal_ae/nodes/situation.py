@@ -8,6 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 OLD = 1.0  # [s] after which something that moves is no longer shown
 TOLD = 'stopped', 'anomaly detected'  # errors that are told with what to do
+VERIFYING = '; verifying it'  # ends an anomaly while its suspect is: the arm may go on by itself
 
 
 def figures(measured: bool, error: float, anomaly: float) -> str:
@@ -22,7 +23,7 @@ class Situation:
 
     def __init__(self, namespace: str) -> None:
         self._here = namespace.rstrip('/')
-        self.detected = self.explored = False
+        self.detected = self.explored = self._verifying = False
         self._failing: dict[str, str] = {}  # what nodes report as any other error
         self.samples = self.checkpoints = self.suspect = self.doing = self.stopped = ''
         self.distance = self.limit = math.nan  # d of the detector, and what is an anomaly
@@ -41,6 +42,7 @@ class Situation:
                 self.checkpoints = values.get('checkpoints', '')
             elif node == f'{self._here}/estimator':
                 self.suspect = values.get('suspect muscle', '')
+                self._verifying = status.message.endswith(VERIFYING)
                 self.distance = self.limit = math.nan
                 with contextlib.suppress(ValueError):
                     self.distance = float(values.get('d', 'nan'))
@@ -54,10 +56,13 @@ class Situation:
     def trouble(self) -> str:
         """Return what keeps the arm from going on, and every step that is to be taken."""
         told, steps = [], []
-        if self.detected:
+        verifying = self.detected and self._verifying
+        if verifying:
+            told.append(f'ANOMALY: {self.suspect} is being verified')
+        elif self.detected:
             told.append(f'ANOMALY: {self.suspect}')
             steps += ['mend it', 'estimator/reset']
-        if self.stopped:
+        if self.stopped and not (verifying and 'anomaly_detected' in self.stopped):
             told.append(self.stopped.replace('stopped', 'STOPPED', 1))
             steps += ['controller/reset', *['controller/explore'] * self.explored]
         if steps:

@@ -30,11 +30,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.running import ROS_HELP, raise_interrupt, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.start import load
@@ -76,9 +78,11 @@ class View(Node):
             self.get_logger().warning(f'mesh left out: {printable(note)}')
         self.situation = Situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text))
+        hardware = robot.description.directory.name
+        self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
         self.came: dict[str, tuple[float, Any]] = {}  # when, and what
         self.taken: list[Any] = []  # subscriptions
-        self.told = self.looked = -math.inf  # [s] of the monotonic clock
+        self.told = self.looked = self.reported = -math.inf  # [s] of the monotonic clock
         self.ruptured: list[str] = []
         self.payload = 0.0
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
@@ -149,6 +153,9 @@ class View(Node):
         """Show what comes until the process is asked to end."""
         while rclpy.ok():
             looked_at = self.page.looked_at.wait(timeout=1.0)
+            if (now := time.monotonic()) >= self.reported + diagnostics.PERIOD:
+                self.reported = now
+                self.diagnostics.tell(Report('ok', 'shown' if looked_at else 'nobody looks', {}))
             while not self.asked.empty():  # also what the last visitor asked for
                 what, *value = self.asked.get()
                 try:

@@ -33,6 +33,7 @@ class Posture(NamedTuple):
     theta: Array  # θ [rad], (D,)
     distance: float  # [m]
     angle: float  # [rad]
+    seen: Array  # θ, NaN of joints that do not move the end effector: of them a pose says nothing
 
 
 def inverse_kinematics(
@@ -66,8 +67,9 @@ def inverse_kinematics(
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
-    left = error * spreads
-    return Posture(theta, float(np.linalg.norm(left[:3])), float(np.linalg.norm(left[3:])))
+    distance, angle = np.linalg.norm((error * spreads).reshape(2, 3), axis=1).tolist()
+    seen = np.where(kin.end_effector_jacobian(theta).any(axis=0), theta, np.nan)
+    return Posture(theta, distance, angle, seen)
 
 
 def _error(robot: Robot, pose: pin.SE3, theta: Array, spreads: Array) -> Array:

@@ -23,6 +23,7 @@ EXAMPLE_NOISE = 1e-4  # [m], what a caliper on a testbed resolves
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # of the elastic unit, as shares of the highest tension
 SLIGHTLY = 1e-3
 LEAST_ELONGATION = -0.002  # [m], by noise
+LONGEST = 10.0  # [m] of a muscle on a testbed: numbers above that are in another unit
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -99,12 +100,13 @@ def read_table(file: Path) -> Array:
             values = []
         if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
             raise _refusal(file, f'row {number}: expected 3 finite numbers, got {line[:80]!r}')
-        if values[0] < 0.0 or values[1] <= 0.0:
-            problem = f'row {number}: expected tension >= 0 and absolute_length > 0, got {line!r}'
-            raise _refusal(file, problem)
+        if values[0] < 0.0 or not 0.0 < values[1] <= LONGEST:
+            legal = f'tension >= 0 and absolute_length > 0, at most {LONGEST:g} m'
+            problem = f'row {number}: expected {legal}, got {line!r}'
+            raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
         if not LEAST_ELONGATION <= values[2] < values[1]:
             problem = f'row {number}: expected elongation from 0 to absolute_length, got {line!r}'
-            raise _refusal(file, f'{problem}; are both in m?')
+            raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
         rows.append(values)
     return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))
 

@@ -9,6 +9,7 @@ from array import array
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
@@ -20,6 +21,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
 from musculoskeletal_ae.nodes import record as record_tool
 from musculoskeletal_ae.nodes import replay as replay_tool
+from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.validity import read_array
 
 from .arm_bag import JOINTS, joints
@@ -38,7 +40,9 @@ def record(tool, graph, out, *options):
 
 
 def messages(path, namespace):
-    return [(m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages()]
+    """Return topic and data of all but what a replay said of itself."""
+    every = ((m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages())
+    return [(topic, data) for topic, data in every if b'/replay: state' not in data]
 
 
 def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
@@ -151,11 +155,13 @@ def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_pa
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     told = graph.listen(Float64MultiArray, 'replay/position')
+    graph.listen(DiagnosticArray, '/diagnostics')
     begin = '--start', str(start * length)
     tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
     graph.wait(lambda: told, 'where it is')
     where, whole = read_array(told[-1], 1, 2)  # as the page's timeline does
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
+    graph.wait(lambda: graph.report('replay').message == 'paused', 'its diagnostics')
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
     graph.wait(lambda: told[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
@@ -268,6 +274,26 @@ def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
     short = tool('replay', tmp_path / 'bag', '--as-trajectory', '--duration', '0.2', *ros(graph))
     assert 'holds no motion' in short.output()
     assert short.process.returncode == 1
+
+
+@pytest.mark.parametrize('takes', [True, False])
+def test_what_the_controller_makes_of_a_shown_motion_is_told(tool, graph, tmp_path, takes):
+    controller = graph.host(Controller, robot='arm26')
+    names = controller.robot.joints
+    if takes:
+        controller.core.trajectory = lambda *_: None
+    content = []
+    for n in range(300):
+        now = samples.START + n * 10_000_000
+        data = joints(names, [0.1 * np.sin(0.01 * n), -1.0])
+        content.append(samples.Sample('/estimated_joint_states', JOINTS, now, now, data))
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    replay = tool('replay', tmp_path / 'bag', '--as-trajectory', '--wait', '20', *ros(graph))
+    graph.wait(lambda: replay.process.poll() is not None, 'its end')
+    output = replay.output()
+    assert replay.process.returncode == (0 if takes else 1), output
+    why = 'the controller did not take it: joint_trajectory: no posture yet'
+    assert ('joint_trajectory: 31 points' if takes else why) in output
 
 
 def test_of_two_arms_that_were_shown_a_motion_one_is_asked_for(tmp_path):

@@ -315,31 +315,48 @@ def test_with_joint_sensors_a_rest_needs_one_of_them(arm26, initial, stage):
             assert np.isfinite(sample.theta).tolist() == [False, True]
 
 
-def test_an_accelerometer_tells_where_down_is_while_it_is_heard(arm26, initial, stage):
+UP = np.array([0.0, 0.0, 9.8])  # [m/s²] of an accelerometer that hangs as its link does
+
+
+def moving(start, end):
+    """Return samples on the way, without those at its ends, which rest."""
+    for share in np.linspace(0.1, 0.9, 40):
+        yield end._replace(length=(1.0 - share) * start.length + share * end.length)
+
+
+def test_an_accelerometer_tells_of_the_rests_in_which_it_is_heard(arm26, initial, stage):
     learner = Learner(arm26, initial, training=Prepared, joint_source='none')
-    arm = Partly(learner, stage)
-    arm.rest(1.0)
-    joint, placement = arm26.kinematics.placement('forearm')
-    learner.imu(arm.time, 'forearm', placement.rotation.T @ [0.0, 0.0, 9.8])
-    arm.rest(0.4)
-    (gravity,) = learner._rests.gravity.reshape(1, -1, 3)
-    np.testing.assert_allclose(gravity[joint], [0.0, 0.0, -1.0], atol=1e-9)
-    assert np.isnan(np.delete(gravity, joint, axis=0)).all()
-    arm.rest(1.0)
-    assert not learner._rests.gravity.size
+    arm, last, rests = Partly(learner, stage), stage.sample(), []
+    for heard in (['upper_arm'], ['upper_arm', 'forearm'], []):
+        last, before = stage.sample(), last
+        rests.append((last, heard))
+        for sample in moving(before, last):
+            arm.rest(DT, sample)
+        for _ in range(11):
+            arm.rest(0.1, last)
+            for link in heard:
+                learner.imu(arm.time, link, UP)
+    arm.rest(MARGIN + 0.1)
+    for sample, heard in rests:
+        told = min(learner.samples.samples, key=lambda s: np.abs(s.length - sample.length).max())
+        expected = np.full((len(arm26.kinematics.parent) * bool(heard), 3), np.nan)
+        for joint, placement in map(arm26.kinematics.placement, heard):
+            expected[joint] = placement.rotation @ [0.0, 0.0, -1.0]
+        np.testing.assert_allclose(told.gravity, expected.ravel(), atol=1e-9)
 
 
-def test_an_accelerometer_that_falls_silent_says_nothing_beside_one_that_is_heard(learner, stage):
-    arm = Arm(learner, stage)
-    kinematics = learner.robot.kinematics
-    arm.rest(0.5)
-    learner.imu(arm.time, 'forearm', np.array([0.0, 0.0, 9.8]))
-    for _ in range(10):
-        learner.imu(arm.time, 'upper_arm', np.array([0.0, 0.0, 9.8]))
-        arm.rest(0.1)
-    gravity = learner._rests.gravity.reshape(-1, 3)
-    assert np.isfinite(gravity[kinematics.placement('upper_arm')[0]]).all()
-    assert np.isnan(gravity[kinematics.placement('forearm')[0]]).all()
+def test_what_an_accelerometer_reads_in_motion_says_nothing_of_the_rest_after_it(
+    arm26, initial, stage
+):
+    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    arm, start, end = Partly(learner, stage), stage.sample(), stage.sample()
+    arm.rest(1.0, start)
+    for sample in moving(start, end):
+        arm.rest(DT, sample)
+        learner.imu(arm.time, 'forearm', UP)
+    arm.rest(1.0 + MARGIN + 0.1, end)
+    assert len(learner.samples) >= 2
+    assert not any(sample.gravity.size for sample in learner.samples.samples)
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,22 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
     assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
 
 
+def test_a_suspect_that_is_verified_is_not_to_be_mended_yet():
+    told, anomaly = Situation('/left'), 'anomaly_detected; call estimator/reset when it is mended'
+    told.diagnosed(said('/left/controller', f'stopped: {anomaly}'))
+    cause = 'anomaly detected: biceps: d 12.5 above 9.0'
+    told.diagnosed(said('/left/estimator', f'{cause}; verifying it', suspect_muscle='biceps'))
+    told.detected = True
+    assert told.trouble() == 'ANOMALY: biceps is being verified'
+    told.diagnosed(said('/left/controller', 'stopped: controller/stop was called'))
+    assert told.trouble() == (
+        'ANOMALY: biceps is being verified, '
+        'STOPPED: controller/stop was called (to go on: controller/reset)'
+    )
+    told.diagnosed(said('/left/estimator', cause, suspect_muscle='biceps'))
+    assert 'mend it' in told.trouble()
+
+
 def test_an_error_of_any_node_is_told_until_it_is_over():
     error = DiagnosticStatus.ERROR
     alone = Situation('/')

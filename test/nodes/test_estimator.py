@@ -20,6 +20,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
+from musculoskeletal_ae.robot.robot import Robot
 
 
 @pytest.fixture
@@ -177,11 +178,10 @@ def test_commands_of_either_kind_tell_a_dead_muscle(estimator, arm26, healthy, k
     assert estimator.estimator.core.cause.startswith(arm26.muscles[2])
 
 
-def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, arm26):
-    theta = arm26.lower + 0.4 * (arm26.upper - arm26.lower)
-    pose = arm26.kinematics.end_effector_pose(theta)
+def picture(robot, theta):
+    pose = robot.kinematics.end_effector_pose(theta)
     message = PoseStamped()
-    message.header.frame_id, message.header.stamp.sec = arm26.root_link, 42
+    message.header.frame_id, message.header.stamp.sec = robot.root_link, 42
     position, turn = message.pose.position, message.pose.orientation
     position.x, position.y, position.z = pose.translation.tolist()
     half = 0.5 * np.sqrt(1.0 + np.trace(pose.rotation))
@@ -190,6 +190,23 @@ def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, a
         float(difference) / (4.0 * half)
         for difference in (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
     )
+    return message
+
+
+def test_a_marker_says_nothing_of_joints_that_do_not_move_it(graph):
+    robot = Robot.load('musashi_upper_body')
+    graph.host(Estimator, robot='musashi_upper_body')
+    seen = graph.listen(JointState, 'vision_joint_states')
+    graph.publisher(PoseStamped, 'marker_pose').publish(picture(robot, 0.5 * robot.lower))
+    graph.wait(lambda: seen, 'the joint angles')
+    hand = robot.description.end_effector.partition('_')[0]
+    assert seen[0].name == [joint for joint in robot.joints if joint.startswith(hand)]
+    assert 0 < len(seen[0].position) == len(seen[0].name) < robot.joint_count
+
+
+def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, arm26):
+    theta = arm26.lower + 0.4 * (arm26.upper - arm26.lower)
+    message = picture(arm26, theta)
     camera, seen = estimator.publisher(PoseStamped, 'marker_pose'), estimator.received
 
     def arrived():

@@ -13,6 +13,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED
+from musculoskeletal_ae.nodes.situation import VERIFYING
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 
@@ -33,6 +34,8 @@ def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
+    graph.wait(lambda: graph.report('estimator').message.endswith(VERIFYING), 'what is done')
+    assert graph.report('estimator').values['suspect muscle'] == name
     graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
     assert arm.estimator.core.verified == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name

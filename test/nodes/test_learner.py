@@ -82,7 +82,7 @@ class HostedLearner:
 
     @property
     def tilted(self):
-        return self.node.core._rests.gravity.size > 0
+        return any(sample.gravity.size for sample in self.node.core.samples.samples)
 
     @property
     def updates(self):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import Point, TransformStamped
 from graph import Process, executable
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -65,6 +65,24 @@ def test_a_picture_is_written_or_its_ending_refused(graph, tmp_path, file, statu
     ended, output = tool.ended()
     assert ended == status and out.exists() is (status == 0)
     assert status == 0 or (file in output and '.png' in output and 'Traceback' not in output)
+
+
+def test_where_there_is_no_emulator_the_estimate_is_drawn(graph, tmp_path):
+    """As with an arm of one's own; an estimator that waits for a network draws nothing yet."""
+    publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
+    bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
+    out = tmp_path / 'arm.png'
+    arguments = ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}']
+    tool = Process('render', [*executable('render'), *arguments])
+
+    def ended():
+        for markers in ([], [bone]):
+            publisher.publish(MarkerArray(markers=markers))
+        return not tool.alive()
+
+    graph.wait(ended, 'its end')
+    status, output = tool.ended()
+    assert (status, out.exists()) == (0, True) and 'estimated/markers' in output
 
 
 def test_poses_of_all_links_go_to_tf_where_tf2_msgs_is(graph, monkeypatch):

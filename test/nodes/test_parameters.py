@@ -9,6 +9,7 @@ import pytest
 import yaml
 from graph import DEADLINE, executable
 from rclpy.parameter import Parameter as RosParameter
+from robots import write_robot
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.controller import Controller
@@ -65,11 +66,12 @@ print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
 @pytest.mark.parametrize('node', PARAMETERS)
 def test_every_number_has_a_range_in_which_its_default_is(node):
     for name, parameter in PARAMETERS[node].items():
-        first = parameter.default[0] if isinstance(parameter.default, tuple) else parameter.default
-        if isinstance(first, int | float) and not isinstance(first, bool):
+        default = parameter.default
+        numbers = default if parameter.is_number_list else (default,)
+        if all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):
             assert parameter.within is not None, name
             low, high = parameter.within
-            assert low <= first <= high, name
+            assert all(low <= number <= high for number in numbers), name
 
 
 @pytest.mark.parametrize('kind', [Controller, Estimator, HardwareEmulator, Learner, Sim])
@@ -121,6 +123,16 @@ def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path
         assert node.parameter(name) == ()
     finally:
         node.destroy_node()
+
+
+def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
+    robot = str(write_robot(tmp_path, joints=['swing']))
+    assert graph.host(Estimator, robot=robot).posture == ()
+    graph.end(graph.hosted[0])
+    assert graph.host(Estimator, robot=robot, zero_posture=[0.0]).posture == (0.0,)
+    for nothing in ([], [0.0]):  # of two joints, as the file of parameters had it once
+        graph.end(graph.hosted[0])
+        assert graph.host(Estimator, robot='arm26', zero_posture=nothing).posture == ()
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,8 @@ def test_the_example_never_overwrites_a_file(tmp_path, capsys):
         ('tension,absolute_length,elongation\n5,0.2,nan\n', ['row 2', 'finite']),
         ('tension,absolute_length,elongation\n5,0.2\n', ['row 2', '3 finite numbers']),
         ('# c\ntension,absolute_length,elongation\n-5,0.2,0.1\n', ['row 3', 'tension >= 0']),
+        ('tension,absolute_length,elongation\n5,200,1.5\n', ['row 2', 'at most 10 m', 'by 1000']),
+        ('tension,absolute_length,elongation\n5,0.2,1.5\n', ['row 2', 'to absolute_l', 'by 1000']),
         ('tension,absolute_length,elongation\n5,0.2,0.001\n', ['at least 4']),
         (
             'tension,absolute_length,elongation\n5,0.2,0.02\n50,0.2,0.01\n5,0.3,0.02\n50,0.3,0\n',

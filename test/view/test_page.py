@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from graph import Process, executable, no_number_of
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
@@ -162,6 +163,8 @@ def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
 
 def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
     port, asked = view(), []
+    graph.listen(DiagnosticArray, '/diagnostics')
+    graph.wait(lambda: graph.report('view').message == 'nobody looks', 'its diagnostics')
 
     def answer(request, response):  # as a node without these parameters does
         asked.append(request)
@@ -179,6 +182,8 @@ def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
             return len(asked) > 2  # once a second, after the picture
 
         graph.wait(shown, 'the page to go on')
+        rate = 'estimated_joint_states rate'
+        graph.wait(lambda: rate in graph.report('view').values, 'what it says of them')
     assert graph.processes[-1].alive()
 
 

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node says of itself on /diagnostics: how it is, what came, and what was rejected."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.report import Report
+
+PERIOD = 1.0  # [s] of reports
+
+
+class Diagnostics:
+    """Publishes the reports of one node, each as a single status."""
+
+    def __init__(self, node: Node, reception: Reception, hardware: str) -> None:
+        """Tell of a node, of what it receives, and by which `hardware` that is."""
+        self._node, self._reception, self._hardware = node, reception, hardware
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._told_at = time.monotonic()
+
+    def tell(self, report: Report) -> dict[str, int]:
+        """Publish a report; return how many messages were used since the last, by topic."""
+        now = time.monotonic()
+        elapsed, self._told_at = now - self._told_at, now
+        received, rejected = self._reception.take_received(), self._reception.rejected
+        values = dict(report.values)
+        values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
+        values['rejected'] = str(sum(rejected.values()))
+        values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}
+        if self._reception.last_rejected:
+            values['last rejected'] = self._reception.last_rejected
+        status = DiagnosticStatus(
+            level=getattr(DiagnosticStatus, report.level.upper()),
+            name=f'{self._node.get_fully_qualified_name()}: state',
+            message=printable(report.message),
+            hardware_id=self._hardware,
+            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+        return received
