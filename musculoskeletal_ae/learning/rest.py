@@ -80,7 +80,8 @@ class RestDetector:
             self._rest += new if self.blind else filter(_measured, new)
             self._since = self._since if was_still else self._time
             time, earlier = self._window[0]
-            self._gravity += [earlier.gravity] * (time >= self._since)
+            if time >= self._since:
+                self._gravity.append(earlier.gravity)
             self._span = self._span + dt if was_still else self._needed
             if self._span < LONGEST and len(self._rest) < MOST:
                 return None
