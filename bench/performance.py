@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes doc/performance.md: core steps, the running system, starts, memory and learning times.
 
-    python -m bench performance [--seconds 20] [--robots NAME,…] [--flames] --out doc
+    python -m bench performance [--seconds 20] [--late 600] [--flames] --out doc
 
 Times hold for the machine and the day that the page names, which should have nothing else to do.
 `--flames` draws, by py-spy, where each node spends its time at 200 Hz, as OUT/flames/NODE.svg.
@@ -20,18 +20,19 @@ from pathlib import Path
 from bench import timings
 from bench.processes import cpu
 from bench.scaling import update_time
-from bench.wire import KINDS, System, systems
+from bench.wire import KINDS, System, Wire, systems
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, names, number
+from musculoskeletal_ae.options import Parser, number
 from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = 'musashi_left_arm'
-RATES, SIZES = (100.0, 200.0, 500.0), f'arm26,{ARM},musashi_upper_body'
+LARGE = 'musashi_upper_body'
+RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
 EXPLORING = 60.0  # [s] that samples of an update come from
 FLAME_RATE, STARTING, SETTLING = 200.0, 60.0, 15.0  # [Hz], [s], [s]
 
@@ -52,10 +53,17 @@ PAGE = """# Performance
 Written by `python -m bench performance --out doc` on {day}: {machine}. Before: the first version
 that was measured (be0daee), on an idle machine of two cores.
 
+## Goals
+
+On two idle cores, `{arm}` where nothing else is said.
+
+{goals}
+
 ## One call of the core
 
-`bench timings`, `{arm}`, one core. Torch eager: the same algorithm, its network in torch. Bound:
-the network's multiply-adds at the rate of this machine's own products of matrices of that size.
+`bench timings`, `{arm}`, CPU time. Torch eager: the same algorithm, its network in torch, or, where
+it says so, all of it. Bound: the network's multiply-adds at the rate of this machine's own products
+of matrices of that size.
 By torch's own estimate, which took {torch_before:.0f} µs before, this machine was {slower:.1f}
 times as slow as that of before: compare what was measured on one day, by ratios to torch and to
 "messages alone".
@@ -83,12 +91,13 @@ Python on rclpy has no less.
 
 ## Learning
 
-`{arm}`, one core.
+One core; an update with a full store.
 
 | | before | now |
 |---|---|---|
-| initial training [CPU s] | 28 | {training:.0f} |
-| one update, samples full [CPU s] | 0.5–1 | {update:.2f} |
+| `{arm}`, initial training [CPU s] | 28 | {training:.0f} |
+| one update [CPU s] | 0.5–1 | {update:.2f} |
+| `{large}`, one update [CPU s] | | {large_update:.2f} |
 {flames}"""
 FLAMES = '\n## Where a node’s time goes\n\nBy py-spy at 200 Hz: {}.\n'
 
@@ -100,35 +109,55 @@ def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
     return '\n'.join((f'| {head} |', '|---' * columns + '|', *cells))
 
 
-def core(robot: Robot) -> tuple[str, float]:
-    """Return the table of the core's steps, and by how much torch was slower than before."""
-    said, measured = [], timings.measure(robot, DEFAULT.name)
+def core(measured: Iterable[timings.Timed]) -> str:
+    """Return the table of the core's steps."""
+    said = []
     for row in measured:
         ratio = f'{row.torch_eager / row.ours:.1f}' if row.torch_eager else ''
         numbers = (f'{v:.1f}' if v else '' for v in (row.ours, row.torch_eager, row.bound))
         said.append((row.name, BEFORE_CORE.get(row.name, ''), *numbers, ratio))
     head = '| before [µs] | now [µs] | torch eager [µs] | bound [µs] | times faster'
-    return rows(head, said), measured[0].torch_eager / TORCH_BEFORE
+    return rows(head, said)
 
 
-def wire(robots: Iterable[str], seconds: float) -> str:
+def wire(seconds: float) -> dict[tuple[str, float, str], Wire]:
+    """Measure the running system; return what it did, by robot, rate and kind of nodes."""
+    return {
+        (robot, rate, kind): found
+        for robot in SIZES
+        for rate, kind, found in systems(
+            robot, RATES, KINDS if robot == ARM else ('nodes', 'with learner'), seconds
+        )
+    }
+
+
+def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
     """Return the table of the running system."""
     said = []
-    for robot in robots:
-        kinds = KINDS if robot == ARM else ('nodes', 'with learner')
-        for rate, kind, found in systems(robot, RATES, kinds, seconds):
-            latency = ' / '.join(f'{value:.1f}' for value in found.latency)
-            # Those were measured with the learner, at 500 Hz without.
-            same = 'nodes' if rate == max(RATES) else 'with learner'
-            known = BEFORE_WIRE[rate] if (robot, kind) == (ARM, same) else ('', '')
-            lost = f'{found.late:.1f}', f'{found.missed:.1f}'
-            cost = known[1], f'{sum(found.cpu.values()):.0f}'
-            said.append((robot, f'{rate:.0f}', kind, known[0], latency, *lost, *cost))
+    for (robot, rate, kind), found in measured.items():
+        latency = ' / '.join(f'{value:.1f}' for value in found.latency)
+        # Those were measured with the learner, at 500 Hz without.
+        same = 'nodes' if rate == max(RATES) else 'with learner'
+        known = BEFORE_WIRE[rate] if (robot, kind) == (ARM, same) else ('', '')
+        lost = f'{found.late:.1f}', f'{found.missed:.1f}'
+        cost = known[1], f'{sum(found.cpu.values()):.0f}'
+        said.append((robot, f'{rate:.0f}', kind, known[0], latency, *lost, *cost))
     head = (
         'robot | rate [Hz] | nodes | before: 50 % / 99 % / largest [ms] | now [ms] | late [%] | '
         'missed [%] | CPU before [%] | now [%]'
     )
     return rows(head, said)
+
+
+def goals(numbers: dict[str, tuple[float, float]]) -> str:
+    """Return the table of goals, from what is measured and what it may be; at least, if below 0."""
+    said = []
+    for name, (value, limit) in numbers.items():
+        least = limit < 0.0
+        met = value >= -limit if least else value <= limit
+        legal = f'{"≥" if least else "≤"} {abs(limit):g}'
+        said.append((name, legal, f'{value:.3g}', 'met' if met else '**missed**'))
+    return rows('| goal | now |', said)
 
 
 def resident(pid: int) -> tuple[float, float]:
@@ -155,10 +184,8 @@ def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, flo
         system.end()
 
 
-def starting(network: Path) -> tuple[str, float]:
-    """Return the table of starts and memory, and what the estimator has of files [MB]."""
-    started(network)  # this may compile, and is not counted
-    used, held = started(network)
+def starting(used: dict[str, float], held: dict[str, tuple[float, float]], network: Path) -> str:
+    """Return the table of starts and memory."""
     said = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )
@@ -169,8 +196,7 @@ def starting(network: Path) -> tuple[str, float]:
     finally:
         system.end()
     head = 'node | CPU until the first command [s] | memory before [MB] | now [MB]'
-    table = rows(head, (*said, ('messages alone', '', '', f'{floor:.0f}')))
-    return table, held['estimator'][1]
+    return rows(head, (*said, ('messages alone', '', '', f'{floor:.0f}')))
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:
@@ -188,9 +214,10 @@ def flames(network: Path, seconds: float, out: Path) -> str:
     return FLAMES.format(', '.join(f'[{name}](flames/{name}.svg)' for name in system.nodes))
 
 
-def learning(robot: Robot, folder: Path) -> tuple[float, float, Path]:
+def learning(name: str, folder: Path) -> tuple[float, float, Path]:
     """Return the time of initial training and of an update [s], and the network."""
-    begun, network = time.process_time(), folder / 'network.safetensors'
+    robot, network = Robot.load(name), folder / f'{name}.safetensors'
+    begun = time.process_time()
     mae = initial_mae(robot).mae
     training = time.process_time() - begun
     checkpoint.save(mae, network)
@@ -209,23 +236,56 @@ def main(argv: list[str]) -> None:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
-    parser.add_argument('--robots', type=names, default=SIZES, help='of the wire, or directories')
+    parser.add_argument(
+        '--late',
+        type=number(1.0, 3600.0),
+        default=600.0,
+        help='[s] in which no message may be late',
+    )
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
     if args.flames and shutil.which('py-spy') is None:
         parser.error('--flames draws by py-spy, which is not installed: pip install py-spy')
 
-    robot = Robot.load(ARM)
     with tempfile.TemporaryDirectory() as folder:
-        training, update, network = learning(robot, Path(folder))
-        start, shared = starting(network)
-        table, slower = core(robot)
+        training, update, network = learning(ARM, Path(folder))
+        _, large_update, _ = learning(LARGE, Path(folder))
+        started(network)  # this may compile, and is not counted
+        used, held = started(network)
+        steps = timings.measure(Robot.load(ARM), DEFAULT.name)
+        moved = wire(args.seconds)
+        ((_, _, long),) = systems(ARM, (FLAME_RATE,), ('with learner',), args.late)
+        ratio = {row.name: row.torch_eager / row.ours for row in steps}
+        step, batch = 'simulation step', f'the same, each of {timings.MANY} in one batch'
+        whole = f', {timings.ALL_TORCH}'
+        numbers = {
+            '99 % of commands at 100 Hz, with learner [ms]': (
+                moved[ARM, 100.0, 'with learner'].latency[1], 5.0,
+            ),
+            '99 % at 500 Hz, without [ms]': (moved[ARM, 500.0, 'nodes'].latency[1], 2.0),
+            'five nodes at 200 Hz [% of a core]': (
+                sum(moved[ARM, 200.0, 'with learner'].cpu.values()), 100.0,
+            ),
+            f'late in {args.late:.0f} s at 200 Hz, with learner [%]': (long.late, 0.0),
+            'simulation step, times torch’s network in it': (ratio[step], -6.0),
+            'simulation step, times all of it in torch': (ratio[step + whole], -6.0),
+            f'each of {timings.MANY}, times torch’s network in it': (ratio[batch], -3.0),
+            f'each of {timings.MANY}, times all of it in torch': (ratio[batch + whole], -3.0),
+            'start of any node [CPU s]': (max(used.values()), 1.5),
+            'memory of estimator, controller or sim [MB]': (
+                max(held[name][0] for name in ('estimator', 'controller', 'sim')), 100.0,
+            ),
+            'online update [s]': (update, 0.3),
+            f'online update, {LARGE} [s]': (large_update, 2.0),
+            'initial training [s]': (training, 20.0),
+        }  # fmt: skip
         page = PAGE.format(
-            day=date.today().isoformat(), machine=machine(), arm=ARM, core=table,  # noqa: DTZ011
-            torch_before=TORCH_BEFORE, slower=slower, wire=wire(args.robots, args.seconds),
-            start=start, shared=shared,
-            training=training, update=update,
+            day=date.today().isoformat(), machine=machine(), arm=ARM, large=LARGE,  # noqa: DTZ011
+            goals=goals(numbers), core=core(steps), wire=wire_table(moved),
+            torch_before=TORCH_BEFORE, slower=steps[0].torch_eager / TORCH_BEFORE,
+            start=starting(used, held, network), shared=held['estimator'][1],
+            training=training, update=update, large_update=large_update,
             flames=flames(network, args.seconds, args.out / 'flames') if args.flames else '',
         )  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
