@@ -97,17 +97,19 @@ def _solve(robot: Robot, mae: Mae) -> Array:
 
 
 def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
-    """Return the time of an update from a store that is full [s], the median of three."""
-    part = exploring.part(np.linspace(0, len(exploring.theta) - 1, CAPACITY, dtype=int))
-    none = np.zeros_like(part.tension)
-    seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
+    """Return the time of an update from a store that is full [s], the median of five."""
     columns = exploring.tension, exploring.length, np.zeros_like(exploring.length)
-    messages = np.concatenate(columns, axis=1)[::10]
-    updater = make_updater(robot, mae, DEFAULT)
-    job = Job(seen, Healthy(messages.astype(np.float32), 600.0, 100), True, STEPS)
+    messages = np.concatenate(columns, axis=1)[::10].astype(np.float32)
+    updater, count = make_updater(robot, mae, DEFAULT), len(exploring.theta)
+    kept, rng = np.linspace(0, count - 1, CAPACITY, dtype=int), np.random.default_rng(0)
     times = []
     with one_thread():  # as the training process
-        for _ in range(4):
+        for _ in range(6):
+            kept = np.append(kept[1:], rng.integers(count))  # each update is for something new
+            part = exploring.part(kept)
+            none = np.zeros_like(part.tension)
+            seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
+            job = Job(seen, Healthy(messages, 600.0, 100), True, STEPS)
             begun = time.process_time()
             updater.update(job)
             times.append(time.process_time() - begun)

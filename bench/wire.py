@@ -11,7 +11,7 @@ would write: one plain rclpy node in which torch eager estimates and a tension i
 length, no safety, no control; and the floor: as many nodes that exchange the same messages, by the
 same executor, and compute nothing, so that no node in Python on this machine can do with less.
 
-    late      no command within two periods
+    late      no command within two periods, or at all
     missed    messages that the emulator should have sent, and that did not come
 """
 
@@ -220,7 +220,8 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
     after = np.searchsorted(commands, states)
     known = after < len(commands)
     latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
-    late = 100.0 * float((latency > 2e3 / rate).mean())
+    late = (latency > 2e3 / rate).sum() + (states[~known] < states[-1] - 2e9 / rate).sum()
+    late = 100.0 * float(late) / len(states)
     missed = 100.0 * max(0.0, 1.0 - len(states) / (rate * passed))
     return Wire(tuple(np.percentile(latency, (50, 99, 100)).tolist()), late, missed, used)
 

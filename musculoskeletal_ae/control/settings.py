@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.parameters import PRESET, UNBOUNDED, settable
+from musculoskeletal_ae.parameters import PRESET, settable
 
 UNREACHABLE = ('refuse', 'nearest')
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
@@ -21,11 +21,11 @@ class Settings:
     preset: str = replace(PRESET, settable=True).field()
     joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
-        f'desired diagonal of the joint stiffness, one for each joint, at most {MOST_STIFFNESS:g}, '
-        'over 0.06² where it slides (0 or []: as it comes)',
+        f'desired diagonal of the joint stiffness, one for each joint, at most {MOST_STIFFNESS:g} '
+        'where it turns (0 or []: as it comes)',
         'N·m/rad or N/m',
         0.0,
-        float(UNBOUNDED),
+        MOST_STIFFNESS / 0.06**2,  # where it slides: RACK, which --help is not to load
     )
     first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = settable(

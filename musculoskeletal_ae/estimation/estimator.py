@@ -29,7 +29,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
 from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
-from musculoskeletal_ae.estimation.verification import HEALTHY, Verification
+from musculoskeletal_ae.estimation.verification import HEALTHY, VERIFYING, Verification
 from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.friction import FrictionDirection
@@ -393,7 +393,7 @@ class Estimator:
         far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
         values['posture'] = f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'
         if self.cause:
-            doing = '; verifying it' if self._verification is not None else ''
+            doing = VERIFYING if self._verification is not None else ''
             return Report('error', f'anomaly detected: {self.cause}{doing}', values)
         if now - self._stepped_at > SILENCE:
             return Report('warn', 'no muscle_states', values)

@@ -25,6 +25,7 @@ import numpy as np
 from musculoskeletal_ae.plausibility import SLACK
 
 HEALTHY = 'healthy'
+VERIFYING = '; verifying it'  # ends the report of an anomaly: the arm may go on by itself
 BEGUN, JUDGED = 0.001, 0.8  # [m] that the command has fallen, [s] of that
 PATIENCE = 8.0  # [s] without an answer
 FAR, FOLLOWED = 0.025, 0.005  # [m]

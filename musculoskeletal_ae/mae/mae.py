@@ -122,23 +122,32 @@ def _silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     return u, slope
 
 
+def _linear(u: Singles) -> Singles:
+    return u
+
+
+def _linear_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
+    u += bias
+    return u, np.ones(1, np.float32)
+
+
 ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
+LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent space, where stacks meet
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Layers x @ weight + bias, weight (in, out); the activation follows all but the last.
+    """Layers x @ weight + bias, weight (in, out); an activation follows each but the last.
 
-    The gain of the activation is in the weights before it. What goes in and comes out is of double
+    The gain of an activation is in the weights before it. What goes in and comes out is of double
     precision, what is between of single.
     """
 
     layers: tuple[tuple[Singles | BlockDiagonal, Singles], ...]
-    activation: Activation
-    latent: int = -1  # of two stacks in one, the layer that the first one ends with
+    activations: tuple[Activation, ...]
 
     @cached_property
     def _back(self) -> list[Singles | BlockDiagonal]:
@@ -151,24 +160,19 @@ class Stack:
     def __call__(self, given: Array) -> Array:
         """Return the output (..., out) for an input (..., in)."""
         x = given.astype(np.float32)
-        for weight, bias in self.layers[:-1]:
+        for (weight, bias), activation in zip(self.layers, self.activations):
             x = product(x, weight)
             x += bias
-            x = self.activation.value(x)
+            x = activation.value(x)
         weight, bias = self.layers[-1]
         return (product(x, weight) + bias).astype(np.float64)
 
     def with_pullback(self, given: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return the output and the function that maps a gradient by it to one by the input."""
-        x, slopes = given.astype(np.float32), list[Singles | float]()
-        for i, (weight, bias) in enumerate(self.layers[:-1]):
-            x = product(x, weight)
-            if i == self.latent:
-                x += bias
-                slopes.append(1.0)
-            else:
-                x, slope = self.activation.with_slope(x, bias)
-                slopes.append(slope)
+        x, slopes = given.astype(np.float32), []
+        for (weight, bias), activation in zip(self.layers, self.activations):
+            x, slope = activation.with_slope(product(x, weight), bias)
+            slopes.append(slope)
         last, last_bias = self.layers[-1]
 
         def pullback(by_output: Array) -> Array:
@@ -192,8 +196,8 @@ class Stack:
             x, tangent = product(x, weight), product(tangent, weight)
             if len(shape) > 1:
                 tangent = tangent.reshape(*shape, -1)
-            if i < len(self.layers) - 1:
-                x, slope = self.activation.with_slope(x, bias)
+            if i < len(self.activations):
+                x, slope = self.activations[i].with_slope(x, bias)
                 tangent = tangent * slope[..., None, :]
         x += bias
         return x.astype(np.float64), tangent.astype(np.float64)
@@ -211,7 +215,7 @@ def side_by_side(
         weights, biases = zip(*level, strict=True)
         bias = np.concatenate(biases)
         layers.append((BlockDiagonal(weights, *ends), bias if ends[1] is None else bias[out]))
-    return Stack(tuple(layers), stacks[0].activation)
+    return Stack(tuple(layers), stacks[0].activations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,8 +422,9 @@ class Mae:
         from musculoskeletal_ae.mae.compiled import WITH_SLOPE
 
         enter, leave = self._enter[Mask.THETA_TENSION], self._leave_length
-        activation = enter.activation._replace(with_slope=WITH_SLOPE[self.activation])
-        return Stack((*enter.layers, *leave.layers), activation, len(enter.layers) - 1)
+        own = ACTIVATIONS[self.activation]._replace(with_slope=WITH_SLOPE[self.activation])
+        before, after = ([own] * len(stack.activations) for stack in (enter, leave))
+        return Stack((*enter.layers, *leave.layers), (*before, LINEAR, *after))
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
         """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
@@ -462,7 +467,7 @@ def _frozen(array: Array) -> Array:
 def _stack(layers: tuple[tuple[Singles, Singles], ...], activation: Activation) -> Stack:
     gain = np.float32(activation.gain)
     hidden = tuple((gain * weight, gain * bias) for weight, bias in layers[:-1])
-    return Stack((*hidden, layers[-1]), activation)
+    return Stack((*hidden, layers[-1]), (activation,) * len(hidden))
 
 
 def _transposed(weight: Array, bias: Array) -> tuple[Singles, Singles]:

@@ -162,11 +162,11 @@ class Estimator(Shell):
         detected, before = bool(self.core.cause), self.latched
         if detected != before:
             self.latched, self.chosen = detected, True
-            self._report()  # what is known of the suspect comes with the news, not a second later
+            self.detected.publish(Bool(data=detected))  # which stops the arm: first of all
             told = f'anomaly detected: {self.core.cause}' if detected else self.core.verified
             self.get_logger().warning(told)
-            self.detected.publish(Bool(data=detected))
             self.take_anomaly(detected)
+            self._report()  # what is known of the suspect comes with the news, not a second later
         self._tell_isolated()
 
     def _tell_zeros(self) -> None:

@@ -16,6 +16,7 @@ from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
+DISCOVERY = 2.0  # [s] in which nodes that run know of each other
 
 
 def _line(strip: Marker) -> Line:
@@ -32,10 +33,12 @@ def _render(options: Namespace, arguments: list[str]) -> int:
     for topic in topics:
         take = partial(_take, drawn, topic)
         node.create_subscription(MarkerArray, topic, take, SENSOR)
-    first = node.resolve_topic_name(topics[0])
-    Spinner(node).spin_until(
-        lambda: topics[0] in drawn or (drawn and not node.count_publishers(first)), options.timeout
-    )
+    first, spinner = node.resolve_topic_name(topics[0]), Spinner(node)
+    spinner.spin_until(lambda: drawn, options.timeout)
+    # Who publishes the first may be discovered later, or send its next markers later.
+    spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY if drawn else 0.0)
+    if drawn and node.count_publishers(first):
+        spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
     if not drawn:
         told = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
         told += '; is the node running, and in this namespace (--ros-args -r __ns:=/NAME)?'

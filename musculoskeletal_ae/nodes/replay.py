@@ -224,7 +224,9 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     spinner.spin_until(is_taken, ANSWER_TIME)
     # The first report may have been on its way; others than our controller may say nothing.
     if len(reports) > 1 and not is_taken():
-        why = reports[-1].get('last rejected', 'it says nothing of it')
+        last, counted = reports[-1].get('last rejected', ''), f'rejected {TRAJECTORY}: '
+        reasons = [key.removeprefix(counted) for key in reports[-1] if key.startswith(counted)]
+        why = last if last.startswith(TRAJECTORY) else ', '.join(reasons) or 'it does not say why'
         raise MusculoskeletalError(f'the controller did not take it: {why}')
     told = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
     print(f'{topic}: {told}, the first {LEAD:g} s of it to where it begins')

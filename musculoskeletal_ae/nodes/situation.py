@@ -6,9 +6,10 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from musculoskeletal_ae.estimation.verification import VERIFYING
+
 OLD = 1.0  # [s] after which something that moves is no longer shown
 TOLD = 'stopped', 'anomaly detected'  # errors that are told with what to do
-VERIFYING = '; verifying it'  # ends an anomaly while its suspect is: the arm may go on by itself
 
 
 def figures(measured: bool, error: float, anomaly: float) -> str:

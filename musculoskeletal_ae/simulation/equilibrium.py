@@ -246,7 +246,7 @@ def advance(
     soft, lost, turning = np.empty_like(end), np.empty_like(end), slid.copy()
     change, spring, stiff = np.empty(arms), np.empty(arms), np.empty(arms)
     arrived, way = np.empty_like(load), np.empty(arms)
-    done, rough = np.zeros(arms, np.bool_), False
+    done, rough = np.zeros(arms, np.bool_), body.friction.any()
     hold(tree, theta, wrench, load, slope)
     add_slopes(limbs, theta, end, jacobian, slope)
     for m in range(muscles):
@@ -271,7 +271,6 @@ def advance(
         for m in range(muscles):
             stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
             friction = body.friction[m]
-            rough |= friction != 0.0
             for n in range(arms):
                 # Where a wire slides, friction is like a stiff spring until it has turned round:
                 # one of constant stiffness, where the arm's lets go little by little.
@@ -298,6 +297,8 @@ def advance(
                 for n in range(arms):
                     push[d, n] -= change[n] * jacobian[m, d, n]
                     stiff[n] = spring[n] * jacobian[m, d, n]
+                if not stiff.any():  # a joint that the muscle does not cross
+                    continue
                 for e in range(d + 1):
                     for n in range(arms):
                         matrix[d, e, n] += stiff[n] * jacobian[m, e, n]
@@ -325,11 +326,8 @@ def advance(
                 if not done[n]:
                     turning[m, n], after.slid[m, n] = now, now
                     after.tension[m, n], after.length[m, n] = pull, length[m, n] + moved
-        left = False
-        for n in range(arms):
-            done[n] |= not again[n]
-            left |= not done[n]
-        if not (rough and left):
+        done |= ~again
+        if not rough or done.all():
             break
 
 
@@ -368,7 +366,7 @@ class QuasiStatics:
         passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
-        before = ArmState(*map(arms_last, (*state[:2], length, *state[3:])))
+        before = ArmState(*map(arms_last, state._replace(length=length)))
         others = map(arms_last, (passed, pullback(end), command, wrench, fixed))
         after = ArmState(*map(np.empty_like, before))
         advance(self._handle, before, after, h, *others)

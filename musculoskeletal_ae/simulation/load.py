@@ -112,7 +112,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
                 pose[tree.parent[i], 5, r, n] += pose[i, 5, r, n]
     load[:], gradient[:] = 0.0, 0.0
     down, tip, hand = vector(tree.gravity), vector(tree.effector), pose[tree.effector_joint]
-    tips = hand[3].copy()
+    tips, nothing = hand[3].copy(), np.zeros_like(wrench)
     for c in range(3):
         for r in range(3):
             for n in range(arms):
@@ -120,11 +120,11 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
     for k in range(1, joints):
         origins, axes, moments = pose[k, 3], pose[k, 4], pose[k, 5]
         master, weighs, slides = tree.master[k], tree.carried[k], tree.slides[k]
-        held = 1.0 if tree.carries[k] else 0.0
+        acting = wrench if tree.carries[k] else nothing
+        pushes, twists = acting[:3], acting[3:]
         for n in range(arms):
             at, axis = of(n, origins), of(n, axes)
-            push = held * wrench[0, n], held * wrench[1, n], held * wrench[2, n]
-            twist = held * wrench[3, n], held * wrench[4, n], held * wrench[5, n]
+            push, twist = of(n, pushes), of(n, twists)
             weight, arm = plus(of(n, moments), at, -weighs), plus(of(n, tips), at, -1.0)
             if slides:
                 force = plus(push, down, weighs)

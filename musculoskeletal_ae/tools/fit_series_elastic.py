@@ -100,8 +100,10 @@ def read_table(file: Path) -> Array:
             values = []
         if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
             raise _refusal(file, f'row {number}: expected 3 finite numbers, got {line[:80]!r}')
-        if values[0] < 0.0 or not 0.0 < values[1] <= LONGEST:
-            legal = f'tension >= 0 and absolute_length > 0, at most {LONGEST:g} m'
+        if values[0] < 0.0:
+            raise _refusal(file, f'row {number}: expected tension >= 0 [N], got {line!r}')
+        if not 0.0 < values[1] <= LONGEST:
+            legal = f'absolute_length > 0, at most {LONGEST:g} m'
             problem = f'row {number}: expected {legal}, got {line!r}'
             raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
         if not LEAST_ELONGATION <= values[2] < values[1]:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -123,3 +125,11 @@ def test_muscle_jacobian_is_the_limit_of_the_papers_difference(mae, states):
 def test_weights_cannot_be_written(mae):
     for weight, bias in (*mae.encoder, *mae.decoder, (mae.mean, mae.std)):
         assert not weight.flags.writeable and not bias.flags.writeable
+
+
+def test_a_network_that_was_simulated_goes_to_other_processes(mae, states):
+    length, pullback = mae.lengths_with_pullback(states.theta, states.tension)
+    sent = pickle.loads(pickle.dumps(mae))
+    again, torque = sent.lengths_with_pullback(states.theta, states.tension)
+    np.testing.assert_array_equal(again, length)
+    np.testing.assert_array_equal(torque(states.tension), pullback(states.tension))
