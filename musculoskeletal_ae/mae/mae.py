@@ -60,7 +60,7 @@ class BlockDiagonal:
         """Return x @ weight, shape (..., out), for x (..., in)."""
         if self._into is not None:
             x = x[..., self._into]
-        parts = [x[..., into] @ block for into, block in self._blocks]
+        parts = [product(x[..., into], block) for into, block in self._blocks]
         result: Singles = np.concatenate(parts, axis=-1)
         # Rows stay whole in memory, as after a product with an array; [..., out] would turn them.
         return result if self._out is None else result.take(self._out, axis=-1)

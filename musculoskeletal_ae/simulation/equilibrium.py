@@ -81,6 +81,7 @@ class Limbs(NamedTuple):
     counts: Ints  # D joints and M muscles of each, (limbs, 2)
     joints: Ints  # places in θ
     muscles: Ints  # places in T and l
+    crossed: Ints  # of each place in T and l, from and to which of `joints` its limb's are, (M, 2)
     first: Array  # of each, G (M, D) by each member of the basis 1, θ_j, θ_j θ_k with j ≤ k
     second: Array  # of each, and each muscle, the lower half of ∂²l_i/∂θ² by 1 and each θ_j
 
@@ -293,13 +294,14 @@ def advance(
                 change[n] = passed[m, n] * rise + rub * moved - lost[m, n]
                 wholly = (passed[m, n] + rub / stiffness) * soft[m, n]
                 spring[n] = wholly if settled == wanted[m, n] else rub / give[m, n]
-            for d in range(joints):
+            start, stop = limbs.crossed[m]
+            for i in range(start, stop):
+                d = limbs.joints[i]
                 for n in range(arms):
                     push[d, n] -= change[n] * jacobian[m, d, n]
                     stiff[n] = spring[n] * jacobian[m, d, n]
-                if not stiff.any():  # a joint that the muscle does not cross
-                    continue
-                for e in range(d + 1):
+                for j in range(start, i + 1):
+                    e = limbs.joints[j]
                     for n in range(arms):
                         matrix[d, e, n] += stiff[n] * jacobian[m, e, n]
         turn(body, theta, push, matrix, JOINT_SPEED * h, fixed, arrived)
@@ -314,7 +316,9 @@ def advance(
         for m in range(muscles):
             stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
             way[:] = 0.0
-            for d in range(joints):
+            start, stop = limbs.crossed[m]
+            for i in range(start, stop):
+                d = limbs.joints[i]
                 for n in range(arms):
                     way[n] += jacobian[m, d, n] * (arrived[d, n] - theta[d, n])
             for n in range(arms):
@@ -397,8 +401,15 @@ class Slopes:
         middle = 0.5 * (robot.tension.bias + robot.tension.limit)
         self._tension = np.full((count, robot.muscle_count), middle)
         self._cubics = [Cubics(group, self._postures) for group in robot.groups]
-        places = map(np.concatenate, zip(*robot.groups, strict=True))
-        self._places = np.array([[*map(len, group)] for group in robot.groups]), *places
+        joints, muscles = map(np.concatenate, zip(*robot.groups, strict=True))
+        counts, crossed = (
+            np.array([[*map(len, g)] for g in robot.groups]),
+            np.empty((len(muscles), 2), int),
+        )
+        ends = np.cumsum([0, *counts[:, 0]])
+        for group, *span in zip(robot.groups, ends, ends[1:]):
+            crossed[list(group.muscles)] = span
+        self._places = counts, joints, muscles, crossed
 
     def fit(self, mae: Mae) -> None:
         """Fit what a network says; a FloatingPointError says that it cannot be fitted."""
