@@ -47,7 +47,7 @@ KINDS = {
 }
 WARM_UP = 8.0  # [s] until the first message counts
 PLAIN = """
-import sys, numpy as np, rclpy, torch
+import contextlib, sys, numpy as np, rclpy, torch
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.mae import checkpoint
@@ -70,7 +70,9 @@ class Plain(Node):
             out = network.decoder(network.encode(row, torch.tensor([1])))
         goal = l - np.maximum(T - 30.0, 0.0) / 1e4 + 0.0 * float(out[0, 0])
         self.out.publish(Float64MultiArray(data=goal.tolist()))
-rclpy.init(); rclpy.spin(Plain())
+rclpy.init()
+with contextlib.suppress(KeyboardInterrupt):
+    rclpy.spin(Plain())
 """
 #: node: when it publishes (at a message, or at its rate), what, and what else it hears
 BARE = {
