@@ -61,7 +61,8 @@ class Simulation:
         The network computes on a device of torch, such as `cuda` (preset `default` only).
 
         Raises:
-            MusculoskeletalError: If torch computes nothing there, or the preset cannot.
+            MusculoskeletalError: If torch computes nothing there, the preset cannot, or there are
+                no arms.
         """
         self.robot = copy.copy(robot)
         kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
@@ -90,8 +91,13 @@ class Simulation:
         """Put the arms at θ [rad] (N, D), of numpy, with T_bias, commands forgotten.
 
         If they become more or fewer, wrenches and fixed angles are forgotten as well.
+
+        Raises:
+            MusculoskeletalError: If there are none.
         """
         robot = self.robot
+        if not len(theta):
+            raise MusculoskeletalError('arms: expected at least 1, got 0')
         if len(theta) != len(self.wrench):
             self.wrench = np.zeros((len(theta), 6))
             self.fixed = np.full((len(theta), robot.joint_count), np.nan)

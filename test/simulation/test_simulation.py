@@ -14,6 +14,7 @@ from bench.simulation_nominal import (
     responses,
     rest_errors,
 )
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation import simulation
@@ -274,6 +275,11 @@ def test_more_or_fewer_arms_are_not_pushed_by_what_pushed_others(arm26, mae):
         simulation.start_from(np.zeros((arms, arm26.joint_count)))
         free = Simulation(arm26, mae, arms=arms).step(0.02)
         np.testing.assert_allclose(simulation.step(0.02).theta, free.theta, atol=1e-9)
+
+
+def test_no_arms_at_all_are_refused(arm26, mae):
+    with pytest.raises(MusculoskeletalError, match='at least 1, got 0'):
+        Simulation(arm26, mae, arms=0)
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])
