@@ -92,6 +92,7 @@ from array import array
 from contextlib import suppress
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.nodes.running import LeanExecutor
@@ -105,7 +106,7 @@ def message(topic):
         return JointState(name=robot.joints, position=[0.0] * robot.joint_count)
     rows = 3 if topic.endswith('muscle_states') else 1
     return Float64MultiArray(data=array('d', [0.0] * rows * robot.muscle_count))
-rclpy.init()
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 node = rclpy.create_node(name)
 outs = [(node.create_publisher(kind(topic), topic, 10), topic) for topic in out.split()]
 def tell(_=None):
