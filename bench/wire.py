@@ -90,7 +90,6 @@ ALONE = """
 import sys, rclpy
 from array import array
 from contextlib import suppress
-from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
@@ -117,7 +116,7 @@ for topic in {at, *hears.split()} - {''}:
     node.create_subscription(kind(topic), topic, heard, qos_profile_sensor_data)
 if not at:
     node.create_timer(1.0 / float(rate), tell)
-with LeanExecutor() as executor, suppress(KeyboardInterrupt, ExternalShutdownException):
+with LeanExecutor() as executor, suppress(KeyboardInterrupt):
     executor.add_node(node)
     executor.spin()
 """

@@ -402,10 +402,8 @@ class Slopes:
         self._tension = np.full((count, robot.muscle_count), middle)
         self._cubics = [Cubics(group, self._postures) for group in robot.groups]
         joints, muscles = map(np.concatenate, zip(*robot.groups, strict=True))
-        counts, crossed = (
-            np.array([[*map(len, g)] for g in robot.groups]),
-            np.empty((len(muscles), 2), int),
-        )
+        counts = np.array([[*map(len, group)] for group in robot.groups])
+        crossed = np.empty((len(muscles), 2), int)
         ends = np.cumsum([0, *counts[:, 0]])
         for group, *span in zip(robot.groups, ends, ends[1:]):
             crossed[list(group.muscles)] = span
