@@ -4,9 +4,9 @@
     message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
             ─► tendon friction ─► MuscleSample
 
-A message that fails a check raises a `RejectionError`, which names the reason, the value and the legal
-range. Nodes, bags, `check_driver` and experiments all use this class, and `signals/limits.py` has
-its limits. What isolated muscles read is never judged.
+A message that fails a check raises a `RejectionError`, which names the reason, the value and the
+legal range. Nodes, bags, `check_driver` and experiments all use this class, and `signals/limits.py`
+has its limits. What isolated muscles read is never judged.
 """
 
 from __future__ import annotations
