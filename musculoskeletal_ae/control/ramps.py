@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ramps of muscle lengths: how the paper's methods and the exploration reach a posture.
+
+A target becomes one or two goals (`second` runs `first` before it, as in the paper); a goal is
+ramped to and then held. Every ramp starts from the command of the moment, so that nothing jumps:
+
+    c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
+
+It starts and ends at rest, and all muscles arrive together. T_current is read once, when a method
+starts: read again and again, `second` would raise the tension without end.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import methods
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import LENGTH, Command
+from musculoskeletal_ae.control.feedback import depends_on_limit
+from musculoskeletal_ae.control.methods import Solution
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+# Share of a movement in which the command moves; the arm settles and is sampled in the rest.
+RAMP_SHARE = 0.6
+PEAK = 1.5  # fastest over mean speed of a ramp
+
+
+class Ramp:
+    """A smooth way from one command to another, both of shape (M,)."""
+
+    def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
+        """Plan to take `duration` [s], or longer so that no entry exceeds its rate limit [1/s]."""
+        self._start, self._goal, self._elapsed = start.copy(), goal, 0.0
+        farthest = float(np.abs(goal - start).max())
+        self.duration = max(duration, PEAK * farthest / rate_limit)
+
+    @property
+    def done(self) -> bool:
+        """Whether the goal is reached."""
+        return self._elapsed >= self.duration
+
+    def step(self, dt: float) -> Array:
+        """Return the command dt seconds on."""
+        self._elapsed += dt
+        u = 1.0 if self.done else self._elapsed / self.duration
+        return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
+
+
+class Goal(NamedTuple):
+    """A posture, and the method by which it becomes lengths.
+
+    Attributes:
+        method: `geometric`, `first`, `second`, or `proposed` as printed.
+        theta: θ_target [rad], (D,).
+        effort: Torque beyond holding the weight [N·m], (D,).
+        duration: How long it may take [s].
+        tension: T_const of `first` [N], (M,); None reads T_current when the goal begins.
+    """
+
+    method: str
+    theta: Array
+    effort: Array
+    duration: float
+    tension: Array | None = None
+
+
+class LengthRamps:
+    """Ramps to one goal after the other, and holds the last one.
+
+    Attributes:
+        solution: The command of the goal that is pursued or held, and what it is to bring.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.use(robot, settings)
+        self._goals: list[Goal] = []
+        self._goal: Goal | None = None  # that is pursued or held
+        self._remaining = 0.0  # [s] of its time
+        self._ramp: Ramp | None = None
+        self._command: Array = np.zeros(robot.muscle_count)
+        self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
+        self.solution: Solution | None = None
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
+        self._robot, self._settings = robot, settings
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time of the last goal has passed."""
+        return self._remaining <= 0.0 and not self._goals
+
+    def start_from(self, command: Array) -> None:
+        """Continue from a command [m] (M,), without a goal."""
+        self._command, self._ramp, self._goal = command.copy(), None, None
+        self._goals, self._remaining = [], 0.0
+        self.solution = None
+
+    def pursue(self, goals: list[Goal]) -> None:
+        """Pursue goals one after the other, in the place of all others."""
+        self._goals, self._remaining = list(goals), 0.0
+
+    def solve_again(self) -> None:
+        """Solve the goal that is held anew, as with another network, and ramp to it."""
+        if self._goal is None or self._goals or self.solution is None:
+            return
+        held = self._goal._replace(
+            duration=self._settings.second_duration, tension=self.solution.tension
+        )
+        self._goals = [held]
+        if self._ramp is not None and self._ramp.done:
+            self._remaining = 0.0
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command, or None while there is no goal."""
+        self._remaining -= inputs.dt
+        if (
+            self.solution is not None
+            and self._remaining <= 0.0
+            and depends_on_limit(self.solution.tension, self._limit, inputs.limit)
+        ):
+            self._limit = inputs.limit
+            self.solve_again()
+        if self._remaining <= 0.0 and self._goals:
+            self._begin(self._goals.pop(0), inputs)
+        if self._ramp is None:
+            return None
+        if not self._ramp.done:
+            self._command = self._ramp.step(inputs.dt)
+        return Command(LENGTH, self._command.copy())
+
+    def _begin(self, goal: Goal, inputs: Inputs) -> None:
+        tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._goal, self._limit = goal, inputs.limit
+        self.solution = None  # if the next line fails there is none
+        self.solution = self._solve(goal, inputs.mae, tension)
+        length = np.where(self._robot.used, self.solution.length, self._command)
+        rate_limit = self._settings.rate_limit
+        self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
+        self._remaining = max(goal.duration, self._ramp.duration)
+
+    def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
+        robot, nothing = self._robot, np.zeros(self._robot.joint_count)
+        if goal.method == 'geometric':
+            bias = np.full(robot.muscle_count, robot.tension.bias)
+            return Solution(methods.geometric_command(robot, goal.theta), bias, nothing)
+        if goal.method in ('first', 'second'):
+            tension = np.minimum(tension, self._limit)
+            length = methods.first_command(robot, mae, goal.theta, tension)
+            return Solution(length, tension, nothing)
+        torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
+        return methods.proposed_paper(robot, mae, goal.theta, torque, tension)
+
+
+class PaperMethods:
+    """The activity of holding a target by one of the paper's methods."""
+
+    def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
+        self.ramps = ramps
+        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        self.use(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Hold by these settings."""
+        self._robot, self._settings = robot, settings
+
+    def set_target(self, theta: Array, effort: Array) -> None:
+        """Go to a posture [rad] (D,) and exert a torque there [N·m] (D,)."""
+        self._target = theta, effort
+        self.ramps.pursue(self._goals())
+
+    def enter(self, inputs: Inputs) -> None:
+        """Begin from how the muscles pull now."""
+        self.ramps.start_from(inputs.length)
+        self.ramps.pursue(self._goals())
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command."""
+        return self.ramps.step(inputs)
+
+    def leave(self) -> None:
+        """End; the target stays, for the next time."""
+
+    def _goals(self) -> list[Goal]:
+        if self._target is None:
+            return []
+        chosen, limits = self._settings, self._robot.tension
+        constant = np.clip(chosen.constant_tension, limits.bias, limits.limit)
+        constant = np.full(self._robot.muscle_count, constant)
+        first = Goal('first', *self._target, chosen.first_duration, constant)
+        if chosen.method == 'first':
+            return [first]
+        if chosen.method == 'second':
+            return [first, Goal('second', *self._target, chosen.second_duration)]
+        return [Goal(chosen.method, *self._target, chosen.first_duration)]
