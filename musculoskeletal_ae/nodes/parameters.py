@@ -161,9 +161,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 #: executables that are several nodes in one process
 COMBINED = {'combined': ('estimator', 'controller')}
 
-#: old names of parameters, read for one version: by 0.3 they are gone
-RENAMED = {'marker_rate': 'marker_pose_rate'}
-
 #: what every node of rclpy has
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
@@ -175,7 +172,7 @@ def check_names(given: Iterable[str], node: str = '') -> None:
     another one has: a file is for all nodes.
     """
     own = COMBINED.get(node, (node,) if node else ())
-    every = [*RENAMED, *OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
+    every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
     for name in given:
         users = [user for user, table in PARAMETERS.items() if name in table]
         told = ''

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What result.json says of several individuals, and of parts that failed; what they share."""
 
-import io
 import json
 import os
 import shutil
 import signal
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -200,19 +198,3 @@ def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_p
         assert reading.read() == 'first'
     assert file.read_text() == 'second'
     assert len(list(part.folder.iterdir())) == len(PRESETS)
-
-
-def test_a_frozen_learner_that_fails_costs_its_own_number_only(arm26, tmp_path, monkeypatch):
-    archive, output = io.BytesIO(), robustness._output
-    zipfile.ZipFile(archive, 'w').close()  # it needs no commit at hand
-
-    def without_git(command, cwd=None):
-        return output(command, cwd) if cwd else archive.getvalue()
-
-    monkeypatch.setattr(robustness, '_output', without_git)
-    monkeypatch.setattr(robustness, 'FROZEN_RUN', "raise ValueError('unknown key')")
-    study = Study(arm26, 'default', (0,), 1.0, False, tmp_path)
-    errors, why = robustness._frozen(study, 0, [tmp_path, tmp_path])
-    assert errors == [None, None]
-    assert why.endswith('ended with ValueError: unknown key')
-    assert robustness.FROZEN in why
