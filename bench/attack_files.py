@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
+from robots import chain
 
 from bench import bag_samples, fuzz
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -97,16 +98,6 @@ def changed_numbers(text: str, rng: random.Random) -> str:
         ['nan', '-1', '1e300', '0', '', '0 0', '1 ' * 10_000, '\x9b1m', '1e-300', '-0.001 0 0']
     )
     return '"'.join(parts)
-
-
-def chain(links: int) -> str:
-    """Return a URDF of so many links, one below the other."""
-    joints = ''.join(
-        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
-        f'<child link="l{i + 1}"/></joint>'
-        for i in range(links)
-    )
-    return f'<robot name="r"><link name="l0"/>{joints}</robot>'
 
 
 # -- reading them ---------------------------------------------------------------------------------

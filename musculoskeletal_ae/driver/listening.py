@@ -28,8 +28,8 @@ TEMPERATURES = -20.0, 130.0  # [°C]
 BEYOND = 0.1, 1.0  # [m] that l may lie beyond what the routes allow, with and without known zeros
 BEYOND_JOINT = 0.3  # [rad]
 # How far the lengths of healthy arms are from the model's, as these see it, individuals 0–9 of both
-# shipped arms (`python -m bench driver_margins`): offset at most 42 mm, changes by 0.31 to 1.55 of
-# the model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
+# shipped arms (notes/removed_benches.md): offset at most 42 mm, changes by 0.31 to 1.55 of the
+# model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
 ZERO_TOLERANCE = 0.045  # [m]
 SLOPES = 0.2, 2.2
 MISPLACED = 0.012  # [m] by which l follows the model worse than another muscle's, and this …

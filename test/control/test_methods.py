@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from nominal_body import posture_table
 
-from bench.control_nominal import posture_table
 from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.exploration import holdable_postures

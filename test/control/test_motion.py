@@ -9,8 +9,8 @@ import pinocchio as pin
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
+from nominal_body import nominal_arm
 
-from bench.control_nominal import nominal_arm
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.controller import FED_BACK, Controller
 from musculoskeletal_ae.control.hand import Hand

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from nominal_body import stiffness_ratios
 from robots import write_robot
 
-from bench.control_nominal import stiffness_ratios
 from musculoskeletal_ae.control.methods import MARGINS, StiffnessModel, stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot

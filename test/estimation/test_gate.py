@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network takes over only if it explains the arm; the attacks are those of `bench/gate.py`."""
+"""A network takes over only if it explains the arm; attacks are those of `network_attacks`."""
 
 import re
 from collections import deque
@@ -8,9 +8,9 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from network_attacks import ATTACKS, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum, copy_robot
 
-from bench.gate import ATTACKS, ON_MESSAGES
 from musculoskeletal_ae.estimation.anomaly import DISTANCE
 from musculoskeletal_ae.estimation.gate import FLOOR, LIMITS, MOST_USED, NOTICED, PROOF, Gate
 from musculoskeletal_ae.exceptions import GateError

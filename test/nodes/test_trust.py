@@ -9,13 +9,13 @@ import pytest
 import rclpy
 from controlled_arm import ControlledArm
 from graph import LOOK
+from network_attacks import ATTACKS
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import Trigger
 
-from bench.gate import ATTACKS
 from musculoskeletal_ae.estimation import gate
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller

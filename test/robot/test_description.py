@@ -3,9 +3,8 @@ import re
 
 import numpy as np
 import pytest
-from robots import copy_robot, read_muscles, write_muscles, write_robot
+from robots import chain, copy_robot, read_muscles, write_muscles, write_robot
 
-from bench.attack_files import chain
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.robot.directories import shipped_robots

@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from bench import sim_pictures
-from bench.simulation_nominal import (
+from nominal_rest import (
     NOTICEABLE,
     nominal_rest,
     random_commands,
     responses,
     rest_errors,
 )
+
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.robot.robot import Robot
@@ -307,9 +306,3 @@ def test_a_network_that_cannot_be_simulated_leaves_the_one_in_use(arm26, mae):
         simulation.use(beyond)
     assert simulation.mae is mae
     np.testing.assert_array_equal(simulation.step(0.01).theta, expected.step(0.01).theta)
-
-
-def test_pictures_of_an_arm_at_rest_and_loaded_are_written(arm26, mae, tmp_path):
-    files = sim_pictures.save_both(arm26, mae, tmp_path / 'new')
-    assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
-    assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)
