@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a raw `muscle_states` message to numbers: the only place where that happens.
+
+    message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
+            ─► tendon friction ─► MuscleSample
+
+A message that fails a check raises a `RejectionError`, which names the reason, the value and the
+legal range. Nodes, bags, `check_driver` and experiments all use this class, and `signals/limits.py`
+has its limits. What isolated muscles read is never judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.friction import FrictionDirection, end_tension
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.limits import (
+    LENGTH,
+    LENGTH_JUMPED,
+    LIMITS,
+    TEMPERATURE,
+    TENSION,
+    Persistence,
+    longest_lengths,
+)
+from musculoskeletal_ae.validity import QUANTITIES, read_array
+
+
+class RejectionError(MessageError):
+    """A message that cannot be used.
+
+    Attributes:
+        reason: What it is counted under.
+        states: l, T and temperature as they were read, (3, M), where the message had that shape.
+    """
+
+    def __init__(self, reason: str, detail: str, states: Array | None = None) -> None:
+        super().__init__(reason, detail)
+        self.states = states
+
+
+@dataclass(frozen=True)
+class MuscleSample:
+    """One message of the muscle modules, ready for use. Arrays have the shape (M,).
+
+    Attributes:
+        time: When it came, by the clock of the caller [s].
+        length: l, with the length offset removed [m].
+        length_read: l as the sensor read it [m].
+        motor_tension: T at the motor [N].
+        bone_tension: T_end at the bone, with tendon friction removed [N].
+        sliding: Which way each tendon slid last: 1 wound in, −1 paid out.
+        temperature: Of the module's housing [°C]; NaN where it is unknown.
+        usable: Which muscles count; isolated ones do not.
+        newest: l (offset removed), T and temperature of the last message alone, before the median
+            against glitches, (3, M).
+        jumped: The one muscle whose length has settled at another level, or None.
+    """
+
+    time: float
+    length: Array
+    length_read: Array
+    motor_tension: Array
+    bone_tension: Array
+    sliding: Array
+    temperature: Array
+    usable: Bools
+    newest: Array
+    jumped: int | None = None
+
+
+class LevelCheck:
+    """Checks every value of a message against what a sound sensor can read."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        most, longest = robot.description.tension.max, longest_lengths(robot)
+        ones = np.ones_like(most)
+        #: lowest and highest l [m], T [N] and temperature [°C], (3, M)
+        self._low = np.array(
+            [-longest, LIMITS.lowest_tension * most, LIMITS.lowest_temperature * ones]
+        )
+        self._high = np.array(
+            [longest, LIMITS.highest_tension * most, LIMITS.highest_temperature * ones]
+        )
+        self._slack = LIMITS.slack_share * robot.description.tension.bias
+
+    def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
+        """Return the reason and the detail of the first impossible value, or None.
+
+        Args:
+            states: l [m], T [N] and temperature [°C] (3, M); NaN is not judged.
+            used: Which muscles are judged, (M,).
+            lengths_known: Whether l can be judged; not while the length offsets are unknown.
+        """
+        low = self._low.copy()
+        # A slack tendon, as of a ruptured muscle, can be wound in beyond any posture.
+        low[0] -= np.where(states[1] < self._slack, LIMITS.slack_length_margin, 0.0)
+        beyond = ((states < low) | (states > self._high)) & used
+        beyond[0] &= lengths_known
+        if not np.count_nonzero(beyond):
+            return None
+        quantity, muscle = np.argwhere(beyond)[0]
+        reason, unit = ((LENGTH, 'm'), (TENSION, 'N'), (TEMPERATURE, '°C'))[quantity]
+        value = states[quantity, muscle]
+        legal = f'{low[quantity, muscle]:.3g} to {self._high[quantity, muscle]:.3g} {unit}'
+        return reason, f'{self._robot.muscles[muscle]} {value:.3g} {unit}, possible {legal}'
+
+
+class StepCheck:
+    """Checks that no length changes faster than a muscle can; accepts a level that lasts."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._accepted: Array | None = None  # the last lengths that were believed [m], (M,)
+        self._last: Array = np.zeros(robot.muscle_count)  # the last lengths, believed or not
+        self._last_at, self._settled_since = -math.inf, math.inf
+        self._alone: int | None = None  # the only muscle that jumped, if it is one
+        self.jumped: int | None = None  # the same, once its new level is accepted
+
+    def problem(self, length: Array, used: Bools, now: float) -> tuple[str, str] | None:
+        """Return the reason and the detail if a length jumped, or None.
+
+        `jumped` names the muscle in the one message with which its new level is accepted.
+        """
+        self.jumped = None
+        elapsed = min(max(now - self._last_at, 0.0), LIMITS.longest_step)
+        allowed = LIMITS.step + LIMITS.speed * elapsed
+        last, self._last, self._last_at = self._last, length, now
+        if self._accepted is None:
+            self._accept(length)
+            return None
+        change = np.abs(length - self._accepted) * used
+        if change.max() <= allowed:
+            self._accept(length)
+            return None
+        if self._settled_since == math.inf:  # later, others may have moved as far
+            (far,) = np.nonzero(change > allowed)
+            self._alone = int(far[0]) if len(far) == 1 else None
+        if (np.abs(length - last) * used).max() > allowed:
+            self._settled_since = now
+        self._settled_since = min(self._settled_since, now)
+        if now - self._settled_since > LIMITS.settled:
+            self.jumped = self._alone
+            self._accept(length)
+            return None
+        muscle = int(change.argmax())
+        by = 1e3 * (length - self._accepted)[muscle]
+        return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {by:.0f} mm'
+
+    def _accept(self, length: Array) -> None:
+        self._accepted, self._settled_since = length, math.inf
+
+
+class MuscleStream:
+    """Turns the messages of one arm's muscle modules into samples."""
+
+    def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
+        """Expect messages of this robot.
+
+        Args:
+            robot: The nominal body.
+            body: Length offsets and isolated muscles; by default none.
+            window: How many messages the median against glitches spans; 1 leaves them as they are.
+        """
+        self._robot = robot
+        self.body = body or BodyState.healthy(robot.muscle_count)
+        self._friction: Array | float = 0.0
+        self._levels = LevelCheck(robot)
+        self._readings: deque[Array] = deque(maxlen=window)  # (3, M) each, l as it was read
+        self._implausible = Persistence()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what came before, as after a jump of the clock."""
+        self._steps = StepCheck(self._robot)
+        self._direction = FrictionDirection()
+        self._readings.clear()
+        self._time = math.inf
+
+    def use_friction(self, friction: Array | float) -> None:
+        """Remove this tendon friction μ, (M,), from now on."""
+        self._friction = friction
+
+    def use_body(self, body: BodyState) -> None:
+        """Go by another body state from now on."""
+        moved = body.offsets is not self.body.offsets
+        self.body = body
+        if moved:  # the same muscles, measured from other offsets
+            self._steps = StepCheck(self._robot)
+            self._direction = FrictionDirection()
+
+    def implausible(self, now: float) -> str:
+        """Return why messages have been implausible for longer than a glitch, or ''."""
+        return self._implausible.lasting(now)
+
+    def take(self, message: Any, time: float, now: float | None = None) -> MuscleSample:
+        """Take a Float64MultiArray message that came at `time` [s]; `now` is on a steady clock.
+
+        Raises:
+            RejectionError: If the message cannot be used.
+        """
+        muscle_count = self._robot.muscle_count
+        try:
+            states = read_array(message, len(QUANTITIES), muscle_count, self.body.isolated)
+        except MessageError as error:
+            raw = None
+            if len(message.data) == len(QUANTITIES) * muscle_count:
+                raw = np.reshape(np.array(message.data, dtype=float), (len(QUANTITIES), -1))
+            raise RejectionError(error.reason, str(error).partition(': ')[2], raw) from error
+        return self.take_states(states, time, now)
+
+    def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
+        """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s].
+
+        Raises:
+            RejectionError: If they are not plausible.
+        """
+        now = time if now is None else now
+        offsets = self.body.offsets
+        newest = states.copy()
+        newest[0] -= offsets.offset
+        problem = self._problem(newest, now)
+        self._implausible.note('' if problem is None else ': '.join(problem), now)
+        if problem is not None:
+            raise RejectionError(*problem, states)
+        if not 0.0 <= time - self._time <= LIMITS.pause:
+            self._direction.reset()
+        self._time = time
+        self._readings.append(states)
+        read = states if len(self._readings) == 1 else median_of_rows(np.array(self._readings))
+        length = read[0] - offsets.offset
+        sliding = self._direction.step(length)
+        return MuscleSample(
+            time=time,
+            length=length,
+            length_read=read[0],
+            motor_tension=read[1],
+            bone_tension=end_tension(self._friction, read[1], sliding),
+            sliding=sliding,
+            temperature=read[2],
+            usable=self.body.used,
+            newest=newest,
+            jumped=self._steps.jumped,
+        )
+
+    def _problem(self, states: Array, now: float) -> tuple[str, str] | None:
+        known = self.body.offsets.known
+        problem = self._levels.problem(states, self.body.used, known)
+        if problem is None and known:
+            problem = self._steps.problem(states[0], self.body.used, now)
+        return problem

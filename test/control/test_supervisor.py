@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm stops, and goes on, by one table."""
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from musculoskeletal_ae.control.stops import Clears, Condition, StopCause
+from musculoskeletal_ae.control.supervisor import (
+    RESUME,
+    TRANSITIONS,
+    Activity,
+    Event,
+    StopState,
+    Supervisor,
+)
+
+ANOMALY, OPERATOR = Condition(StopCause.ANOMALY), Condition(StopCause.OPERATOR)
+STALE = Condition(StopCause.STALE_MUSCLE_STATES)
+STEP = 0.01  # [s]
+
+
+def exploring():
+    supervisor = Supervisor()
+    supervisor.on_request(Activity.EXPLORING)
+    return supervisor
+
+
+def wait(supervisor, *present, seconds=2 * RESUME, released=False):
+    for _ in range(round(seconds / STEP)):
+        supervisor.on_conditions(present, STEP, released)
+
+
+def test_old_data_that_comes_back_before_the_release_only_pauses_the_arm():
+    supervisor = exploring()
+    wait(supervisor, STALE)
+    assert supervisor.mode == 'paused' and supervisor.condition == STALE
+    wait(supervisor)
+    assert supervisor.mode == 'exploring' and supervisor.condition is None
+
+
+def test_old_data_that_outlasts_the_hold_time_stops_the_arm_until_a_reset():
+    supervisor = exploring()
+    wait(supervisor, STALE)
+    wait(supervisor, STALE, released=True)
+    wait(supervisor, seconds=10.0)
+    assert supervisor.mode == 'stopped'
+    assert supervisor.on_reset([]) is None
+    assert supervisor.mode == 'holding'
+
+
+def test_a_reset_is_refused_with_the_cause_that_is_present():
+    supervisor = exploring()
+    wait(supervisor, ANOMALY)
+    assert supervisor.on_reset([ANOMALY]) == ANOMALY
+    assert supervisor.mode == 'stopped'
+
+
+def test_the_arm_explores_again_once_the_suspect_is_verified():
+    supervisor = exploring()
+    wait(supervisor, ANOMALY)
+    supervisor.on_suspect(True)
+    assert supervisor.mode == 'verifying'
+    supervisor.on_verified()
+    wait(supervisor, ANOMALY, seconds=STEP)  # still present: it does not move
+    assert not supervisor.is_running
+
+
+@pytest.mark.parametrize('cause', [c for c in StopCause if c.clears is Clears.RESET])
+def test_a_verification_does_not_end_a_stop_that_needs_a_reset(cause):
+    supervisor = exploring()
+    wait(supervisor, ANOMALY)
+    supervisor.on_suspect(True)
+    supervisor.on_event(cause)
+    supervisor.on_verified()
+    wait(supervisor, seconds=10.0)
+    assert supervisor.mode == 'stopped'
+
+
+def test_a_target_during_a_stop_is_held_after_it_and_exploration_does_not_come_back():
+    supervisor = exploring()
+    wait(supervisor, ANOMALY)
+    supervisor.on_suspect(True)
+    supervisor.on_request(Activity.HOLDING)
+    supervisor.on_verified()
+    wait(supervisor)
+    assert supervisor.mode == 'holding'
+
+
+def test_every_cause_has_an_identifier_a_text_and_a_remedy():
+    identifiers = [cause.identifier for cause in StopCause]
+    assert len(set(identifiers)) == len(identifiers)
+    assert all(cause.text and cause.remedy and cause.condition for cause in StopCause)
+
+
+class Arm(RuleBasedStateMachine):
+    """Random sequences of events; what must hold after every single one."""
+
+    def __init__(self):
+        super().__init__()
+        self.supervisor = Supervisor()
+        self.present = []
+        self.before = StopState.RUNNING
+        self.latched_by = set()  # latching causes since the stop began
+        self.may_start = True
+
+    @rule(activity=st.sampled_from(list(Activity)))
+    def request(self, activity):
+        self.before = self.supervisor.state
+        self.supervisor.on_request(activity)
+        self.may_start = False
+
+    @rule(causes=st.lists(st.sampled_from(list(StopCause)), max_size=3))
+    def conditions(self, causes):
+        self.present = [Condition(cause) for cause in causes]
+
+    @rule(released=st.booleans(), steps=st.integers(1, 40))
+    def time_passes(self, released, steps):
+        for _ in range(steps):
+            self.before = self.supervisor.state
+            self.note(self.present)
+            self.supervisor.on_conditions(self.present, STEP, released)
+            self.may_start = not self.present and self.before in (
+                StopState.PAUSED,
+                StopState.RESUMING,
+            )
+            self.check()
+
+    @rule(cause=st.sampled_from(list(StopCause)))
+    def event(self, cause):
+        self.before = self.supervisor.state
+        self.note([Condition(cause)])
+        self.supervisor.on_event(cause)
+        self.may_start = False
+
+    @rule(known=st.booleans())
+    def offsets(self, known):
+        self.before = self.supervisor.state
+        self.supervisor.on_offsets(known)
+        self.may_start = False
+
+    @rule(isolated=st.booleans())
+    def suspect(self, isolated):
+        self.before = self.supervisor.state
+        self.supervisor.on_suspect(isolated)
+        self.may_start = False
+
+    @rule()
+    def verified(self):
+        self.before = self.supervisor.state
+        self.supervisor.on_verified()
+        self.may_start = False
+
+    @rule()
+    def reset(self):
+        self.before = self.supervisor.state
+        refused = self.supervisor.on_reset(self.present)
+        assert (refused is None) == (not self.present)
+        self.may_start = not self.present
+
+    def note(self, conditions):
+        if self.supervisor.is_running:
+            self.latched_by.clear()
+        self.latched_by |= {c.cause for c in conditions if c.cause.clears is not Clears.CONDITION}
+
+    @invariant()
+    def check(self):
+        supervisor = self.supervisor
+        started = supervisor.is_running and self.before is not StopState.RUNNING
+        # A stop ends only where it may, and a latched one by a reset or a verification.
+        assert not started or self.may_start
+        if supervisor.state is StopState.RESUMING:
+            assert all(c.clears is Clears.VERIFICATION for c in self.latched_by)
+        # Every stop has one cause, with a remedy; a running arm has none.
+        assert (supervisor.condition is None) == supervisor.is_running
+        assert supervisor.is_running or supervisor.condition.cause.remedy
+        # A latched arm does not explore or move when it goes on, unless it is told to again.
+        assert not (supervisor.is_latched and supervisor.activity is Activity.MOVING)
+        assert not (supervisor.is_latched and supervisor.explores)
+
+
+TestArm = Arm.TestCase
+TestArm.settings = settings(max_examples=250, stateful_step_count=50, deadline=None)
+
+
+def test_the_table_names_every_state_and_event():
+    sources = {source for source, _ in TRANSITIONS}
+    assert sources == set(StopState) == {*TRANSITIONS.values()}
+    assert {event for _, event in TRANSITIONS} == set(Event)

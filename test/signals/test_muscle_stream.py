@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of a message of the muscle modules."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+
+ROBOT = Robot.load('arm26')
+M = ROBOT.muscle_count
+HEALTHY = BodyState.healthy(M)
+PERIOD = 0.01  # [s]
+
+
+def message(states):
+    layout = SimpleNamespace(dim=[], data_offset=0)
+    return SimpleNamespace(data=np.ravel(states).tolist(), layout=layout)
+
+
+def resting(**changes):
+    """Return sound l, T and temperature, with single values changed: length=(muscle, value)."""
+    states = np.stack([np.zeros(M), ROBOT.tension.bias, np.full(M, 30.0)])
+    for row, quantity in enumerate(('length', 'tension', 'temperature')):
+        if quantity in changes:
+            muscle, value = changes[quantity]
+            states[row, muscle] = value
+    return states
+
+
+def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
+    offset = np.linspace(-0.08, 0.08, M)
+    body = HEALTHY.with_offsets(LengthOffsets(offset, np.zeros(M)))
+    stream, states = MuscleStream(ROBOT, body), resting()
+    states[0] += offset
+    sample = stream.take(message(states), 1.5)
+    np.testing.assert_allclose(sample.length, 0.0, atol=1e-15)
+    np.testing.assert_allclose(sample.length_read, offset)
+    np.testing.assert_allclose(sample.motor_tension, ROBOT.tension.bias)
+    assert sample.time == 1.5 and sample.usable.all()
+
+
+@pytest.mark.parametrize(
+    ('states', 'reason'),
+    [
+        (resting()[:2], 'wrong length'),
+        (resting(length=(1, np.nan)), 'not finite'),
+        (resting(tension=(1, 2.0 * ROBOT.tension.max[1])), 'tension beyond the maximum'),
+        (resting(temperature=(0, 500.0)), 'impossible temperature'),
+        (
+            resting(length=(0, 1.01 * longest_lengths(ROBOT)[0]), tension=(0, 100.0)),
+            'length beyond what the joints allow',
+        ),
+    ],
+)
+def test_what_no_sound_sensor_reads_is_rejected_with_the_reason(states, reason):
+    with pytest.raises(RejectionError) as rejection:
+        MuscleStream(ROBOT).take(message(states), 0.0)
+    assert rejection.value.reason == reason
+
+
+def test_an_isolated_muscle_may_read_anything():
+    states = resting(length=(1, np.inf), tension=(1, 1e80), temperature=(1, 500.0))
+    sample = MuscleStream(ROBOT, HEALTHY.with_isolated([1])).take(message(states), 0.0)
+    assert not sample.usable[1] and np.isfinite(sample.motor_tension).all()
+
+
+def test_a_ruptured_muscle_may_be_wound_in_beyond_any_posture_but_not_without_end():
+    stream, shortest = MuscleStream(ROBOT), -longest_lengths(ROBOT)[0]
+    end = shortest - LIMITS.slack_length_margin
+    for n, length in enumerate(np.arange(0.0, end, -0.01)):
+        stream.take_states(resting(length=(0, length), tension=(0, 0.0)), n * PERIOD)
+    with pytest.raises(RejectionError, match='length beyond what the joints allow'):
+        stream.take_states(resting(length=(0, end - 0.01), tension=(0, 0.0)), (n + 1) * PERIOD)
+
+
+def test_lengths_are_not_judged_while_the_offsets_are_unknown():
+    body = HEALTHY.with_offsets(LengthOffsets.unknown(M))
+    stream = MuscleStream(ROBOT, body)
+    for n, length in enumerate((0.0, 5.0)):
+        stream.take_states(resting(length=(0, length)), n * PERIOD)
+
+
+def test_a_jump_of_one_length_is_rejected_until_it_has_lasted_and_names_its_muscle():
+    stream, jumped, rejected = MuscleStream(ROBOT), [], 0
+    for n in range(200):
+        try:
+            sample = stream.take_states(resting(length=(1, 0.08 * (n >= 20))), n * PERIOD)
+        except RejectionError as rejection:
+            rejected += rejection.reason == 'length jumped'
+        else:
+            jumped += [sample.jumped] * (sample.jumped is not None)
+    assert jumped == [1]
+    assert rejected * PERIOD == pytest.approx(LIMITS.settled, abs=0.05)
+
+
+def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():
+    stream = MuscleStream(ROBOT)
+    hot = resting(temperature=(0, 500.0))
+    for n in range(20):
+        with pytest.raises(RejectionError):
+            stream.take_states(hot, n * PERIOD)
+        lasts = n * PERIOD > LIMITS.glitch
+        assert bool(stream.implausible(n * PERIOD)) == lasts
+    stream.take_states(resting(), 20 * PERIOD)
+    assert stream.implausible(20 * PERIOD) == ''
+
+
+def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
+    stream = MuscleStream(ROBOT, window=3)
+    tension = ROBOT.tension.bias[0]
+    for n, spike in enumerate((0.0, 0.0, 60.0, 0.0)):
+        sample = stream.take_states(resting(tension=(0, tension + spike)), n * PERIOD)
+        assert sample.motor_tension[0] == pytest.approx(tension)
+        assert sample.newest[1, 0] == pytest.approx(tension + spike)
+
+
+def test_tendon_friction_is_removed_by_the_direction_of_sliding():
+    stream = MuscleStream(ROBOT)
+    stream.use_friction(np.full(M, 0.1))
+    for n in range(100):  # every tendon is wound in: the motor pulls more than the bone feels
+        states = resting()
+        states[0] -= 1e-4 * n
+        sample = stream.take_states(states, n * PERIOD)
+    np.testing.assert_allclose(sample.sliding, 1.0, atol=1e-3)
+    np.testing.assert_allclose(sample.bone_tension, np.exp(-0.1) * ROBOT.tension.bias, rtol=1e-3)
+
+
+def test_samples_and_body_states_cannot_be_changed():
+    sample = MuscleStream(ROBOT).take_states(resting(), 0.0)
+    for value, name in ((sample, 'length'), (HEALTHY, 'isolated')):
+        with pytest.raises(AttributeError):
+            setattr(value, name, None)
+
+
+@given(st.sets(st.integers(0, M - 1)), st.sets(st.integers(0, M - 1)))
+def test_a_body_state_counts_its_changes(first, second):
+    body = HEALTHY.with_isolated(first)
+    after = body.with_isolated(second)
+    assert after.version - body.version == (first != second)
+    assert np.flatnonzero(~after.used).tolist() == sorted(second)
