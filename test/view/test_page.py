@@ -59,8 +59,7 @@ def view(graph):
         command = [*executable('view'), '--robot', 'arm26', '--port', str(port), *options]
         process = Process('view', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
         graph.processes.append(process)
-        lines = iter(process.process.stdout.readline, '')
-        assert any(line.startswith(f'http://localhost:{port}') for line in lines)
+        process.wait_for_output(f'http://localhost:{port}')
         return port
 
     return start
