@@ -188,7 +188,9 @@ class Graph:
                 status, output = dead[0].end()
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
-                raise AssertionError(f'waited {deadline:g} s in vain for {what}; {self._last_diagnostics()}')
+                raise AssertionError(
+                    f'waited {deadline:g} s in vain for {what}; {self._last_diagnostics()}'
+                )
             self.executor.look(LOOK)
         return value
 
