@@ -75,7 +75,7 @@ class Watched(Motors):
         self.core.step(self.pulled, length, self.now, self.now, self.read)
 
 
-def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
+def test_a_step_of_any_length_solves_the_thermal_model():
     state = Heat(ROBOT)._state
     state[0], state[1] = 10.0, 50.0
     kappa, tau, slow = np.exp(state[2:5])
@@ -92,7 +92,7 @@ def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_after_twenty_minutes_the_winding_is_known(seed):
+def test_the_winding_temperature_is_estimated_after_twenty_minutes(seed):
     motors = Motors(seed)
     first = motors.run(300)
     motors.run(900)
@@ -104,7 +104,7 @@ def test_after_twenty_minutes_the_winding_is_known(seed):
     assert motors.heat.changed == {}
 
 
-def test_what_is_held_at_the_limit_reaches_the_highest_temperature_and_no_more():
+def test_a_muscle_held_at_its_limit_reaches_the_highest_temperature_and_no_more():
     motors = Motors()
     motors.run(1200)
     held = motors.run(1800, lambda: motors.heat.limits(HIGHEST)[0])
@@ -119,7 +119,7 @@ def test_what_is_held_at_the_limit_reaches_the_highest_temperature_and_no_more()
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
 
 
-def test_cool_muscles_are_not_limited_and_a_moment_allows_more_than_long():
+def test_cool_muscles_are_not_limited_and_short_pulls_may_be_stronger_than_long_ones():
     motors = Motors()
     motors.run(10, TENSION.bias)
     long, moment = motors.heat.limits(HIGHEST)
@@ -132,7 +132,7 @@ def test_cool_muscles_are_not_limited_and_a_moment_allows_more_than_long():
 
 
 @pytest.mark.parametrize('constant', ['loss', 'housing_resistance'])
-def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained, constant):
+def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, constant):
     motors = Watched(trained['default'], seed=1)
     motors.run(1.2 * LEARNED)
     assert motors.heat.changed == {}
@@ -148,7 +148,7 @@ def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained,
     assert motors.core.cause == ''
 
 
-def test_a_cool_muscle_is_named_but_not_stopped_for_it(trained):
+def test_an_anomaly_of_a_cool_muscle_is_reported_without_a_stop(trained):
     motors = Watched(trained['default'], seed=1, most=0.6 * TENSION.limit)
     motors.run(1.2 * LEARNED)
     motors.wound.loss[2] *= 2.2
@@ -162,7 +162,7 @@ def test_a_cool_muscle_is_named_but_not_stopped_for_it(trained):
     assert motors.core.cause.startswith(how)
 
 
-def test_hours_of_health_change_no_constant():
+def test_hours_of_healthy_work_are_no_anomaly():
     motors = Motors(5, hold=60)
     motors.run(3600)
     motors.run(1800, TENSION.bias)
@@ -171,7 +171,7 @@ def test_hours_of_health_change_no_constant():
 
 
 @pytest.mark.parametrize('most', [1.0, 1.3])
-def test_a_minute_of_which_nothing_is_known_changes_no_constant(most):
+def test_a_gap_of_a_minute_in_the_messages_is_no_anomaly(most):
     motors = Motors(3, most=most * TENSION.limit)
     motors.run(1500)
     arm = motors.arm
@@ -183,7 +183,7 @@ def test_a_minute_of_which_nothing_is_known_changes_no_constant(most):
         assert motors.heat.changed == {}
 
 
-def test_an_unknown_temperature_limits_nothing_and_comes_back():
+def test_an_unknown_temperature_limits_no_tension_until_it_is_known():
     heat, pull = Heat(ROBOT), TENSION.limit
     known = np.full(COUNT, 84.9)
     unknown = np.where(np.arange(COUNT) == 1, -np.inf, known)
@@ -194,7 +194,7 @@ def test_an_unknown_temperature_limits_nothing_and_comes_back():
         np.testing.assert_array_equal(free, ~np.isfinite(read))
 
 
-def test_a_thermometer_that_comes_and_goes_leaves_all_other_windings_watched():
+def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
     sound, flaky = Motors(seed=3), Motors(seed=3)
     read = np.full((2, COUNT), AIR + 5.0)
     for n in range(1200):

@@ -6,7 +6,7 @@ from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.mae import checkpoint
 
 
-def test_the_windings_of_an_emulated_arm_are_known_within_a_few_degrees(
+def test_winding_temperatures_of_an_emulated_arm_are_estimated_within_5_k(
     arm26, trained, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(heat, 'HELD', 8.0)

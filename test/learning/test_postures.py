@@ -10,7 +10,7 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.learning.body import PRIOR, CorrectedBody, fit_body
+from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 from musculoskeletal_ae.learning.postures import Bent, _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
@@ -73,7 +73,7 @@ def test_postures_are_found_from_the_muscles_alone(arm26, seen):
     assert after < before / 3.0
 
 
-def test_a_fit_goes_on_until_it_would_not_move(arm26, seen):
+def test_a_fit_is_run_until_it_has_converged(arm26, seen):
     body, rng = CorrectedBody(arm26), np.random.default_rng(1)
     guess = seen.theta + rng.normal(0.0, 0.3, seen.theta.shape)
     first = fit_body(body, blind(seen), guess=guess).theta
@@ -83,7 +83,7 @@ def test_a_fit_goes_on_until_it_would_not_move(arm26, seen):
 
 @pytest.mark.parametrize('other', [False, True], ids=['arm26', 'other'])
 @pytest.mark.parametrize('scale', [0.3, 1.0])
-def test_without_any_anchor_learning_is_better_than_not_learning(arm26, tmp_path, other, scale):
+def test_learning_without_joint_angles_improves_the_estimate(arm26, tmp_path, other, scale):
     robot = Robot.load(write_robot(tmp_path / 'other')) if other else arm26
     resting = Resting(drawn_body(robot, 7, seed=2, scale=scale), seed=9)
     seen, test = resting.observations(40), resting.observations(40)
@@ -97,7 +97,7 @@ def test_without_any_anchor_learning_is_better_than_not_learning(arm26, tmp_path
     assert off[0] < off[1]
 
 
-def test_each_anchor_brings_them_nearer(arm26, seen):
+def test_each_additional_sensor_improves_the_postures(arm26, seen):
     truth, rng = seen.theta, np.random.default_rng(2)
     _, nothing = errors(arm26, blind(seen), truth)
     sighted = blind(seen)
@@ -116,7 +116,7 @@ def test_each_anchor_brings_them_nearer(arm26, seen):
     assert errors(arm26, tilted, truth)[1] < nothing
 
 
-def test_the_zero_of_a_joint_sensor_is_no_error_of_the_body(arm26, seen):
+def test_a_joint_sensor_offset_is_not_taken_for_an_error_of_the_body(arm26, seen):
     off = replace(seen, theta=seen.theta + [0.03, 0.0])
     found = fit_body(CorrectedBody(arm26), off).theta
     left = np.abs(found - seen.theta).mean(axis=0)
@@ -124,12 +124,12 @@ def test_the_zero_of_a_joint_sensor_is_no_error_of_the_body(arm26, seen):
     assert left[1] < 0.01
 
 
-def test_angles_that_are_read_stay_where_they_are_read(arm26, seen):
+def test_measured_joint_angles_stay_where_they_were_measured(arm26, seen):
     found = fit_body(CorrectedBody(arm26), seen).theta
     assert np.abs(found - seen.theta).max() < 0.03
 
 
-def test_positions_of_what_slides_stay_where_they_are_read(tmp_path):
+def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(tmp_path):
     robot, off = Robot.load(write_robot(tmp_path, slider=True)), []
     for seed in range(4):
         seen = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
@@ -138,7 +138,7 @@ def test_positions_of_what_slides_stay_where_they_are_read(tmp_path):
     assert np.abs(off).mean() < 4e-4
 
 
-def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
+def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting, seen):
     part = seen[np.arange(8)]
     body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
     joints, muscles = np.arange(2), np.arange(6)
@@ -163,22 +163,7 @@ def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
         column += layout.size
 
 
-def test_a_joint_leans_on_a_stop_while_it_is_near_and_pushed(arm26, seen):
-    part, body, upper = blind(seen[np.arange(8)]), CorrectedBody(arm26), arm26.upper
-    means, spreads = zip(*((PRIOR.mean(o), PRIOR.spread(o)) for o in body.layouts))
-    prior, bent = ([*means], [*spreads], 3e-4), Bent.unknown(8, 2)
-    fit = _GroupFit(body, part, np.arange(2), np.arange(6), *prior, bent)
-    theta = np.tile(0.5 * (arm26.lower + upper), (8, 1))
-    theta[:2, 1] = upper[1] - [0.02, 0.1]
-    rows = fit.rows(theta, np.zeros(2))
-    for pushed, leaning in ((10.0, [0]), (0.1, [])):
-        torque = np.full_like(rows.torque, 0.1)
-        torque[:2, 1] = pushed
-        fit.weigh(rows._replace(torque=torque), theta, np.zeros(6))
-        assert np.flatnonzero(fit._stops(theta)[1][:, 1]).tolist() == leaning
-
-
-def test_where_no_sensor_reads_a_joint_the_ellipsoid_holds_what_errs_alike_in_all_samples(arm26):
+def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26):
     inside = []
     for seed in (0, 2, 4):  # bodies that are found worst
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)

@@ -63,7 +63,7 @@ def test_loss_has_a_finite_gradient_where_nothing_is_wrong():
     assert gradients and all(torch.isfinite(g).all() for g in gradients)
 
 
-def test_samples_are_the_geometric_model_to_a_little_beyond_its_limits(robot):
+def test_training_samples_cover_the_geometric_model_slightly_beyond_its_limits(robot):
     theta, tension, length = overload_states(robot, 2000, np.random.default_rng(0))
     margin = POSTURE_MARGIN * (robot.upper - robot.lower)
     assert (theta >= robot.lower - margin).all() and (theta <= robot.upper + margin).all()

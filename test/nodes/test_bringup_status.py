@@ -2,7 +2,6 @@
 """What the status line says, and the screen that takes its place on a terminal."""
 
 import io
-import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,7 @@ from graph import no_number_of
 
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.bringup_status import muscle_table, open_screen
-from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.situation import Situation
 
 
 def said(
@@ -23,7 +22,7 @@ def said(
     return DiagnosticArray(status=[status])
 
 
-def test_before_the_first_sample_it_says_why_the_error_may_rise():
+def test_the_status_explains_before_the_first_sample_why_the_error_may_rise():
     told = Situation('/left')
     assert told.hint() == ''  # nobody learns
     told.diagnosed(said('/left/learner', samples='0'))
@@ -32,14 +31,7 @@ def test_before_the_first_sample_it_says_why_the_error_may_rise():
     assert told.hint() == '' and (told.samples, told.checkpoints) == ('3', '2')
 
 
-def test_what_is_not_known_is_said_to_be_waited_for():
-    assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
-    assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
-    none = figures(True, math.nan, math.nan)
-    assert none == 'error waits for estimated_joint_states  A waits for anomaly'
-
-
-def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
+def test_the_status_line_shows_errors_only_with_fresh_joint_states(graph, capsys):
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     node.anomalies.append(0.5)
     node._measured(np.zeros(2))
@@ -52,7 +44,7 @@ def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
     assert 'error waits for joint_states' in capsys.readouterr().out
 
 
-def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
+def test_trouble_of_this_arm_only_is_shown_with_its_remedies():
     told = Situation('/left')
     told.diagnosed(said('/right/controller', 'stopped: by request'))
     assert told.trouble() == ''
@@ -73,7 +65,7 @@ def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
     assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
 
 
-def test_a_suspect_that_is_verified_is_not_to_be_mended_yet():
+def test_no_remedy_is_shown_during_a_verification():
     told, anomaly = Situation('/left'), 'anomaly_detected; call estimator/reset when it is mended'
     told.diagnosed(said('/left/controller', f'stopped: {anomaly}'))
     cause = 'anomaly detected: biceps: d 12.5 above 9.0'
@@ -89,7 +81,7 @@ def test_a_suspect_that_is_verified_is_not_to_be_mended_yet():
     assert 'mend it' in told.trouble()
 
 
-def test_an_error_of_any_node_is_told_until_it_is_over():
+def test_an_error_of_any_node_is_shown_until_it_is_over():
     error = DiagnosticStatus.ERROR
     alone = Situation('/')
     alone.diagnosed(said('/right/learner', 'the disk is full', error))
