@@ -218,7 +218,7 @@ class Graph:
             for m in messages
             for s in m.status
         }
-        return '\n'.join(f'{name}: {said}' for name, said in last.items())
+        return '\n'.join(f'{name}: {reported}' for name, reported in last.items())
 
     def call(self, kind: type, service: str, request: Any = None) -> Any:
         """Call a service and return its response."""

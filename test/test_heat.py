@@ -51,11 +51,11 @@ class Motors:
             arm._muscle.tension[:] = self.pulled
             warm(self.wound, arm._muscle, arm._command, round(1.0 / modules.STEP))
             self.read = arm._muscle.housing + self.rng.normal(0.0, 0.1, COUNT)
-            self.told()
+            self.hand_on()
             self.errors.append(self.heat.core - arm.winding)
         return np.abs(self.errors[-round(seconds) :])
 
-    def told(self):
+    def hand_on(self):
         """Hand on what was read."""
         self.heat.step(self.pulled, self.read, 1.0)
 
@@ -69,7 +69,7 @@ class Watched(Motors):
         self.core.use(mae)
         self.heat = self.core.heat
 
-    def told(self):
+    def hand_on(self):
         length = ROBOT.muscle_lengths(POSTURE, self.pulled)
         self.now += 1.0
         self.core.step(self.pulled, length, self.now, self.now, self.read)
@@ -154,10 +154,10 @@ def test_an_anomaly_of_a_cool_muscle_is_reported_without_a_stop(trained):
     motors.wound.loss[2] *= 2.2
     motors.run(600)
     assert motors.core.cause == ''
-    said, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
-    assert said.level == 'warn'
-    assert said.message.startswith(f'anomaly of a cool muscle: {how}')
-    assert said.values['suspect muscle'] == ROBOT.muscles[2]
+    reported, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
+    assert reported.level == 'warn'
+    assert reported.message.startswith(f'anomaly of a cool muscle: {how}')
+    assert reported.values['suspect muscle'] == ROBOT.muscles[2]
     motors.run(120, TENSION.limit)
     assert motors.core.cause.startswith(how)
 
@@ -203,8 +203,8 @@ def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
             heat.step(1.2 * TENSION.limit, here, 0.25)
     others = np.arange(COUNT) != 1
     np.testing.assert_allclose(flaky.heat.core[others], sound.heat.core[others], atol=0.1)
-    for known, seen in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
-        np.testing.assert_allclose(seen[others], known[others], atol=0.5)
+    for known, observed in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
+        np.testing.assert_allclose(observed[others], known[others], atol=0.5)
     # Its own winding warms all the same, as far as is known.
     flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
     assert flaky.heat.core[1] > AIR + 40.0

@@ -221,15 +221,15 @@ def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
 
 def test_exploration_started_again_continues_its_stream_of_postures():
     bench = Bench()
-    seen = []
+    observed = []
     for _ in range(3):
         bench.core.explore(True)
         bench.core.explore(True)  # asking twice starts nothing anew
         bench.step(5)
-        seen.append(bench.core.posture.theta)
+        observed.append(bench.core.posture.theta)
         bench.core.explore(False)
         bench.step(5)
-    assert len({tuple(theta) for theta in seen}) == 3
+    assert len({tuple(theta) for theta in observed}) == 3
 
 
 @pytest.mark.parametrize(('preset', 'sends'), [('default', True), ('paper', False)])
@@ -273,9 +273,9 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     limit = core.watch.limit[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
-    said = status.report(core, 12.0)
-    assert said.level == 'warn'
-    assert robot.muscles[strongest] in said.values['tension limited by heat']
+    reported = status.report(core, 12.0)
+    assert reported.level == 'warn'
+    assert robot.muscles[strongest] in reported.values['tension limited by heat']
 
 
 def test_rest_feedback_is_bounded_and_begins_only_at_rest():

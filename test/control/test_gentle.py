@@ -58,12 +58,12 @@ def test_a_target_waits_until_the_length_offsets_are_known(loop):
 def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_tension(loop):
     loop.offset[:] = [0.1, -0.13, 0.08, -0.06, 0.12, 0.05]
     loop.core.explore(True)
-    seen = []
+    observed = []
     for _ in range(200):
         loop.run(0.1)
-        seen.append(loop.arm.theta)
+        observed.append(loop.arm.theta)
     assert not loop.core.safety.cause
-    assert np.ptp(seen, axis=0).min() > 0.3
+    assert np.ptp(observed, axis=0).min() > 0.3
     speed = np.abs(np.diff(loop.commands, axis=0)) / DT
     # What is faster pays out, so that no tension passes its limit.
     assert np.quantile(speed, 0.99) < 1.2 * SPEED
@@ -73,10 +73,10 @@ def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_te
 def test_new_length_offsets_do_not_move_the_arm(loop):
     loop.core.explore(True)
     loop.run(1.0)
-    less = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
+    reduced = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
     before = loop.commands[-1]
-    loop.offset = loop.offset - less
-    loop.core.zeros(True, less)
+    loop.offset = loop.offset - reduced
+    loop.core.zeros(True, reduced)
     # An estimate may come before the next lengths.
     assert np.abs(loop.core.step(loop.now).value - loop.offset - before).max() < 0.002
     loop.run(DT)

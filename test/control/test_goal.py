@@ -50,8 +50,8 @@ class Followed:
 
 def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
     followed = Followed(path=TIGHT, goal=TIGHT)
-    (code, told), steps = followed.run()
-    assert (code, told) == (SUCCESSFUL, '')
+    (code, reported), steps = followed.run()
+    assert (code, reported) == (SUCCESSFUL, '')
     duration = followed.bench.core.motion.trajectory.duration
     assert 100.0 * duration - 1.5 <= steps <= 100.0 * duration + 5.0
 
@@ -64,9 +64,9 @@ def test_a_goal_in_the_future_is_waited_for():
 
 
 def test_an_arm_that_does_not_follow_violates_the_path_tolerance_and_the_joint_is_named():
-    (code, told), steps = Followed(path=TIGHT).run(moves=False)
+    (code, reported), steps = Followed(path=TIGHT).run(moves=False)
     assert code == BEYOND_PATH
-    assert ROBOT.joints[0] in told
+    assert ROBOT.joints[0] in reported
     assert steps < 100
 
 
@@ -106,9 +106,9 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
         core.stop('asked')
     else:
         followed.bench.configure(method='tension')
-    (code, told), steps = followed.run()
+    (code, reported), steps = followed.run()
     assert (code, steps) == (INVALID, 0)
-    assert ('stopped: asked' if event == 'stop' else 'replaced') in told
+    assert ('stopped: asked' if event == 'stop' else 'replaced') in reported
 
 
 def test_tolerances_of_unknown_joints_or_not_finite_are_refused_and_zero_means_no_bound():

@@ -183,8 +183,8 @@ def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     bench.target(THERE)
     for _ in range(150):
         bench.step(100)
-    told = lacking(ROBOT_WITHOUT, bench.mae, NOT_THERE)
-    assert told and f'the muscles lack {told}; lift it by hand' in bench.report().message
+    reported = lacking(ROBOT_WITHOUT, bench.mae, NOT_THERE)
+    assert reported and f'the muscles lack {reported}; lift it by hand' in bench.report().message
 
 
 def test_a_path_avoids_postures_that_cannot_be_held():
@@ -219,9 +219,9 @@ def sliding(tmp_path_factory):
 
 def test_a_prismatic_joint_without_muscles_lacks_force_in_newtons(sliding):
     robot, postures, force = sliding
-    told = [lacking(robot, ExactMae(robot), theta) for theta in postures]
+    reported = [lacking(robot, ExactMae(robot), theta) for theta in postures]
     notable = reach.NOTABLE / RACK
-    assert told == [f'{f:.2f} N at wrist' if f > notable else '' for f in np.abs(force)]
+    assert reported == [f'{f:.2f} N at wrist' if f > notable else '' for f in np.abs(force)]
     assert 0 < np.sum(np.abs(force) > notable) < len(force)
 
 

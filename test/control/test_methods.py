@@ -98,11 +98,11 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
     solution = methods.proposed_paper(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
-    less = copy.copy(robot)
-    less.isolate((2, 4))
-    *_, balance = methods.paper_terms(less, mae, theta, torque, tension)
+    reduced = copy.copy(robot)
+    reduced.isolate((2, 4))
+    *_, balance = methods.paper_terms(reduced, mae, theta, torque, tension)
     pulls = balance.matrix[:, robot.joint_count :][:, : robot.muscle_count]
-    np.testing.assert_array_equal(np.abs(pulls).max(axis=0) > 0.0, less.used)
+    np.testing.assert_array_equal(np.abs(pulls).max(axis=0) > 0.0, reduced.used)
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -140,11 +140,11 @@ def test_a_curve_whose_values_overflow_is_refused():
 def test_a_refusal_for_a_prismatic_joint_is_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
-    for off, told in ((0.001, None), (0.01, 'wrist by 0.01 m')):
+    for off, reported in ((0.001, None), (0.01, 'wrist by 0.01 m')):
         end = np.append(start[:3], robot.upper[3] + off)
         points = Points(np.arange(4), np.ones(1), end[None], still, None)
         trajectory = Trajectory.through(Setpoint.resting(start), points)
-        with pytest.raises(MessageError, match=told) if told else nullcontext():
+        with pytest.raises(MessageError, match=reported) if reported else nullcontext():
             trajectory.check(robot)
 
 

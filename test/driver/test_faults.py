@@ -75,8 +75,8 @@ def test_a_sound_driver_is_found_sound(seed):
         assert not verdict.faults, str(verdict)
     verdict = settled(seed).wind()
     assert not verdict.faults, str(verdict)
-    told = str(verdict).splitlines()
-    for name, line in zip(ROBOT.muscles, told[1:]):
+    reported = str(verdict).splitlines()
+    for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)
         assert line.count('ok') == 4 and 'WRONG' not in line  # all but rate, order, zero, clip
 
@@ -106,12 +106,12 @@ HEARD = {
 
 @pytest.mark.parametrize('name', HEARD)
 def test_a_fault_is_found_by_listening(name):
-    publish, how, check, told = HEARD[name]
+    publish, how, check, reported = HEARD[name]
     driver = Driver(ROBOT)
     driver.publish = publish
     verdict = driver.listen(8.0 if how == 'moved' else 5.0, moved=how == 'moved')
     assert verdict.wrong == {check}, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)
 
 
 def test_unknown_length_offsets_are_no_fault_if_the_user_says_so():
@@ -242,13 +242,13 @@ WOUND = {
 
 @pytest.mark.parametrize('name', WOUND)
 def test_a_fault_is_found_by_winding_in(name):
-    changes, check, told = WOUND[name]
+    changes, check, reported = WOUND[name]
     driver = settled()
     for attribute, value in changes.items():
         setattr(driver, attribute, value)
     verdict = driver.wind((0, BICEPS))
     assert check in verdict.wrong, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
@@ -312,15 +312,15 @@ def test_a_sound_driver_is_found_sound_above_the_tension_limit():
 
 
 @pytest.mark.parametrize(
-    ('robot', 'highest', 'told'),
+    ('robot', 'highest', 'reported'),
     [
         (ROBOT, 35.0, 'is asked for 50 N at least to be judged, not 35 N'),
         (with_tension(35.0, 45.0), None, 'its tension.max is 45 N: it is not wound'),
         (with_tension(35.0, 45.0), 60.0, 'its tension.max is 45 N: it is not wound'),
     ],
 )
-def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, told):
-    with pytest.raises(MusculoskeletalError, match=told):
+def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reported):
+    with pytest.raises(MusculoskeletalError, match=reported):
         Winding(Verdict(robot), (1,), highest)
 
 
@@ -354,7 +354,7 @@ def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
 
 
 @pytest.mark.parametrize(
-    ('fault', 'checks', 'told'),
+    ('fault', 'checks', 'reported'),
     [
         ('drop:0.4', {'rate'}, 'rate of all muscles'),
         ('delay:0.2', {'latency'}, 'latency of biceps_long'),
@@ -366,9 +366,9 @@ def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
         ('stuck_motor:biceps_long', {'law'}, 'does not respond'),
     ],
 )
-def test_faults_of_the_emulated_arm_are_found(fault, checks, told):
+def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
     driver = settled()
     driver.arm.faults.set([fault])
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)

@@ -191,10 +191,10 @@ def test_reset_brings_the_arm_back_to_rest(robot, reality):
 
 def test_the_marker_is_seen_where_the_hand_is(robot, reality):
     arm = make_arm(robot, 0, reality)
-    seen = np.array([arm.marker_pose().translation for _ in range(200)])
+    observed = np.array([arm.marker_pose().translation for _ in range(200)])
     true = robot.kinematics.end_effector_pose(arm.theta).translation
-    np.testing.assert_allclose(seen.mean(axis=0), true, atol=1e-3)
-    assert 5e-4 < seen.std(axis=0).max() < 1e-2
+    np.testing.assert_allclose(observed.mean(axis=0), true, atol=1e-3)
+    assert 5e-4 < observed.std(axis=0).max() < 1e-2
 
 
 @pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])

@@ -255,22 +255,23 @@ def test_a_model_with_other_lengths_is_reported_by_muscle_and_millimetres(import
 
 
 @pytest.mark.parametrize(
-    ('given', 'told'),
+    ('given', 'reported'),
     [('range="-1.5 0.2" limited="true"', '-1.5 to 0.2'), ('limited="false"', '-inf to inf')],
 )
-def test_a_model_with_other_joint_limits_is_reported(imported, tmp_path, given, told):
+def test_a_model_with_other_joint_limits_is_reported(imported, tmp_path, given, reported):
     other = tmp_path / 'other.xml'
     text = bodies.MJCF.replace('range="-1.8 0.2" limited="true"', given)
     other.write_text(text, encoding='utf-8')
     (warning,) = make_arm(imported[1], 0, str(other)).warnings
     assert (
-        f"joint 'elbow' moves from {told} there, in {imported[1].description.directory}" in warning
+        f"joint 'elbow' moves from {reported} there, in {imported[1].description.directory}"
+        in warning
     )
     assert 'from -1.8 to 0.2' in warning
 
 
 @pytest.mark.parametrize(
-    ('old', 'new', 'told'),
+    ('old', 'new', 'reported'),
     [
         ('name="swing"', 'name="swung"', "joint 'swing'"),
         ('name="front"', 'name="ahead"', "tendon 'front'"),
@@ -283,11 +284,11 @@ def test_a_model_with_other_joint_limits_is_reported(imported, tmp_path, given, 
         ),
     ],
 )
-def test_a_model_that_does_not_fit_the_robot_is_refused(imported, tmp_path, old, new, told):
+def test_a_model_that_does_not_fit_the_robot_is_refused(imported, tmp_path, old, new, reported):
     other = tmp_path / 'other.xml'
     text = bodies.MJCF.replace(old, new, 1).replace(f'tendon="{old[6:-1]}"', 'tendon="ahead"')
     other.write_text(text, encoding='utf-8')
-    with pytest.raises(MusculoskeletalError, match=told):
+    with pytest.raises(MusculoskeletalError, match=reported):
         make_arm(imported[1], 0, str(other))
 
 

@@ -174,12 +174,12 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, wound, k
     detector.use(mae)
     theta, tension = np.array([0.1, -1.0]), np.where(np.arange(6) == 3, 100.0, 60.0)
     state = State(theta, tension, mae.lengths(theta, tension))
-    told = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
+    reported = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
     for n in range(300):
         length = state.length + 1e-4 * rng.standard_normal(6)
         length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
-        told[0] = 140.0 if n < 200 else 60.0
-        command = {'length': length - (told - 30.0) / 1e4, 'tension': told}
+        reported[0] = 140.0 if n < 200 else 60.0
+        command = {'length': length - (reported - 30.0) / 1e4, 'tension': reported}
         detector.commanded(**{kind: command[kind]})
         verdict = detector.step(state, tension, tension, length, 0.01)
         named += [(n, verdict.suspect)] * ('its winch stands' in verdict.cause)

@@ -83,8 +83,8 @@ def test_a_network_with_singular_statistics_is_refused_and_the_one_in_use_stays(
 def test_an_anomaly_is_detected_once_and_latched_with_its_first_suspect(
     stepped, robot, healthy, wound
 ):
-    told = [estimate.detected for estimate in stepped.step(wound, 10)]
-    assert told.index(True) == 4 and sum(told) == 1
+    reported = [estimate.detected for estimate in stepped.step(wound, 10)]
+    assert reported.index(True) == 4 and sum(reported) == 1
     suspect = robot.muscles[1]
     assert stepped.core.cause.startswith(f'{suspect}: ')
     stepped.step(healthy, 10)
@@ -151,8 +151,8 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
 def test_a_marker_pose_gives_the_joint_angles_that_reach_it(stepped, robot, healthy):
     stepped.step(healthy)
     theta = robot.lower + 0.4 * (robot.upper - robot.lower)
-    seen = stepped.core.see(robot.kinematics.end_effector_pose(theta))
-    np.testing.assert_allclose(seen, theta, atol=1e-3)
+    observed = stepped.core.see(robot.kinematics.end_effector_pose(theta))
+    np.testing.assert_allclose(observed, theta, atol=1e-3)
 
 
 def test_a_marker_that_the_arm_cannot_reach_is_refused(stepped):

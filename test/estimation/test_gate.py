@@ -40,8 +40,8 @@ def seeing(gate, start=0.0):
 
 
 def calibrated(mae):
-    seen = (*body(500, 1), np.zeros((500, ROBOT.muscle_count)))
-    healthy = Healthy(np.hstack(seen).astype(np.float32), 100.0, 50)
+    observed = (*body(500, 1), np.zeros((500, ROBOT.muscle_count)))
+    healthy = Healthy(np.hstack(observed).astype(np.float32), 100.0, 50)
     return replace(mae, anomaly=calibrate(mae, healthy, 50))
 
 
@@ -72,8 +72,8 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     for name, robot in arms.items():
         with pytest.raises(GateError) as refusal:
             Gate(robot).check(initial_mae(robot, steps=1).mae)
-        told = 'no network restores lengths that jump'
-        assert (told in str(refusal.value)) == (name == 'jumps')
+        reported = 'no network restores lengths that jump'
+        assert (reported in str(refusal.value)) == (name == 'jumps')
     assert re.search(r': straightener \(\d+ mm\); see check_robot', str(refusal.value))
 
 
@@ -104,13 +104,13 @@ def test_a_detector_with_too_high_or_too_low_threshold_is_refused(trained):
     gate, mae = Gate(ROBOT), calibrated(trained['default'])
     seeing(gate)
     gate.check(mae)
-    for times, told in (
+    for times, reported in (
         (100.0, 'with a muscle cut'),
         (0.01, 'on own messages'),
         (0.0, 'on own messages'),
     ):
         thresholds = {DISTANCE: times * mae.anomaly.thresholds[DISTANCE]}
-        with pytest.raises(GateError, match=told):
+        with pytest.raises(GateError, match=reported):
             gate.check(replace(mae, anomaly=replace(mae.anomaly, thresholds=thresholds)))
 
 

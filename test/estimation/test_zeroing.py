@@ -162,10 +162,10 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     for n in range(400):
         _, tension, length = moment(0.01 * n)
         estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
-    told = str(estimator.report(4.0))
-    assert re.search('finding the length zeros: [1-4] of', told)
+    reported = str(estimator.report(4.0))
+    assert re.search('finding the length zeros: [1-4] of', reported)
     estimator.isolate(())
-    assert str(estimator.report(4.0)) == told
+    assert str(estimator.report(4.0)) == reported
     estimator.use(mae)  # another network, for all it knows
     assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):

@@ -59,13 +59,14 @@ def test_baselines_that_learn_improve_on_a_body_with_other_lengths(robot, motion
         middle[:, 1:] = 0.5 * (robot.lower + robot.upper)[1:]
         return lengths + 0.2 * robot.routes.relative_lengths(middle)
 
-    seen = robot.random_postures(3000, rng)
+    observed = robot.random_postures(3000, rng)
     pull = rng.uniform(30.0, 130.0, (3000, robot.muscle_count))
     theta, tension, _ = motion
-    untaught, taught = kind(robot), kind(robot)
-    taught.learn(seen, pull, other(seen, pull))
+    initial_baseline, trained_baseline = kind(robot), kind(robot)
+    trained_baseline.learn(observed, pull, other(observed, pull))
     length = other(theta, tension)
     before, after = (
-        errors(each.estimate(tension, length), theta)[20:].mean() for each in (untaught, taught)
+        errors(each.estimate(tension, length), theta)[20:].mean()
+        for each in (initial_baseline, trained_baseline)
     )
     assert after < before

@@ -101,9 +101,9 @@ def test_only_an_alarm_that_begins_after_the_rupture_counts_as_detection(arm26, 
     alarm[starts[0] + 9 : starts[0] + 20] = True  # noticed after 0.1 s, named rightly
     alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, and muscle 0 is named
     alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
-    seen = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
+    observed = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
     well = Watched(*(np.zeros(5, dtype=bool) for _ in range(5)))
-    numbers = detection(arm26, plan, seen, well, trained['default'])
+    numbers = detection(arm26, plan, observed, well, trained['default'])
     cuts = list(numbers['cuts'].values())
     assert [cut['detected'] for cut in cuts[:3]] == [True, True, False]
     assert [cut['named'] for cut in cuts[:3]] == [True, False, False]

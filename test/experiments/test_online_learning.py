@@ -103,8 +103,8 @@ def test_the_error_counts_as_halved_once_it_stays_below_half():
 def test_a_full_sample_store_does_not_change_how_often_a_marker_is_used(arm26):
     learner, nothing = Learner(arm26), np.zeros(arm26.muscle_count)
     learner.samples = SampleStore(capacity=2 * SIGHTED)
-    seen = []
+    observed = []
     for count in range(6 * SIGHTED):
-        seen.append(sighted(learner))
+        observed.append(sighted(learner))
         learner.accept(Sample(np.full(2, 0.1 * count), nothing, nothing, nothing))
-    assert np.flatnonzero(seen).tolist() == list(range(0, 6 * SIGHTED, SIGHTED))
+    assert np.flatnonzero(observed).tolist() == list(range(0, 6 * SIGHTED, SIGHTED))

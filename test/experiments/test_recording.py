@@ -37,16 +37,16 @@ def test_a_recording_lasts_for_whole_steps_and_rests_at_the_end_of_each(plain):
 
 
 def test_a_script_is_called_in_every_step_and_an_empty_one_changes_nothing(arm26, mae, plain):
-    told = []
+    reported = []
 
     def script(arm, time):
         assert isinstance(arm, EmulatedArm)
-        told.append(time)
+        reported.append(time)
 
     recording = record(EmulatedArm(arm26, 3), mae, 7, 8.0, script)
     for ours, theirs in zip(recording, plain, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    np.testing.assert_array_equal(told, times(len(plain.theta)))
+    np.testing.assert_array_equal(reported, times(len(plain.theta)))
 
 
 def test_a_script_changes_the_arm_from_its_time_on(arm26, mae, plain):

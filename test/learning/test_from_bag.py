@@ -31,9 +31,9 @@ def test_learning_from_one_recording_improves_the_estimate_of_another(robot):
     other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the muscle is cut later
     mae = initial_mae(robot, steps=600).mae
     learner = Learner(robot, mae, steps=50)
-    told = []
-    learn(learner, exploration, told.append)
-    assert sum(told) == pytest.approx(exploration.time[-1] - exploration.time[0])
+    reported = []
+    learn(learner, exploration, reported.append)
+    assert sum(reported) == pytest.approx(exploration.time[-1] - exploration.time[0])
     assert learner.updates > 0
     assert error(learner.mae, other) < 0.6 * error(mae, other)
 
@@ -63,9 +63,9 @@ def test_isolated_muscles_of_a_recording_are_neither_learned_nor_used(arm26, ini
 def test_bad_messages_of_a_recording_are_left_out_and_reported(robot, capsys):
     recording = read(BAGS / 'faults', robot)
     assert len(recording.time) > 2000
-    said = capsys.readouterr().err
-    assert '2 messages rejected, /muscle_states: not finite' in said
-    assert '/muscle_states: wrong length' in said
+    errors = capsys.readouterr().err
+    assert '2 messages rejected, /muscle_states: not finite' in errors
+    assert '/muscle_states: wrong length' in errors
 
 
 @pytest.mark.parametrize(

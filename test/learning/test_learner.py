@@ -330,11 +330,13 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
                 learner.imu(arm.time, link, UP)
     arm.rest(MARGIN + 0.1)
     for sample, heard in rests:
-        told = min(learner.samples.samples, key=lambda s: np.abs(s.length - sample.length).max())
+        reported = min(
+            learner.samples.samples, key=lambda s: np.abs(s.length - sample.length).max()
+        )
         expected = np.full((len(arm26.kinematics.parent) * bool(heard), 3), np.nan)
         for joint, placement in map(arm26.kinematics.placement, heard):
             expected[joint] = placement.rotation @ [0.0, 0.0, -1.0]
-        np.testing.assert_allclose(told.gravity, expected.ravel(), atol=1e-9)
+        np.testing.assert_allclose(reported.gravity, expected.ravel(), atol=1e-9)
 
 
 def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26, initial, stage):

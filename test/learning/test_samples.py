@@ -208,11 +208,11 @@ def test_samples_shortly_before_an_anomaly_are_not_learned(collector, arm26, hea
     collector.set_anomaly(True)
     assert rests_at(collector, arm26, theta, 10.0) == []
     assert collector.rejected['anomaly'] > 5
-    seen = healthy.time
+    observed = healthy.time
     collector.set_anomaly(False)
     assert rests_at(collector, arm26, theta, MARGIN) == []
     assert len(rests_at(collector, arm26, theta, MARGIN + 1.5)) >= 1
-    assert healthy.time > seen
+    assert healthy.time > observed
 
 
 def test_implausible_readings_are_rejected_by_reason(collector, arm26):

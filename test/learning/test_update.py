@@ -73,10 +73,13 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
         updater = BodyUpdater(arm26, initial)
         for _ in range(4):
             update = updater.update(job(store, steps=150, **parts))
-        return error(update.mae, seen.theta, seen.tension, seen.length)
+        return error(update.mae, observed.theta, observed.tension, observed.length)
 
     stage = Giving(other_body)
-    store, (seen, messages) = stage.store(30), (stage.store(400).observations() for _ in range(2))
+    store, (observed, messages) = (
+        stage.store(30),
+        (stage.store(400).observations() for _ in range(2)),
+    )
     # Over eight bodies and streams 0.91 with a standard deviation of 0.02.
     assert learned(learned=messages) < 0.98 * learned()
 
@@ -93,8 +96,8 @@ def test_motion_samples_that_contradict_the_body_model_are_not_learned(arm26, in
 
 def test_the_covariance_covers_95_percent_of_validation_messages(arm26, initial, stage):
     judging, fresh = stage.store(1000).observations(), stage.store(1000).observations()
-    for seen in (judging, fresh):
-        seen.length[:] += 0.003 * stage.rng.standard_normal(seen.length.shape)
+    for observed in (judging, fresh):
+        observed.length[:] += 0.003 * stage.rng.standard_normal(observed.length.shape)
 
     def inside(**parts):
         mae = BodyUpdater(arm26, initial).update(job(store, steps=100, **parts)).mae
@@ -142,9 +145,12 @@ def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_bod
 def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
     data = synthetic_samples(other_body, np.zeros(6), 2000, np.random.default_rng(0))
     scale = scale_vector(2, 6)
-    (theta, tension, length), seen = np.split(data.true / scale, [2, 8], axis=1), data.seen / scale
-    off = seen[:, 8:] - length
-    np.testing.assert_array_equal(seen[:, :8], np.hstack([theta, tension]))
+    (theta, tension, length), observed = (
+        np.split(data.true / scale, [2, 8], axis=1),
+        data.seen / scale,
+    )
+    off = observed[:, 8:] - length
+    np.testing.assert_array_equal(observed[:, :8], np.hstack([theta, tension]))
     all_of_it = [
         other_body.lengths(theta, tension, way * np.ones_like(length))[0] for way in (-1, 1)
     ]
@@ -216,10 +222,10 @@ def test_a_network_of_another_arm_adapts_as_fast_as_an_initial_one(learned, arm2
 
 def test_removing_tendon_friction_improves_the_estimate(learned):
     mae, _, _, stage = learned
-    seen = stage.store(500).observations()
+    observed = stage.store(500).observations()
     read, end = (
-        error(mae, seen.theta, tension, seen.length)
-        for tension in (seen.tension, seen.end_tension(mae.friction))
+        error(mae, observed.theta, tension, observed.length)
+        for tension in (observed.tension, observed.end_tension(mae.friction))
     )
     assert end < 0.8 * read
 

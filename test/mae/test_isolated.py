@@ -74,21 +74,21 @@ def test_a_joint_at_its_end_is_not_taken_for_one_in_the_middle(trained):
 def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     mae = trained['default']
     mae = replace(mae, anomaly=replace(mae.anomaly, calibrated=True))
-    less = mae.without((1,))
+    reduced = mae.without((1,))
     kept = [m for m in range(12) if m % 6 != 1]
     np.testing.assert_array_equal(
-        less.anomaly.covariance[np.ix_(kept, kept)], mae.anomaly.covariance[np.ix_(kept, kept)]
+        reduced.anomaly.covariance[np.ix_(kept, kept)], mae.anomaly.covariance[np.ix_(kept, kept)]
     )
-    np.linalg.cholesky(less.anomaly.covariance)
-    assert less.anomaly.calibrated
-    assert not less.without(()).anomaly.calibrated  # nobody knows what is normal for it
+    np.linalg.cholesky(reduced.anomaly.covariance)
+    assert reduced.anomaly.calibrated
+    assert not reduced.without(()).anomaly.calibrated  # nobody knows what is normal for it
 
 
 def test_a_checkpoint_stores_the_isolated_muscles(trained):
-    less = trained['default'].without((4, 1))
-    back = checkpoint.from_bytes(checkpoint.to_bytes(less), ROBOT)
-    assert back.isolated == less.isolated == (1, 4)
+    reduced = trained['default'].without((4, 1))
+    back = checkpoint.from_bytes(checkpoint.to_bytes(reduced), ROBOT)
+    assert back.isolated == reduced.isolated == (1, 4)
     for wrong in ((6,), (1, 1)):
-        data = checkpoint.to_bytes(replace(less, isolated=wrong))
+        data = checkpoint.to_bytes(replace(reduced, isolated=wrong))
         with pytest.raises(CheckpointError, match='isolated'):
             checkpoint.from_bytes(data, ROBOT)

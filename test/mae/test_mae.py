@@ -36,9 +36,10 @@ def test_numpy_agrees_with_torch(mae, states, index):
 @pytest.mark.parametrize('mask', Mask)
 def test_masked_input_is_ignored(mae, states, mask):
     hidden = [
-        part if seen else np.full_like(part, np.nan) for part, seen in zip(states, mask.value)
+        part if observed else np.full_like(part, np.nan)
+        for part, observed in zip(states, mask.value)
     ]
-    absent = [part if seen else None for part, seen in zip(states, mask.value)]
+    absent = [part if observed else None for part, observed in zip(states, mask.value)]
     expected = mae.encode(mask, *states)
     np.testing.assert_array_equal(mae.encode(mask, *hidden), expected)
     np.testing.assert_array_equal(mae.encode(mask, *absent), expected)

@@ -55,6 +55,6 @@ def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):
     assert main(['--robot', 'arm26', '--out', str(tmp_path)]) == 1
     assert main(['--robot', 'arm26', '--out', str(tmp_path / (250 * 'x'))]) == 1
     assert main(['--robot', 'arm26', '--out', '/proc/x']) == 1
-    said = capsys.readouterr().err
-    assert said.count('\n') == 4
-    assert said.count('choose another place') == 2
+    reported = capsys.readouterr().err
+    assert reported.count('\n') == 4
+    assert reported.count('choose another place') == 2

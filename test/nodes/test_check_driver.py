@@ -36,7 +36,7 @@ def test_a_sound_driver_passes_and_is_moved_only_with_move(graph):
 
 
 @pytest.mark.parametrize(
-    ('fault', 'options', 'told'),
+    ('fault', 'options', 'reported'),
     [
         ('bias:biceps_long:0.1', [], 'fault: zero of biceps_long'),
         (
@@ -46,11 +46,11 @@ def test_a_sound_driver_passes_and_is_moved_only_with_move(graph):
         ),
     ],
 )
-def test_a_fault_is_reported_with_what_to_change(graph, fault, options, told):
+def test_a_fault_is_reported_with_what_to_change(graph, fault, options, reported):
     started(graph, faults=[fault])
     status, output = check(graph, '--seconds', '2', *options).ended()
     assert status == 1, output
-    assert told in output
+    assert reported in output
     assert 'change: ' in output
 
 

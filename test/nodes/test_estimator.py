@@ -145,11 +145,11 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
     sick = deepcopy(healthy)
     sick.data[0] -= 0.1  # a muscle wound in by 10 cm
 
-    def seen():
+    def observed():
         answer(estimator, sick)
         return detected and detected[-1].data
 
-    estimator.wait(seen, 'the detection')
+    estimator.wait(observed, 'the detection')
     estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the diagnosis')
     assert 'anomaly detected: ' in estimator.report('estimator').message
     for _ in range(8):
@@ -170,13 +170,13 @@ def test_a_muscle_without_its_commanded_length_or_tension_is_an_anomaly(
     demand = np.array(healthy.data[:6]) - 0.003 if kind == 'length' else np.full(6, 60.0)
     detected = estimator.received['anomaly_detected']
 
-    def seen():
+    def observed():
         command.publish(array_message(demand, 'muscle'))
         estimator.muscles.publish(healthy)
         estimator.spin(0.02)
         return detected and detected[-1].data
 
-    estimator.wait(seen, 'the detection')
+    estimator.wait(observed, 'the detection')
     assert estimator.estimator.core.cause.startswith(arm26.muscles[2])
 
 
@@ -198,27 +198,27 @@ def picture(robot, theta):
 def test_a_marker_gives_no_angles_of_joints_that_do_not_move_it(graph):
     robot = Robot.load('musashi_upper_body')
     graph.host(Estimator, robot='musashi_upper_body')
-    seen = graph.listen(JointState, 'vision_joint_states')
+    observed = graph.listen(JointState, 'vision_joint_states')
     graph.publisher(PoseStamped, 'marker_pose').publish(picture(robot, 0.5 * robot.lower))
-    graph.wait(lambda: seen, 'the joint angles')
+    graph.wait(lambda: observed, 'the joint angles')
     hand = robot.description.end_effector.partition('_')[0]
-    assert seen[0].name == [joint for joint in robot.joints if joint.startswith(hand)]
-    assert 0 < len(seen[0].position) == len(seen[0].name) < robot.joint_count
+    assert observed[0].name == [joint for joint in robot.joints if joint.startswith(hand)]
+    assert 0 < len(observed[0].position) == len(observed[0].name) < robot.joint_count
 
 
 def test_a_marker_pose_becomes_joint_angles_with_the_stamp_of_the_picture(estimator, arm26):
     theta = arm26.lower + 0.4 * (arm26.upper - arm26.lower)
     message = picture(arm26, theta)
-    camera, seen = estimator.publisher(PoseStamped, 'marker_pose'), estimator.received
+    camera, observed = estimator.publisher(PoseStamped, 'marker_pose'), estimator.received
 
     def arrived():
         camera.publish(message)
         estimator.spin(0.05)
-        return seen['vision_joint_states']
+        return observed['vision_joint_states']
 
     estimator.wait(arrived, 'the joint angles')
-    assert seen['vision_joint_states'][0].header.stamp.sec == 42
-    np.testing.assert_allclose(seen['vision_joint_states'][0].position, theta, atol=1e-3)
+    assert observed['vision_joint_states'][0].header.stamp.sec == 42
+    np.testing.assert_allclose(observed['vision_joint_states'][0].position, theta, atol=1e-3)
     message.header.frame_id = 'camera'
     rejected = estimator.estimator.rejected
     estimator.wait(lambda: arrived() and rejected['marker_pose: wrong frame'], 'the refusal')
@@ -261,8 +261,8 @@ def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, 
     file = tmp_path / 'sure.safetensors'
     checkpoint.save(mae, file)
     node = graph.host(Estimator, robot='arm26', checkpoint=str(file))
-    told = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
+    reported = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
     graph.host(HardwareEmulator, robot='arm26')
-    message = graph.wait(lambda: told and told[-1], 'the covariance')
+    message = graph.wait(lambda: reported and reported[-1], 'the covariance')
     np.testing.assert_array_equal(np.reshape(message.data, (2, 2)), covariance)
     assert '0.020' in node.report().values['joint uncertainty']

@@ -87,11 +87,11 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
 
 def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):
     known = replace(trained['default'].without((4,)), version=5)
-    told = graph.listen(String, 'isolated_muscles', LATCHED)
+    reported = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
     graph.send_network(checkpoint.to_bytes(known))
-    graph.wait(lambda: told, 'the list')
-    assert told[-1].data == arm26.muscles[4]
+    graph.wait(lambda: reported, 'the list')
+    assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
 
 

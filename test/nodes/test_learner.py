@@ -353,9 +353,9 @@ def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, tra
     )
     graph.listen(JointState, 'vision_joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
-    seen = graph.received['vision_joint_states']
-    graph.wait(lambda: seen, 'joint angles from the marker')
-    assert tuple(seen[-1].name) == arm26.joints
+    observed = graph.received['vision_joint_states']
+    graph.wait(lambda: observed, 'joint angles from the marker')
+    assert tuple(observed[-1].name) == arm26.joints
     graph.wait(lambda: samples(graph) >= 1, 'a sample', deadline=120.0)
     publisher = graph.publisher(PoseStamped, 'marker_pose')
     wrong = PoseStamped()
@@ -383,8 +383,8 @@ def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, gr
         def taken(reason=reason):
             publisher.publish(message)
             learner.step()
-            told = learner.node.rejected
-            return reason in told if reason else learner.tilted
+            reported = learner.node.rejected
+            return reason in reported if reason else learner.tilted
 
         graph.wait(taken, f'what came of {frame}')
 
@@ -421,8 +421,8 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
     learner.learn(lambda: learner.samples >= 2, 'samples')
 
     def levels():
-        said = (s for m in graph.received['/diagnostics'] for s in m.status)
-        return [s.level for s in said if s.name.startswith(graph.namespace)]
+        statuses = (s for m in graph.received['/diagnostics'] for s in m.status)
+        return [s.level for s in statuses if s.name.startswith(graph.namespace)]
 
     shutil.rmtree(state)
     before = len(levels())

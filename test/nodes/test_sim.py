@@ -150,8 +150,8 @@ def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae,
     graph.wait(lambda: 'rejected mae_checkpoint' in str(graph.report('sim').values), 'the refusal')
     for version in (41, 42):
         graph.send_network(checkpoint.to_bytes(replace(mae, version=version)))
-        said = f"'checkpoint version': '{version}'"
-        graph.wait(lambda said=said: said in str(graph.report('sim').values), said)
+        reported = f"'checkpoint version': '{version}'"
+        graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
     assert graph.set_parameter('sim', 'checkpoint', trained_file)[0]

@@ -55,8 +55,8 @@ def test_every_latched_message_of_the_last_seconds_is_kept(recording, now, monke
     recording.save('a cause', 10)
     recording.close()
     bag = Bag.open(recording.saved)
-    told = [bag.decode(message).data for message in bag.messages()]
-    assert told == [True, False, True, False]
+    reported = [bag.decode(message).data for message in bag.messages()]
+    assert reported == [True, False, True, False]
 
 
 def test_old_recordings_are_deleted_and_other_folders_stay(recording, now, tmp_path):

@@ -127,7 +127,7 @@ def test_a_second_publisher_of_muscle_states_stops_the_arm_until_it_is_gone(arm)
 
 
 def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
-    node, said = arm.graph.node, set()
+    node, reported = arm.graph.node, set()
     twin = rclpy.create_node(
         'hardware_emulator', namespace=node.get_namespace(), context=node.context
     )
@@ -135,8 +135,8 @@ def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
         publisher = twin.create_publisher(Float64MultiArray, 'muscle_states', 10)
 
         def repeat(message):  # what the first one says, by a second one
-            if (data := bytes(message.data)) not in said:
-                said.add(data)
+            if (data := bytes(message.data)) not in reported:
+                reported.add(data)
                 publisher.publish(message)
 
         node.create_subscription(Float64MultiArray, 'muscle_states', repeat, 10)

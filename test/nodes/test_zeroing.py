@@ -50,7 +50,7 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
     controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
     estimator = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
 
-    def told(offset, deviation):
+    def reported(offset, deviation):
         rows = np.array([np.full(6, offset), np.full(6, deviation)])
         estimator.publish(array_message(rows, 'quantity', 'muscle'))
 
@@ -60,14 +60,14 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
             'the zeros',
         )
 
-    told(0.05, 0.0)
+    reported(0.05, 0.0)
     graph.wait(lambda: controller.zeros.offset.all(), 'the zeros')
-    told(0.0, 0.0)  # as a new one says
+    reported(0.0, 0.0)  # as a new one says
     known(False)
-    told(0.0, 0.0)
+    reported(0.0, 0.0)
     graph.spin(0.3)
     known(False)
-    told(0.01, 1.0)
+    reported(0.01, 1.0)
     graph.wait(lambda: controller.zeros.offset.all(), 'a guess')
-    told(0.05, 0.001)
+    reported(0.05, 0.001)
     known(True)

@@ -61,8 +61,8 @@ def test_linear_and_rigid_springs_give_constants_that_muscles_yaml_accepts(
     text = '\n'.join(','.join(map(repr, row)) for row in rows)
     file.write_text(f'{",".join(tool.COLUMNS)}\n{text}\n')
     assert tool.main([str(file)]) == 0
-    told = capsys.readouterr().out.splitlines()[0]
-    printed = yaml.safe_load(told)['series_elastic']
+    reported = capsys.readouterr().out.splitlines()[0]
+    printed = yaml.safe_load(reported)['series_elastic']
     assert all(0.0 < value <= 1e8 for value in printed.values())
     fitted = constants(**printed)
     for t, a, x in rows:

@@ -234,5 +234,5 @@ def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
     status, output = second.ended()
     assert status == 1
-    told = f'error: no page at port {port} of 127.0.0.1: Address already in use'
-    assert told in output and 'Traceback' not in output
+    reported = f'error: no page at port {port} of 127.0.0.1: Address already in use'
+    assert reported in output and 'Traceback' not in output
