@@ -76,10 +76,8 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
         return error(update.mae, observed.theta, observed.tension, observed.length)
 
     stage = Giving(other_body)
-    store, (observed, messages) = (
-        stage.store(30),
-        (stage.store(400).observations() for _ in range(2)),
-    )
+    store = stage.store(30)
+    observed, messages = (stage.store(400).observations() for _ in range(2))
     # Over eight bodies and streams 0.91 with a standard deviation of 0.02.
     assert learned(learned=messages) < 0.98 * learned()
 
@@ -145,10 +143,8 @@ def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_bod
 def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
     data = synthetic_samples(other_body, np.zeros(6), 2000, np.random.default_rng(0))
     scale = scale_vector(2, 6)
-    (theta, tension, length), observed = (
-        np.split(data.true / scale, [2, 8], axis=1),
-        data.seen / scale,
-    )
+    theta, tension, length = np.split(data.true / scale, [2, 8], axis=1)
+    observed = data.seen / scale
     off = observed[:, 8:] - length
     np.testing.assert_array_equal(observed[:, :8], np.hstack([theta, tension]))
     all_of_it = [
