@@ -64,7 +64,6 @@ class ControlledArm:
         self.graph.processes.remove(process)
         process.process.kill()
         self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
-        process.process.stdout.close()
 
     def target(self, theta, effort=()):
         self.targets.publish(

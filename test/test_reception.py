@@ -23,7 +23,7 @@ class Inbox:
         self.receive(message, {'source_timestamp': time, 'publication_sequence_number': number})
 
 
-def test_what_comes_twice_or_late_is_dropped_and_counted():
+def test_repeated_and_late_messages_are_dropped_and_counted():
     inbox = Inbox()
     for number, time in ((1, 10), (2, 20), (2, 20), (1, 15), (3, 30)):
         inbox.get(number, time * SECOND // 100, number)
@@ -31,7 +31,7 @@ def test_what_comes_twice_or_late_is_dropped_and_counted():
     assert inbox.reception.rejected == {'topic: repeated or reordered': 2}
 
 
-def test_a_publisher_whose_clock_stepped_back_is_heard():
+def test_messages_are_used_after_the_clock_of_the_publisher_stepped_back():
     inbox = Inbox()
     inbox.get('before', 100 * SECOND, 1)
     inbox.get('after', 100 * SECOND - SECOND // 2, 2)
@@ -39,7 +39,7 @@ def test_a_publisher_whose_clock_stepped_back_is_heard():
     assert inbox.used == ['before', 'after', 'much later']
 
 
-def test_of_two_publishers_neither_hides_the_other():
+def test_messages_of_two_publishers_are_all_used():
     inbox = Inbox(publishers=2)
     inbox.get('ahead', 100 * SECOND, 50)
     inbox.get('behind', 100 * SECOND - SECOND // 2, 1)
@@ -71,7 +71,7 @@ def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number,
         (CheckpointError('made for other joints'), 'topic: unfit checkpoint'),
     ],
 )
-def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reason):
+def test_rejections_are_counted_by_reason_and_the_last_is_kept_in_full(error, reason):
     warnings = []
     reception = Reception(warnings.append)
 
@@ -88,7 +88,7 @@ def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reaso
     assert not reception.take_received()
 
 
-def test_what_comes_in_pieces_is_counted_once_the_last_one_has_gone():
+def test_a_callback_in_pieces_counts_when_it_has_ended():
     reception = Reception(print)
 
     @coroutine

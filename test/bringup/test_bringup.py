@@ -88,7 +88,7 @@ def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(envi
     chosen = ['--robot', str(robot), '--preset', 'paper', '--seed', '3']
     run = bringup(environment, *chosen)
     told = []
-    for line in iter(run.process.stdout.readline, ''):
+    for line in run.lines():
         told.append(line)
         if 'starting estimator' in line:
             break
@@ -98,7 +98,7 @@ def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(envi
     # Only the description of a robot says which network it needs.
     (robot / 'README.md').write_text('an arm')
     run = bringup(environment, *chosen, '--duration', '5')
-    output, _ = run.process.communicate(timeout=600)
+    _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     lines = statuses(output)
     assert lines, output  # on a busy machine the sensors are heard late
@@ -169,7 +169,7 @@ def test_a_cut_muscle_is_detected_and_a_dead_node_named(environment):
         graph.close()
     victim = next(line for line in running(run).splitlines() if '/estimator ' in line)
     os.kill(int(victim.split()[0]), signal.SIGKILL)
-    output, _ = run.process.communicate(timeout=DEADLINE)
+    _, output = run.ended()
     assert run.process.returncode == 1
     assert 'ANOMALY: brachialis' in output
     assert '(to go on: mend it, estimator/reset' in output
@@ -181,11 +181,11 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     recording = tmp_path / 'run'
     options = ['--no-controller', '--no-learner', '--duration', '5', '--record', str(recording)]
     live = bringup(environment, '--robot', 'arm26', *options)
-    output, _ = live.process.communicate(timeout=600)
+    _, output = live.ended()
     assert live.process.returncode == 0, output
     assert 'starting hardware_emulator' in output and 'starting controller' not in output
     played = bringup(environment, '--robot', 'arm26', '--bag', str(recording))
-    output, _ = played.process.communicate(timeout=600)
+    _, output = played.ended()
     assert played.process.returncode == 0, output
     assert len(statuses(output)) >= 3, output
     assert 'hardware_emulator' not in output and 'controller' not in output
@@ -199,7 +199,7 @@ def test_that_a_reality_is_another_robot_is_told_where_it_was_started(environmen
     file.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
     run = bringup(environment, '--robot', str(tmp_path / 'own'), '--reality', str(file))
     told = []
-    for line in iter(run.process.stdout.readline, ''):
+    for line in run.lines():
         told.append(line)
         if line.startswith(f"-- reality {file}: joint 'elbow' moves from -1.5 to 0.2 there"):
             break
@@ -231,7 +231,7 @@ def test_that_a_reality_is_another_robot_is_told_where_it_was_started(environmen
 )
 def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments, expected):
     run = bringup(environment, *arguments)
-    output, _ = run.process.communicate(timeout=DEADLINE)
+    _, output = run.ended()
     assert run.process.returncode == 2
     assert expected in output
 
@@ -258,7 +258,7 @@ def driver(namespace):
 def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
     options = ['--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own']
     run = bringup(environment, *options)
-    lines = iter(run.process.stdout.readline, '')
+    lines = run.lines()
     told = []
     for line in lines:
         told.append(line)
@@ -287,11 +287,11 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
 
 def test_a_namespace_that_is_in_use_is_refused_by_name(environment):
     first = bringup(environment, '--robot', 'arm26', '--hardware', '--namespace', 'taken')
-    for line in iter(first.process.stdout.readline, ''):
+    for line in first.lines():
         if 'logs in' in line:
             break
     second = bringup(environment, '--robot', 'arm26', '--namespace', 'taken')
-    output, _ = second.process.communicate(timeout=600)
+    _, output = second.ended()
     assert second.process.returncode == 2
     assert "'/taken' is in use" in output and '--namespace' in output
     first.end(signal.SIGINT)

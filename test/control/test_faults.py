@@ -118,7 +118,7 @@ PROMISES = {
 
 
 @pytest.mark.parametrize('fault', PROMISES)
-def test_under_a_fault_no_command_jumps_and_once_mended_the_arm_goes_on(loop, fault):
+def test_under_each_fault_no_command_jumps_and_the_arm_goes_on_once_it_is_mended(loop, fault):
     held = loop.arm.theta
     loop.arm.faults.set([fault])
     loop.run(4.0)
@@ -136,5 +136,5 @@ def test_under_a_fault_no_command_jumps_and_once_mended_the_arm_goes_on(loop, fa
     assert np.linalg.norm(loop.arm.theta - held) < 0.35
 
 
-def test_every_kind_of_fault_has_its_promise():
+def test_every_kind_of_fault_has_a_promise():
     assert {fault.split(':')[0] for fault in PROMISES} == set(KINDS)

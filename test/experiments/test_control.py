@@ -27,7 +27,7 @@ def test_a_posture_at_the_target_needs_the_bound(ended):
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 
-def test_where_a_controller_stops_all_else_is_measured(arm26, trained, monkeypatch):
+def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monkeypatch):
     target = ClosedLoop.target
 
     def stopping(loop, theta):

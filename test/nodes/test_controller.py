@@ -40,7 +40,7 @@ def test_a_target_is_approached_without_a_jump_and_the_next_one_as_well(arm):
     arm.never_jumped()
 
 
-def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_lengths(arm):
+def test_method_tension_sends_tensions_only_and_returns_to_lengths(arm):
     arm.target(HERE)
     arm.goes_to(HERE)
     assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
@@ -57,7 +57,7 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     arm.goes_to(THERE)
 
 
-def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_joint_refused(arm):
+def test_a_desired_stiffness_within_the_reported_range_is_planned(arm):
     posture, joint = arm.controller.core.posture, arm.robot.joints[0]
     assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
     assert not arm.graph.set_parameter('controller', 'joint_stiffness', [1.0, 2.0, 3.0])[0]
@@ -115,7 +115,7 @@ def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
     assert 'stopped' not in arm.state().message
 
 
-def test_heat_lowers_the_limit_and_is_said(arm):
+def test_heat_lowers_the_tension_limit_and_is_reported(arm):
     arm.target(HERE)
     arm.goes_to(HERE)
     # Modules at room temperature lie 15 °C below 40 °C; the load of holding warms them into that.
@@ -139,7 +139,7 @@ def test_parameters_set_together_are_taken_all_or_none(arm):
     assert arm.state().values['method'] == 'proposed'
 
 
-def test_a_hand_moves_a_floating_arm_and_the_estimator_feels_it(arm):
+def test_a_push_moves_an_arm_in_gravity_compensation_and_is_estimated(arm):
     graph = arm.graph
     graph.listen(WrenchStamped, 'estimated_external_wrench', 1000)
     pushes = graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')

@@ -91,7 +91,7 @@ def arm(graph, arm26, trained_file, monkeypatch):
     return ControlledArm(graph, arm26, trained_file)
 
 
-def test_goals_are_followed_told_of_replaced_cancelled_and_refused(arm):
+def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     server = arm.controller.action._server
     assert server.name == 'follow_joint_trajectory'
     first = server.send(Goal(trajectory(arm, HERE)))
@@ -164,7 +164,7 @@ class Asked(Waitable):
         self.guard.handle.__exit__(*how)
 
 
-def test_what_is_waited_for_as_an_action_is_served_without_the_second_s_look(monkeypatch):
+def test_requests_of_an_action_are_served_at_once(monkeypatch):
     monkeypatch.setattr(running, 'EVENTS_EVERY', 600)  # only what is served at once is served
     context = rclpy.Context()
     rclpy.init(context=context)

@@ -28,7 +28,7 @@ def arm(graph, arm26, trained_file):
     return arm
 
 
-def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
+def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph, name = arm.graph, arm.robot.muscles[3]
     assert graph.received['isolated_muscles'][-1].data == ''
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
@@ -50,7 +50,7 @@ def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
     graph.wait(lambda: arm.controller.core.robot.isolated == (), 'its use')
 
 
-def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
+def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     graph, name = arm.graph, arm.robot.muscles[2]
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
@@ -64,7 +64,7 @@ def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
         assert any('not finite' in reason for reason in node.rejected)
 
 
-def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, trained):
+def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trained):
     graph, names = arm.graph, list(arm.robot.muscles[1:3])
     assert not graph.call(Trigger, 'estimator/isolate').success  # none is named
     done, reason = graph.set_parameter('estimator', 'isolate_muscles', ['tail'])
@@ -85,19 +85,17 @@ def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, tr
     assert arm.estimator.core.robot.isolated == (1, 2)
 
 
-def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
-    graph, arm26, trained
-):
+def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):
     known = replace(trained['default'].without((4,)), version=5)
-    told = graph.listen(String, 'isolated_muscles', LATCHED)
+    reported = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
     graph.send_network(checkpoint.to_bytes(known))
-    graph.wait(lambda: told, 'the list')
-    assert told[-1].data == arm26.muscles[4]
+    graph.wait(lambda: reported, 'the list')
+    assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
 
 
-def test_what_an_estimator_says_before_it_knows_who_is_isolated_does_not_count(
+def test_the_first_empty_list_of_a_restarted_estimator_is_ignored(
     graph, arm26, trained_file, tmp_path
 ):
     options = {'robot': 'arm26', 'checkpoint': trained_file}
@@ -117,7 +115,7 @@ def test_what_an_estimator_says_before_it_knows_who_is_isolated_does_not_count(
     assert tell(successor, '') == ()
 
 
-def test_a_suspect_that_is_isolated_by_hand_while_it_is_verified_stays_so(graph, trained_file):
+def test_a_suspect_isolated_by_service_during_verification_stays_isolated(graph, trained_file):
     node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, on_anomaly='isolate')
     names = node.robot.muscles
     node.core.detector.judges = True
