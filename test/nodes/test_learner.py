@@ -16,7 +16,6 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.state import FILE
 from musculoskeletal_ae.learning.training import Training
@@ -380,13 +379,6 @@ def test_a_second_learner_in_the_same_directory_is_refused(graph, host, state):
     assert status == 1
     assert 'another learner' in output
     assert 'Traceback' not in output
-
-
-def test_an_unknown_home_directory_is_an_error_with_its_remedy(graph, monkeypatch):
-    monkeypatch.delenv('XDG_STATE_HOME', raising=False)
-    monkeypatch.setattr(os.path, 'expanduser', str)
-    with pytest.raises(StateError, match=r'state_directory .* give a whole path'):
-        graph.host(Learner, robot='arm26')
 
 
 def test_ctrl_c_ends_the_learner_and_its_training_process_without_a_traceback(graph, trained_file):
