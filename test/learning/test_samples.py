@@ -102,8 +102,8 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
 
 @pytest.mark.parametrize(
     ('rate', 'rest_time'),
-    [(1.0, 0.3), (5.0, 0.3), (7.0, 0.3), (18.9, 0.3), (20.0, 0.3), (100.0, 0.0), (100.0, 0.02)],
-)  # fmt: skip
+    [(1.0, 0.3), (18.9, 0.3), (100.0, 0.0)],
+)
 def test_rest_is_detected_at_any_message_rate_and_rest_time(rate, rest_time):
     detector = RestDetector(replace(DEFAULT, rest_time=rest_time))
     found = [detector.step(reading(0.3, 0.01), 1.0 / rate) for _ in range(round(13.0 * rate))]

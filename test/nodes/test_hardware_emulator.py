@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated hardware as a robot on the graph."""
 
-import bodies
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,7 +11,6 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.validity import read_array
@@ -194,19 +192,6 @@ def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
     assert graph.next('hardware_emulator/markers').markers
     for wrong in (['front'], [arm26.muscles[0], 'front']):
         assert not graph.set_parameter('hardware_emulator', 'ruptured_muscles', wrong)[0]
-
-
-def test_a_model_with_other_lengths_is_reported_at_the_start(graph, tmp_path, capfd):
-    file, path = tmp_path / 'own.xml', '<site site="u1"/><site site="l1"/>'
-    file.write_text(bodies.MJCF.replace(path, f'<pulley divisor="4"/>{path}'), encoding='utf-8')
-    import_robot(file, tmp_path / 'own')
-    graph.host(HardwareEmulator, robot=str(tmp_path / 'own'), reality=str(file))
-    assert "muscle 'bend' is up to" in capfd.readouterr().err
-
-
-def test_an_unknown_reality_is_refused_with_the_legal_ones(graph):
-    with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
-        graph.host(HardwareEmulator, robot='arm26', reality='no/such.xml')
 
 
 def test_an_accelerometer_is_published_on_request(graph):

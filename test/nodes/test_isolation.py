@@ -11,7 +11,6 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.nodes.situation import VERIFYING
 
@@ -93,38 +92,3 @@ def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, ar
     graph.wait(lambda: reported, 'the list')
     assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
-
-
-def test_the_first_empty_list_of_a_restarted_estimator_is_ignored(
-    graph, arm26, trained_file, tmp_path
-):
-    options = {'robot': 'arm26', 'checkpoint': trained_file}
-    learner = graph.host(Learner, state_directory=str(tmp_path), **options)
-    took = learner._reception.take_received
-
-    def tell(estimator, names):
-        estimator.publish(String(data=names))
-        graph.wait(lambda: took().get('isolated_muscles'), 'the learner to hear it')
-        return learner.core.isolated
-
-    estimator = graph.publisher(String, 'isolated_muscles', LATCHED)
-    assert tell(estimator, arm26.muscles[3]) == (3,)
-    graph.node.destroy_publisher(estimator)
-    successor = graph.publisher(String, 'isolated_muscles', LATCHED)
-    assert tell(successor, '') == (3,)
-    assert tell(successor, '') == ()
-
-
-def test_a_suspect_isolated_by_service_during_verification_stays_isolated(graph, trained_file):
-    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, on_anomaly='isolate')
-    names = node.robot.muscles
-    node.core.detector.judges = True
-    for by_hand, isolated in ((3, (3,)), (5, (3, 5))):
-        node.core.isolate(())
-        node.core.jumped(3, 0.0)
-        assert node.core.cause and node.core.robot.isolated == (3,)
-        assert graph.set_parameter('estimator', 'isolate_muscles', [names[by_hand]])[0]
-        answer = graph.call(Trigger, 'estimator/isolate').message
-        assert answer == f'isolated: {", ".join(names[m] for m in isolated)}'
-        assert node.core.robot.isolated == isolated
-        assert not node.core.cause

@@ -16,11 +16,13 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.rest import MARGIN
 from musculoskeletal_ae.learning.state import FILE
 from musculoskeletal_ae.learning.training import Training
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
@@ -138,7 +140,7 @@ def versions(graph, robot):
     ]
 
 
-def test_the_learner_publishes_checkpoints_with_rising_versions_and_saves_them(
+def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_training_process(
     host, graph, arm26, state
 ):
     learner = host(process=True, state_directory=state)
@@ -148,6 +150,12 @@ def test_the_learner_publishes_checkpoints_with_rising_versions_and_saves_them(
     assert learner.report().level == 'ok'
     assert (Path(state) / FILE).exists()
     assert graph.call(Trigger, 'learner/save').success
+    first = learner.report().values['training process']
+    os.kill(int(first), signal.SIGKILL)
+    learner.learn(lambda: learner.report().values['training process restarts'] == '1', 'a notice')
+    updates = learner.updates
+    learner.learn(lambda: learner.updates > updates, 'an update')
+    assert learner.report().values['training process'] != first
 
 
 def test_an_anomaly_stops_learning_until_the_reset(host, graph):
@@ -207,17 +215,6 @@ def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, graph, sta
     assert fresh.samples == 0
     assert (Path(state) / 'backup-1' / FILE).exists()
     fresh.learn(lambda: fresh.updates >= 1, 'learning anew')
-
-
-def test_a_training_process_that_dies_is_noticed_and_replaced(host):
-    learner = host(process=True)
-    learner.learn(lambda: learner.updates >= 1, 'an update')
-    first = learner.report().values['training process']
-    os.kill(int(first), signal.SIGKILL)
-    learner.learn(lambda: learner.report().values['training process restarts'] == '1', 'a notice')
-    updates = learner.updates
-    learner.learn(lambda: learner.updates > updates, 'an update')
-    assert learner.report().values['training process'] != first
 
 
 def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, graph, arm26):
@@ -343,29 +340,15 @@ def test_a_killed_learner_resumes_from_its_saved_state(graph, arm26, trained_fil
 
 
 def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, trained_file):
-    from geometry_msgs.msg import PoseStamped
-
-    graph.start('hardware_emulator', robot='arm26', joint_sensors=False, marker_pose_rate=30.0)
-    graph.start('estimator', robot='arm26', checkpoint=trained_file)
-    graph.start('controller', robot='arm26', checkpoint=trained_file, explore=True)
-    graph.start(
-        'learner', robot='arm26', checkpoint=trained_file, state_directory='', joint_source='marker'
-    )
-    graph.listen(JointState, 'vision_joint_states')
-    graph.listen(DiagnosticArray, '/diagnostics')
-    observed = graph.received['vision_joint_states']
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    graph.host(HardwareEmulator, robot='arm26', joint_sensors=False, marker_pose_rate=30.0)
+    graph.host(Estimator, **common)
+    graph.host(Controller, **common, explore=True, max_age=1.0)
+    learner = graph.host(Learner, **common, state_directory='', joint_source='marker')
+    observed = graph.listen(JointState, 'vision_joint_states')
     graph.wait(lambda: observed, 'joint angles from the marker')
     assert tuple(observed[-1].name) == arm26.joints
-    graph.wait(lambda: samples(graph) >= 1, 'a sample', deadline=120.0)
-    publisher = graph.publisher(PoseStamped, 'marker_pose')
-    wrong = PoseStamped()
-    wrong.header.frame_id = 'camera'
-
-    def refused():
-        publisher.publish(wrong)
-        return 'rejected marker_pose: wrong frame' in graph.report('estimator').values
-
-    graph.wait(refused, 'the refusal of another frame')
+    graph.wait(lambda: len(learner.core.samples) >= 1, 'a sample')
 
 
 def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, graph):
@@ -396,13 +379,6 @@ def test_a_second_learner_in_the_same_directory_is_refused(graph, host, state):
     assert status == 1
     assert 'another learner' in output
     assert 'Traceback' not in output
-
-
-def test_an_unknown_home_directory_is_an_error_with_its_remedy(graph, monkeypatch):
-    monkeypatch.delenv('XDG_STATE_HOME', raising=False)
-    monkeypatch.setattr(os.path, 'expanduser', str)
-    with pytest.raises(StateError, match=r'state_directory .* give a whole path'):
-        graph.host(Learner, robot='arm26')
 
 
 def test_ctrl_c_ends_the_learner_and_its_training_process_without_a_traceback(graph, trained_file):

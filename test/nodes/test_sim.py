@@ -14,6 +14,8 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -163,9 +165,11 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     graph.listen(JointState, 'joint_states')
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(String, 'robot_description', LATCHED)
-    graph.start('sim', robot='arm26', checkpoint=trained_file, as_robot=True)
-    graph.start('estimator', robot='arm26', checkpoint=trained_file)
-    graph.start('controller', robot='arm26', checkpoint=trained_file, first_duration=1.0)
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    graph.host(Sim, **common, as_robot=True)
+    graph.host(Estimator, **common)
+    # A loaded machine is not the cause of a stop.
+    graph.host(Controller, **common, first_duration=1.0, max_age=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
     assert graph.received['robot_description'][0].data == arm26.description.urdf

@@ -46,19 +46,6 @@ def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
     assert (recording.saved / FILE).read_text() == 'a cause\n'
 
 
-@pytest.mark.parametrize('most', [stop_recording.MOST, 3])
-def test_every_latched_message_of_the_last_seconds_is_kept(recording, now, monkeypatch, most):
-    monkeypatch.setattr(stop_recording, 'MOST', most)
-    for step, detected in enumerate((True, False, True, False)):
-        now[0] += int((0.4 if step else 0.0) * SECONDS * 1e9)
-        recording.heard('anomaly_detected', serialize_message(Bool(data=detected)))
-    recording.save('a cause', 10)
-    recording.close()
-    bag = Bag.open(recording.saved)
-    reported = [bag.decode(message).data for message in bag.messages()]
-    assert reported == [True, False, True, False]
-
-
 def test_old_recordings_are_deleted_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
     (tmp_path / 'stop_20200101-000000-000000').mkdir()  # cut off by a kill
@@ -71,16 +58,6 @@ def test_old_recordings_are_deleted_and_other_folders_stay(recording, now, tmp_p
     assert causes == ['cause 3\n', 'cause 4\n']
     assert (tmp_path / 'stop_of_mine').is_dir()
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_an_old_recording_that_cannot_be_deleted_does_not_prevent_a_new_one(recording, tmp_path):
-    (tmp_path / 'elsewhere').mkdir()
-    (tmp_path / 'stop_20200101-000000-000000').symlink_to(tmp_path / 'elsewhere')
-    recording.heard('muscle_states', states(1.0))
-    recording.save('a cause', 1)
-    recording.close()
-    assert recording.problem == ''
-    assert (recording.saved / FILE).exists()
 
 
 def test_no_recording_is_kept_if_their_number_is_zero(recording, tmp_path):

@@ -71,3 +71,11 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
     graph.wait(lambda: controller.zeros.offset.all(), 'a guess')
     reported(0.05, 0.001)
     known(True)
+
+
+def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    controller = graph.host(Controller, **common)
+    estimator = graph.host(Estimator, **common, zero_at_start=True)
+    graph.wait(lambda: not controller.zeros.known, 'the controller to know of it')
+    assert not estimator.core.zeros.known
