@@ -67,8 +67,7 @@ class View(Node):
             page = load('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
         except ImportError as error:
             raise MusculoskeletalError(
-                'the page needs viser: ./bringup.sh --view installs it, or '
-                'pip install -r .ci/requirements-view.txt'
+                'the page needs viser: pip install -r requirements.txt installs it'
             ) from error
         self.robot = robot
         self.asked: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
