@@ -59,6 +59,18 @@ def test_what_was_latched_before_is_kept_though_newer_came(recording, now, monke
     assert told == [True, False, True, False]
 
 
+def test_large_messages_do_not_fill_the_memory(recording, monkeypatch):
+    monkeypatch.setattr(stop_recording, 'MOST_BYTES', 1000)
+    for n in range(100):
+        recording.heard('muscle_states', states(float(n)))
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    kept = [bag.decode(message).data[0] for message in bag.messages()]
+    assert kept == list(range(100 - len(kept), 100))
+    assert 0 < sum(len(message.data) for message in bag.messages()) <= 1000
+
+
 def test_their_number_is_bounded_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
     (tmp_path / 'stop_20200101-000000-000000').mkdir()  # cut off by a kill
