@@ -51,10 +51,10 @@ def test_what_the_package_refuses_is_one_line_and_status_1(capsys):
 def test_options_and_status_are_handed_through(monkeypatch):
     given = []
 
-    def fuzz(argv):
+    def kills(argv):
         given.append(argv)
         return 3
 
-    monkeypatch.setattr('bench.fuzz.main', fuzz)
-    assert main(['fuzz', '--count', '5']) == 3
+    monkeypatch.setattr('bench.kills.main', kills)
+    assert main(['kills', '--count', '5']) == 3
     assert given == [['--count', '5']]
