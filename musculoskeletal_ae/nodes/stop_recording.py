@@ -53,7 +53,7 @@ class StopRecording:
         now = time.time_ns()
         self._recent.append((now, topic, data))
         self._recent_size += len(data)
-        while (
+        while self._recent and (
             len(self._recent) > MOST
             or self._recent_size > MOST_BYTES
             or self._recent[0][0] < now - int(SECONDS * 1e9)
