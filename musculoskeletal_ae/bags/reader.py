@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from musculoskeletal_ae.bags import message_types
+from musculoskeletal_ae.bags import mcap_file, message_types, sqlite3_file
 from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
 from musculoskeletal_ae.bags.storage import (
     LATEST,
@@ -22,9 +22,10 @@ from musculoskeletal_ae.bags.storage import (
     BagTopic,
     StorageFile,
     add_topic,
-    open_storage,
+    open_file,
     reading,
 )
+from musculoskeletal_ae.exceptions import BagError
 
 # Messages that may be held at once to bring them into order.
 MOST_HELD = 64 << 20  # [bytes]
@@ -52,7 +53,7 @@ class Bag:
         """
         path = Path(path)
         contents = read_metadata(path) if path.is_dir() else Contents([path], None, '')
-        bag = cls(path, [open_storage(file) for file in contents.files])
+        bag = cls(path, [_open_file(file) for file in contents.files])
         for file in bag.files:
             for topic in file.topics.values():
                 add_topic(bag.topics, topic, file.path)
@@ -100,6 +101,19 @@ class Bag:
             except Exception as error:
                 problem = f'a message of {topic.name} is not a {topic.type}: {error}'
                 raise ValueError(problem) from error
+
+
+def _open_file(path: Path) -> StorageFile:
+    """Read an mcap or a sqlite3 file from end to end, or raise a BagError."""
+    with open_file(path) as stream:
+        head = stream.read(max(len(mcap_file.MAGIC), len(sqlite3_file.MAGIC)))
+    if not head:
+        raise BagError(path, 'the file is empty', 'nothing was recorded: record again')
+    if head.startswith(sqlite3_file.MAGIC):
+        return sqlite3_file.Sqlite3File(path)
+    if head.startswith(mcap_file.MAGIC):
+        return mcap_file.McapFile(path)
+    raise BagError(path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or a .mcap')
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The storage files of a recording: mcap, by the library mcap, and sqlite3, by rosbags.
+"""What the storage files of a recording have in common: topics, messages, and their errors.
 
 A file is read once from end to end when it is opened. After that its topics, its times and how much
 of it is complete are known, and `messages` reads it again.
@@ -8,54 +8,28 @@ of it is complete are known, and `messages` reads it again.
 from __future__ import annotations
 
 import re
-import sqlite3
 from collections.abc import Collection, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple, Protocol
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
-from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
-from rosbags.interfaces import (
-    ConnectionExtRosbag2,
-    MessageDefinitionFormat,
-    Qos,
-    QosDurability,
-)
-from rosbags.rosbag2 import Reader
-from rosbags.rosbag2.metadata import parse_qos
+from mcap.records import Schema
+from rosbags.interfaces import Qos, QosDurability
 
-from musculoskeletal_ae.bags.message_types import CDR, MSG, mismatch
+from musculoskeletal_ae.bags.message_types import CDR, mismatch
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import open_regular
 
-# No record, and no chunk once decompressed, may be larger.
-LARGEST_RECORD = 64 << 20  # [bytes]
-# A file may not decompress to more than this: a few kB can hold hours of work.
-MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100  # [bytes], and times the size of the file
 # A topic's log times may go back by this much. More is a jump of the recorder's clock.
 LONGEST_DISORDER = 1_000_000_000  # [ns]
 LATEST = (1 << 63) - 1  # [ns]; ROS time is signed
 
 DAMAGED = 'use a copy or another recording'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
-_CLOCK = 'record again, without --loop, a second /clock or another jump of time'
 
-_MCAP, _SQLITE = b'\x89MCAP0\r\n', b'SQLite format 3\0'  # first bytes of a file
-_LONGEST_QOS = 10_000  # [characters] of YAML
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
 _LONGEST_NAME = 256  # [characters]
-
-
-_DEFINITION_ENCODINGS = {
-    MessageDefinitionFormat.NONE: '',
-    MessageDefinitionFormat.MSG: MSG,
-    MessageDefinitionFormat.IDL: 'ros2idl',
-}
 
 
 @contextmanager
@@ -123,221 +97,28 @@ class StorageFile(Protocol):
         ...
 
 
-def open_storage(path: Path) -> StorageFile:
-    """Read an mcap or a sqlite3 file from end to end, or raise a BagError."""
-    with _open(path) as stream:
-        head = stream.read(max(len(_MCAP), len(_SQLITE)))
-    if not head:
-        raise BagError(path, 'the file is empty', 'nothing was recorded: record again')
-    if head.startswith(_SQLITE):
-        return Sqlite3File(path)
-    if head.startswith(_MCAP):
-        return McapFile(path)
-    raise BagError(path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or a .mcap')
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading, or raise a BagError."""
+
+    def refuse(file: Path, problem: str) -> BagError:
+        return BagError(file, problem, 'name another bag directory or .mcap')
+
+    return open_regular(path, refuse)
 
 
-class _Span(NamedTuple):
-    """What is in a chunk, so that it need not be decompressed in vain."""
-
-    start: int  # earliest log time [ns]
-    end: int  # latest log time [ns]
-    topics: frozenset[str]
-
-    def has_any(self, topics: Collection[str], start: int, stop: int) -> bool:
-        """Return whether it may have messages of some topics from start to stop [ns]."""
-        return self.start <= stop and self.end >= start and not self.topics.isdisjoint(topics)
+def absolute(name: str) -> str:
+    """Return the absolute name of a recorded topic."""
+    return f'/{name.lstrip("/")}'
 
 
-class McapFile:
-    """An mcap file; one that a killed recorder left is read up to its last complete record."""
-
-    def __init__(self, path: Path) -> None:
-        """Read the file from end to end, checksums included, or raise a BagError."""
-        self.path = path
-        self.topics: dict[str, BagTopic] = {}
-        self.start, self.end = LATEST, 0
-        self.unfinished = ''
-        self.has_checksums = True
-        self._channels: dict[int, BagTopic] = {}
-        self._chunks: list[_Span] = []
-        self._size = path.stat().st_size
-        self._expanded = 0  # bytes of decompressed chunks so far
-        self._complete = 0  # bytes of complete records from the start of the file
-        self._newest: dict[str, int] = {}  # log time so far [ns], by topic
-        with reading(path), _open(path) as file:
-            self._survey(_ExactStream(file))
-
-    def messages(
-        self, topics: Collection[str], start: int = 0, stop: int = LATEST
-    ) -> Iterator[BagMessage]:
-        """Yield messages of some topics from start to stop [ns], both included."""
-        chunks = iter(self._chunks)
-        with reading(self.path), _open(self.path) as file:
-            stream = _ExactStream(file)
-            for record in _record_reader(stream, validate_crcs=False).records:
-                if isinstance(record, DataEnd):
-                    return
-                if isinstance(record, Chunk) and not next(chunks).has_any(topics, start, stop):
-                    contents = []
-                else:
-                    contents = _contents(record)
-                for message in contents:
-                    if isinstance(message, Message):
-                        topic = self._channels[message.channel_id].name
-                        time = message.log_time
-                        if topic in topics and start <= time <= stop:
-                            yield BagMessage(
-                                topic, time, message.publish_time, message.data, self.path
-                            )
-                if stream.position >= self._complete:
-                    return
-
-    def _survey(self, stream: _ExactStream) -> None:
-        """Find topics, times and the end of what is complete; check sizes, order and checksums."""
-        records = _record_reader(stream, validate_crcs=True).records
-        schemas: dict[int, Schema] = {}
-        statistics = None
-        in_data = True  # before the summary, which repeats schemas and channels
-        while True:
-            try:
-                record = next(records)
-            except StopIteration:
-                break
-            except EndOfFile:
-                self._note_cut()
-                return
-            if isinstance(record, Statistics):
-                statistics = record
-            elif isinstance(record, DataEnd):
-                in_data = False
-                self.has_checksums |= record.data_section_crc != 0
-            elif in_data:
-                self._survey_record(record, schemas)
-            self._complete = stream.position
-        count = sum(topic.message_count for topic in self.topics.values())
-        if statistics is not None and statistics.message_count != count:
-            raise ValueError(f'its summary counts {statistics.message_count} messages, not {count}')
-
-    def _note_cut(self) -> None:
-        """Take note that the file ends within a record."""
-        if self._complete == 0:
-            raise ValueError('it ends within its first record')
-        with _open(self.path) as file:
-            file.seek(-len(_MCAP), 2)
-            if file.read() == _MCAP:  # the file was ended, so a length within it is wrong
-                raise ValueError('a record reaches beyond the end of the file')
-        self.unfinished = (
-            f'{self.path.name} ends within a record at byte {self._size}; '
-            f'what follows byte {self._complete} is lost'
-        )
-
-    def _survey_record(self, record: McapRecord, schemas: dict[int, Schema]) -> None:
-        if isinstance(record, Chunk):
-            self._expanded += record.uncompressed_size
-            most = MOST_EXPANDED + LARGEST_EXPANSION * self._size
-            if self._expanded > most:
-                raise ValueError(f'its {self._size} bytes decompress to more than {most} bytes')
-            self.has_checksums &= record.uncompressed_crc != 0
-        elif isinstance(record, Message):
-            self.has_checksums = False
-        messages = []
-        for inner in _contents(record):
-            if isinstance(inner, Schema):
-                schemas[inner.id] = inner
-            elif isinstance(inner, Channel):
-                self._add_channel(inner, schemas)
-            elif isinstance(inner, Message):
-                self._survey_message(inner)
-                messages.append(inner)
-        if isinstance(record, Chunk):
-            times = [message.log_time for message in messages]
-            topics = frozenset(self._channels[message.channel_id].name for message in messages)
-            self._chunks.append(_Span(min(times, default=LATEST), max(times, default=0), topics))
-
-    def _add_channel(self, channel: Channel, schemas: dict[int, Schema]) -> None:
-        schema = schemas[channel.schema_id] if channel.schema_id else Schema(0, b'', '', '')
-        topic = BagTopic(
-            _absolute(channel.topic),
-            schema.name,
-            _qos(channel.metadata.get('offered_qos_profiles', '')),
-            channel.message_encoding,
-            schema,
-        )
-        topic.problem = _problem(topic, channel.metadata.get('topic_type_hash', ''))
-        topic = add_topic(self.topics, topic, self.path)
-        if self._channels.setdefault(channel.id, topic) is not topic:
-            raise ValueError(f'channel {channel.id} has two topics')
-
-    def _survey_message(self, message: Message) -> None:
-        topic = self._channels[message.channel_id]
-        topic.message_count += 1
-        time = message.log_time
-        if max(time, message.publish_time) > LATEST:
-            raise ValueError('a message has a time beyond all ROS times')
-        newest = self._newest[topic.name] = max(self._newest.get(topic.name, 0), time)
-        self.start, self.end = min(self.start, time), max(self.end, time)
-        if newest - time > LONGEST_DISORDER:
-            problem = f'the log times of {topic.name} go back by {(newest - time) / 1e9:.3g} s'
-            raise BagError(self.path, problem, _CLOCK)
-        if self.end - time > LONGEST_DISORDER:
-            raise BagError(self.path, 'its topics are not in the order of time', CONVERT)
-
-
-class Sqlite3File:
-    """A sqlite3 file of rosbag2, read by the library rosbags; it holds no checksums."""
-
-    has_checksums = False
-
-    def __init__(self, path: Path) -> None:
-        """Read the file from end to end, or raise a BagError."""
-        self.path = path
-        self.topics: dict[str, BagTopic] = {}
-        self.start, self.end = LATEST, 0
-        self.unfinished = ''
-        for journal in ('-wal', '-journal'):
-            file = path.with_name(f'{path.name}{journal}')
-            if file.exists() and file.stat().st_size:
-                self.unfinished = f'{path.name} was not closed: what {file.name} holds is not read'
-        with reading(path), Reader(path) as reader:
-            self._check_integrity()
-            for connection in reader.connections:
-                assert isinstance(connection.ext, ConnectionExtRosbag2)
-                definition = connection.msgdef
-                encoding = _DEFINITION_ENCODINGS[definition.format]
-                topic = BagTopic(
-                    _absolute(connection.topic),
-                    connection.msgtype,
-                    connection.ext.offered_qos_profiles,
-                    connection.ext.serialization_format,
-                    Schema(0, definition.data.encode(), encoding, connection.msgtype),
-                    message_count=connection.msgcount,
-                )
-                topic.problem = _problem(topic, connection.digest)
-                add_topic(self.topics, topic, path)
-        for message in self.messages(self.topics):
-            self.start = min(self.start, message.log_time)
-            self.end = max(self.end, message.log_time)
-
-    def _check_integrity(self) -> None:
-        address = f'{self.path.absolute().as_uri()}?mode=ro&immutable=1'
-        with closing(sqlite3.connect(address, uri=True)) as connection:
-            ((result,),) = connection.execute('PRAGMA integrity_check(1)')
-        if result != 'ok':
-            raise ValueError(result)
-
-    def messages(
-        self, topics: Collection[str], start: int = 0, stop: int = LATEST
-    ) -> Iterator[BagMessage]:
-        """Yield messages of some topics from start to stop [ns], both included."""
-        with reading(self.path), Reader(self.path) as reader:
-            wanted = [c for c in reader.connections if _absolute(c.topic) in topics]
-            if not wanted:
-                return
-            for connection, time, data in reader.messages(wanted):
-                if not isinstance(time, int) or not isinstance(data, bytes) or time < 0:
-                    raise ValueError('a row of its table of messages is not a message')
-                if start <= time <= stop:
-                    yield BagMessage(_absolute(connection.topic), time, 0, data, self.path)
+def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
+    """Return why messages of a topic cannot be used; '' if they can."""
+    if len(topic.name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(topic.name):
+        return 'has a name that no topic of ROS can have'
+    if topic.encoding != CDR:
+        return f'is encoded as {topic.encoding[:40]!r}, not cdr'
+    definition = topic.schema or Schema(0, b'', '', topic.type)
+    return mismatch(topic.type, definition.encoding, definition.data, recorded_hash)
 
 
 def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTopic:
@@ -348,83 +129,3 @@ def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTo
         raise BagError(file, problem, 'record one type on a topic')
     first.message_count += topic.message_count
     return first
-
-
-def _open(path: Path) -> BinaryIO:
-    def refuse(file: Path, problem: str) -> BagError:
-        return BagError(file, problem, 'name another bag directory or .mcap')
-
-    return open_regular(path, refuse)
-
-
-class _ExactStream:
-    """Returns as many bytes as the library asks for, or raises EndOfFile."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.position = 0
-        self._stream = stream
-
-    def read(self, size: int) -> bytes:
-        if size < 0:
-            raise ValueError('the lengths in a record do not fit')
-        data = self._stream.read(size)
-        self.position += len(data)
-        if len(data) < size:
-            raise EndOfFile
-        return data
-
-
-def _record_reader(stream: Any, validate_crcs: bool) -> StreamReader:
-    return StreamReader(
-        stream, emit_chunks=True, validate_crcs=validate_crcs, record_size_limit=LARGEST_RECORD
-    )
-
-
-def _contents(record: McapRecord) -> list[McapRecord]:
-    """Return the records in a chunk; another record as it is."""
-    if not isinstance(record, Chunk):
-        return [record]
-    # The library decompresses whatever comes out. Here it is no more than the chunk announces.
-    data = _decompress(record)
-    if len(data) != record.uncompressed_size:
-        raise ValueError(f'a chunk does not decompress to {record.uncompressed_size} bytes')
-    return breakup_chunk(replace(record, compression='', data=data), validate_crc=True)
-
-
-def _decompress(chunk: Chunk) -> bytes:
-    size = chunk.uncompressed_size
-    if size > LARGEST_RECORD:
-        raise ValueError(f'a chunk of {size} bytes exceeds the limit of {LARGEST_RECORD}')
-    if chunk.compression == 'zstd':
-        decompressor = zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_RECORD)
-        return decompressor.stream_reader(chunk.data, read_across_frames=True).read(size + 1)
-    if chunk.compression == 'lz4':
-        data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-        return data
-    if chunk.compression:
-        raise ValueError(f'compression {chunk.compression[:40]!r} is neither zstd nor lz4')
-    return chunk.data
-
-
-def _absolute(name: str) -> str:
-    return f'/{name.lstrip("/")}'
-
-
-def _problem(topic: BagTopic, recorded_hash: str) -> str:
-    """Return why messages of a topic cannot be used; '' if they can."""
-    if len(topic.name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(topic.name):
-        return 'has a name that no topic of ROS can have'
-    if topic.encoding != CDR:
-        return f'is encoded as {topic.encoding[:40]!r}, not cdr'
-    definition = topic.schema or Schema(0, b'', '', topic.type)
-    return mismatch(topic.type, definition.encoding, definition.data, recorded_hash)
-
-
-def _qos(text: str) -> list[Qos]:
-    """Return the offered profiles in a channel's metadata; [] if they cannot be read."""
-    if len(text) > _LONGEST_QOS:
-        return []
-    try:
-        return parse_qos(text)
-    except Exception:  # noqa: BLE001 - the library raises many kinds; profiles are only a hint
-        return []
