@@ -75,13 +75,16 @@ class Replay(Node):
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
         self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
         self._sought: int | None = None  # where to go on [ns]
-        told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
+        description = 'go on from here, counted from the beginning [s]'
+        descriptor = ParameterDescriptor(description=description)
         end = self._before + self.length
         legal = FloatingPointRange(from_value=self._before, to_value=end)
-        told.floating_point_range = [legal]
-        self.declare_parameter('position', self._before, told)
+        descriptor.floating_point_range = [legal]
+        self.declare_parameter('position', self._before, descriptor)
         self.add_post_set_parameters_callback(self._seek)
-        self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
+        self._position_publisher = self.create_publisher(
+            Float64MultiArray, 'replay/position', RELIABLE
+        )
         reception = Reception(self.get_logger().warning)  # of nothing: it only sends
         self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
@@ -144,7 +147,7 @@ class Replay(Node):
                     report = Report('ok', doing, {'position': self._position()})
                     self._diagnostics.tell(report)
                     seconds = self._before + np.array([self._done(), self.length])
-                    self._told.publish(array_message(seconds, ''))
+                    self._position_publisher.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
             else:
                 time.sleep(wait)
@@ -212,11 +215,11 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
     listeners, reports = set[str](), list[dict[str, str]]()
 
-    def hear(message: DiagnosticArray) -> None:
-        said = (status for status in message.status if status.name in listeners)
-        reports.extend({value.key: value.value for value in status.values} for status in said)
+    def on_diagnostics(message: DiagnosticArray) -> None:
+        statuses = (status for status in message.status if status.name in listeners)
+        reports.extend({value.key: value.value for value in status.values} for status in statuses)
 
-    node.create_subscription(DiagnosticArray, '/diagnostics', hear, RELIABLE)
+    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, RELIABLE)
     _await_subscribers(spinner, [publisher], options.wait)
     for each in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)):
         listeners.add(f'{each.node_namespace.rstrip("/")}/{each.node_name}: state')
@@ -301,8 +304,10 @@ def parse(arguments: list[str]) -> Namespace:
     if options.robot and not options.check:
         parser.error('--robot is for --check')
     if options.check:
-        given = {name for name, value in vars(options).items() if value != parser.get_default(name)}
-        if ignored := sorted(given - {'bag', 'check', 'robot', 'from_namespace'}):
+        changed = {
+            name for name, value in vars(options).items() if value != parser.get_default(name)
+        }
+        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
             parser.error(f'--check plays nothing: without --{ignored[0].replace("_", "-")}')
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
