@@ -88,22 +88,27 @@ def write_metadata(
         finished: Whether the recording has ended, so that the file must survive a power cut.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
-    span: dict[str, Any] = {
-        'duration': {'nanoseconds': end - start},
-        'starting_time': {'nanoseconds_since_epoch': start},
-    }
+    duration = {'nanoseconds': end - start}
+    starting_time = {'nanoseconds_since_epoch': start}
     entries = [_topic_entry(topic, type_hash) for topic, type_hash in topics]
     count = sum(entry['message_count'] for entry in entries)
+    file = {
+        'path': name,
+        'starting_time': starting_time,
+        'duration': duration,
+        'message_count': count,
+    }
     information = {
         'version': VERSION,
         'storage_identifier': 'mcap',
-        **span,
+        'duration': duration,
+        'starting_time': starting_time,
         'message_count': count,
         'topics_with_message_count': entries,
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': [name],
-        'files': [{'path': name, **span, 'message_count': count}],
+        'files': [file],
         'custom_data': None,
         'ros_distro': 'jazzy',
     }
