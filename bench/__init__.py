@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements that are not part of the product: kills, soak, fuzz, timings, calibration."""
+"""Measurements that are not part of the product: kills, soak, timings, calibration."""
 
 import sys
 from pathlib import Path

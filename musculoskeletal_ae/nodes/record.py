@@ -13,8 +13,9 @@ from pathlib import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags.metadata import Qos, offered_qos
+from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
 from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
@@ -98,31 +99,31 @@ def _record(options: Namespace, arguments: list[str]) -> None:
                 spinner.look(0.05)
         node.destroy_node()
     if node.timeless:
-        told = 'messages came before the first /clock, and are left out'
-        print(f'warning: {node.timeless} {told}', file=sys.stderr)
+        problem = 'messages came before the first /clock, and are left out'
+        print(f'warning: {node.timeless} {problem}', file=sys.stderr)
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
 
 
 def parse(arguments: list[str]) -> Namespace:
     """Return the options of `record`."""
-    told = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
-    parser = Parser('record', told + ROS_HELP)
+    what = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
+    parser = Parser('record', what + ROS_HELP)
     add = parser.add_argument
     add('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
     add('-o', '--out', type=Path, metavar='DIR', help='the same')
     add('--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)')
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     add('--compression', choices=COMPRESSIONS, default='zstd', help='of the messages')
-    mended = (
-        'make a finished bag of one whose recorder was killed: in place, the original kept as '
-        'BAG.unfinished, or in DIR'
+    recover_help = (
+        'copy what can be read of a bag, such as one whose recorder was killed, to a finished one '
+        'in DIR (default: BAG_recovered)'
     )
-    add('--recover', type=Path, metavar='BAG', help=mended)
+    add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
         parser.error('DIR is given twice')
     if options.recover and (options.topics or options.duration):
-        parser.error('--recover mends the whole recording: without --topics and --duration')
+        parser.error('--recover copies the whole recording: without --topics and --duration')
     options.out = options.out or options.directory
     options.topics = options.topics or list(TOPICS)
     return options
@@ -137,12 +138,13 @@ def _topics(text: str) -> list[str]:
 
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
-        bag, count, backup, left_out = recover(options.recover, options.out, options.compression)
-        kept = f'; the original is kept as {backup}' if backup else ''
-        print(f'{count} messages recovered to {bag}{kept}')
+        bag = options.recover
+        target = options.out or bag.with_name(f'{bag.stem}_recovered')
+        count, left_out = recover(bag, target, options.compression)
+        print(f'{count} messages recovered to {target}')
         if left_out:
-            told = f'left out, since they are not in CDR: {", ".join(left_out)}'
-            print(f'warning: {options.recover}: {told}', file=sys.stderr)
+            problem = f'left out, since they are not in CDR: {", ".join(left_out)}'
+            print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
         _record(options, arguments)
     return 0

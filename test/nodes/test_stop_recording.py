@@ -46,6 +46,32 @@ def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
     assert (recording.saved / FILE).read_text() == 'a cause\n'
 
 
+@pytest.mark.parametrize('most', [stop_recording.MOST, 3])
+def test_what_was_latched_before_is_kept_though_newer_came(recording, now, monkeypatch, most):
+    monkeypatch.setattr(stop_recording, 'MOST', most)
+    for step, detected in enumerate((True, False, True, False)):
+        now[0] += int((0.4 if step else 0.0) * SECONDS * 1e9)
+        recording.heard('anomaly_detected', serialize_message(Bool(data=detected)))
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    kept = [bag.decode(message).data for message in bag.messages()]
+    assert kept == [True, False, True, False]
+
+
+def test_large_messages_do_not_fill_the_memory(recording, monkeypatch):
+    monkeypatch.setattr(stop_recording, 'MOST_BYTES', 1000)
+    for n in range(100):
+        recording.heard('muscle_states', states(float(n)))
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    kept = [bag.decode(message).data[0] for message in bag.messages()]
+    assert kept == list(range(100 - len(kept), 100))
+    recording.heard('muscle_states', serialize_message(Float64MultiArray(data=[1.0] * 1000)))
+    assert 0 < sum(len(message.data) for message in bag.messages()) <= 1000
+
+
 def test_old_recordings_are_deleted_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
     (tmp_path / 'stop_20200101-000000-000000').mkdir()  # cut off by a kill
