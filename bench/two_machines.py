@@ -34,7 +34,7 @@ import numpy as np
 from ament_index_python.packages import get_package_prefix
 
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.state import State
+from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, number, whole
@@ -252,7 +252,7 @@ def learn(initial: Path, minutes: float, seed: int, bad: tuple[float, float, flo
             for process in processes:
                 process.wait()
         store = SampleStore()
-        mae = State(state, Robot.load(ROBOT)).load(store)
+        mae = StateStore(state, Robot.load(ROBOT)).load(store)
     errors = [line['error'] for line in lines if line['error'] is not None]
     return Outcome(
         before=float(np.mean(errors[:5])),

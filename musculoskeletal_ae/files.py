@@ -60,14 +60,6 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
     raise refuse(file, f'is larger than {largest} bytes')
 
 
-def read_start(file: Path, largest: int) -> bytes:
-    """Return the first bytes of a regular file, none without one; an OSError says why not."""
-    if not file.is_file():
-        return b''
-    with file.open('rb') as stream:
-        return stream.read(largest)
-
-
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file of at most `largest` bytes."""
     try:
@@ -176,8 +168,12 @@ def _check(text: str) -> None:
             raise ValueError(f'{where}: more than {DEEPEST} levels')
 
 
-def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old one or the new one, never a part."""
+def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
+    """Write a file so that a reader sees the old one or the new one, never a part.
+
+    The old one is kept as `previous`, where that is given. Between the two renames there is only
+    that one.
+    """
     descriptor, temporary = tempfile.mkstemp(dir=file.parent, prefix=f'.{file.name}.')
     try:
         with os.fdopen(descriptor, 'wb') as stream:
@@ -185,18 +181,15 @@ def write_whole(file: Path, data: bytes) -> None:
             stream.flush()
             os.fchmod(stream.fileno(), 0o644)  # mkstemp makes it private
             os.fsync(stream.fileno())
+        if previous is not None and file.exists():
+            file.replace(previous)
         Path(temporary).replace(file)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
     # The new name survives a power cut only once the directory is on disk too.
-    sync_directory(file.parent)
-
-
-def sync_directory(directory: Path) -> None:
-    """Let names in a directory survive a power cut."""
-    descriptor = os.open(directory, os.O_RDONLY)
+    directory = os.open(file.parent, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        os.fsync(directory)
     finally:
-        os.close(descriptor)
+        os.close(directory)

@@ -29,7 +29,7 @@ from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, un
 from musculoskeletal_ae.learning.rest import RestCollector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
-from musculoskeletal_ae.learning.state import State
+from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.learning.training import Job, Training, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -100,7 +100,7 @@ class Learner:
         self._gate_time = 0.0  # [s] of the messages
         self.refused = 0  # updates that the gate did not let through
         self.last_refused = ''
-        self._state = None if directory is None else State(directory, robot)
+        self._state = None if directory is None else StateStore(directory, robot)
         saved = None if self._state is None else self._state.load(self.samples)
         gated = self.training.preset.gated
         if self._state is not None and saved is not None and gated and not self._passes(saved):
@@ -389,7 +389,7 @@ class Learner:
     @property
     def trouble(self) -> str:
         """Why nothing is learned, or what is learned is not on disk; or ''."""
-        disk = '' if self._state is None else self._state.trouble
+        disk = '' if self._state is None else self._state.trouble(self.samples)
         return '; '.join(filter(None, (self.training.trouble, disk)))
 
     def report(self) -> Report:
