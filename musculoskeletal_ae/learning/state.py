@@ -13,55 +13,21 @@ the learner's again when it is copied to `learner.state` while no learner runs.
 import fcntl
 import os
 import time
-import zlib
 from pathlib import Path
 from typing import TextIO
 
-import msgspec
-import numpy as np
-
-from musculoskeletal_ae.arrays import Bools
-from musculoskeletal_ae.exceptions import CheckpointError, StateError
+from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.files import read_bytes, write_whole
+from musculoskeletal_ae.learning import saved_state
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.mae import checkpoint as checkpoints
+from musculoskeletal_ae.learning.saved_state import SavedState
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
-LARGEST = 1 << 26  # [bytes] of a state; a full one of the shipped arms has a fiftieth
-CHECKSUM = 4  # [bytes] at the start of a file
+LARGEST = 1 << 26  # [bytes] of a state; a full one of the shipped arms has a hundredth
 #: between two checks that the files are still there, and between two attempts to save [s]
 CHECK_INTERVAL, RETRY_INTERVAL = 0.5, 2.0
-
-Values = tuple[float, ...]
-
-
-class SavedSample(msgspec.Struct, frozen=True, array_like=True):
-    """One `Sample`, its number among all ever accepted, and which muscles it describes."""
-
-    number: int
-    theta: Values
-    tension: Values
-    length: Values
-    direction: Values
-    spread: Values
-    gravity: Values
-    known: tuple[bool, ...]
-
-    def sizes(self) -> tuple[int, ...]:
-        """Return the number of values of each part that has one for every joint or muscle."""
-        parts = self.theta, self.tension, self.length, self.direction, self.known
-        return tuple(map(len, parts))
-
-
-class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a state file holds, as MessagePack behind a checksum."""
-
-    joints: tuple[str, ...]
-    muscles: tuple[str, ...]
-    samples: tuple[SavedSample, ...]  # the oldest first
-    network: bytes | None  # a checkpoint
 
 
 class StateStore:
@@ -135,97 +101,45 @@ class StateStore:
         Raises:
             StateError: If a state cannot become a backup.
         """
-        problems = []
         try:
-            for file in (self._newest, self._previous):
-                if not file.exists():
-                    continue
-                try:
-                    data = read_bytes(file, _refuse, LARGEST)
-                    saved = self._decode(file, data)
-                except StateError as error:
-                    problems.append(f'{error} (kept as {self._set_aside(file)})')
-                    continue
-                if problems:
-                    problems.append('the state saved before it is used')
-                self._restore(saved, samples)
-                mae, problem = self._restore_network(saved)
-                if problem:
-                    backup = self._free_name()
-                    write_whole(backup, data)
-                    self._save(samples, None)
-                    problems.append(f'{file}: {problem} (kept as {backup})')
-                return mae
-            if problems:
-                problems.append('learning starts anew')
+            return self._load(samples)
         except OSError as error:
             raise StateError(
                 f'{self.directory}: a state that cannot be used cannot be kept as a backup '
                 f'({error}); make space there, or give another state_directory'
             ) from error
-        finally:
-            self.not_used = '; '.join(problems)
-        return None
 
-    def _decode(self, file: Path, data: bytes) -> SavedState:
-        """Return the state of a file's content, which fits the robot."""
-        checksum, content = data[:CHECKSUM], data[CHECKSUM:]
-        try:
-            if checksum != _checksum(content):
-                raise StateError(f'{file}: damaged, or no state of a learner')
-            saved = msgspec.msgpack.decode(content, type=SavedState)
-        except msgspec.MsgspecError as error:
-            raise StateError(
-                f'{file}: no state of this version of the learner ({error})'
-            ) from error
-        joints, muscles = self._robot.joints, self._robot.muscles
-        if saved.joints != joints or not set(saved.muscles) <= set(muscles):
-            raise StateError(
-                f'{file}: of a robot with joints {", ".join(saved.joints)} and muscles '
-                f'{", ".join(saved.muscles)}; this one has {", ".join(joints)} and '
-                f'{", ".join(muscles)}'
-            )
-        sizes = len(joints), *4 * [len(saved.muscles)]
-        spreads = 0, len(joints)
-        gravities = 0, 3 * len(self._robot.kinematics.parent)
-        for sample in saved.samples:
-            if (
-                sample.sizes() != sizes
-                or len(sample.spread) not in spreads
-                or len(sample.gravity) not in gravities
-            ):
-                raise StateError(f'{file}: sample {sample.number} does not fit the robot')
-        return saved
-
-    def _restore(self, saved: SavedState, samples: SampleStore) -> None:
-        robot = self._robot
-        places = list(robot.muscle_indices(saved.muscles))
-        for sample in saved.samples:
-            theta = np.array(sample.theta)
-            # What is not known of an added muscle is as the geometric model has it.
-            tension = robot.tension.bias.copy()
-            length = robot.muscle_lengths(np.nan_to_num(theta), tension)
-            direction = np.zeros(robot.muscle_count)
-            known: Bools = np.zeros(robot.muscle_count, dtype=bool)
-            tension[places] = sample.tension
-            length[places] = sample.length
-            direction[places] = sample.direction
-            known[places] = sample.known
-            spread, gravity = np.array(sample.spread), np.array(sample.gravity)
-            restored = Sample(theta, tension, length, direction, spread, gravity)
-            samples.add(restored, known, sample.number)
+    def _load(self, samples: SampleStore) -> Mae | None:
+        state = self._read(self._newest)
+        if state is None:
+            state = self._read(self._previous)
+            if self.not_used:
+                used = 'learning starts anew' if state is None else 'the state before it is used'
+                self.not_used += f'; {used}'
+        if state is None:
+            return None
+        saved_state.restore_samples(state, self._robot, samples)
         self._saved_samples = list(samples.samples)
-
-    def _restore_network(self, saved: SavedState) -> tuple[Mae | None, str]:
-        """Return the saved network, and what is wrong with it."""
-        if added := [name for name in self._robot.muscles if name not in saved.muscles]:
-            return None, f'of the robot without {", ".join(added)}; its samples are used'
-        if saved.network is None:
-            return None, ''
         try:
-            return checkpoints.from_bytes(saved.network, self._robot), ''
-        except CheckpointError as error:
-            return None, f'the saved network: {error}; its samples are used'
+            return saved_state.restore_network(state, self._robot)
+        except StateError as error:
+            self._note_backup(error, self._write_backup(state))
+            self._save(samples, None)
+            return None
+
+    def _read(self, file: Path) -> SavedState | None:
+        """Return the state of a file; make the file a backup if it cannot be used."""
+        if not file.exists():
+            return None
+        try:
+            return saved_state.from_bytes(read_bytes(file, _refuse, LARGEST), self._robot)
+        except StateError as error:
+            self._note_backup(f'{file}: {error}', file.rename(self._free_name()))
+            return None
+
+    def _note_backup(self, problem: object, backup: Path) -> None:
+        note = f'{problem} (kept as {backup})'
+        self.not_used = f'{self.not_used}; {note}' if self.not_used else note
 
     # -- writing --------------------------------------------------------------------------------
 
@@ -278,16 +192,15 @@ class StateStore:
         Raises:
             StateError: If that cannot be done.
         """
-        backup = self._free_name()
         try:
-            write_whole(backup, self._encode(samples, network))
+            backup = self._write_backup(saved_state.collect(self._robot, samples, network))
         except OSError as error:
             raise StateError(
                 f'{self.directory}: no backup can be made ({error}); nothing was replaced. Make '
                 'space there and try again'
             ) from error
         if reason:
-            self.not_used = f'{reason} (kept as {backup})'
+            self._note_backup(reason, backup)
 
     def _check_in_place(self) -> None:
         """Open the directory if need be; raise an OSError if it, or the state, was removed."""
@@ -303,18 +216,14 @@ class StateStore:
             raise FileNotFoundError(f'{self._newest} was removed')
 
     def _save(self, samples: SampleStore, network: bytes | None) -> None:
-        write_whole(self._newest, self._encode(samples, network), self._previous)
+        state = saved_state.collect(self._robot, samples, network)
+        write_whole(self._newest, saved_state.to_bytes(state), self._previous)
         self._saved_samples, self._is_saved = list(samples.samples), True
 
-    def _encode(self, samples: SampleStore, network: bytes | None) -> bytes:
-        stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
-        saved = tuple(
-            SavedSample(number, *(tuple(part.tolist()) for part in (*sample, known)))
-            for number, sample, known in stored
-        )
-        state = SavedState(self._robot.joints, self._robot.muscles, saved, network)
-        content = msgspec.msgpack.encode(state)
-        return _checksum(content) + content
+    def _write_backup(self, state: SavedState) -> Path:
+        backup = self._free_name()
+        write_whole(backup, saved_state.to_bytes(state))
+        return backup
 
     def _free_name(self) -> Path:
         number = 1
@@ -322,14 +231,6 @@ class StateStore:
             number += 1
         return backup
 
-    def _set_aside(self, file: Path) -> Path:
-        """Rename a file that cannot be used, so that nothing overwrites it; return its new name."""
-        return file.rename(self._free_name())
 
-
-def _checksum(content: bytes) -> bytes:
-    return zlib.crc32(content).to_bytes(CHECKSUM, 'big')
-
-
-def _refuse(file: Path, problem: str) -> StateError:
-    return StateError(f'{file} {problem}')
+def _refuse(_: Path, problem: str) -> StateError:
+    return StateError(problem)
