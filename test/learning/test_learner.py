@@ -391,7 +391,7 @@ def test_a_replaced_network_is_not_judged_by_what_the_last_one_felt(learner, ini
 def test_nothing_of_a_replaced_network_is_owed_or_told(learner, initial, stage):
     accept(learner, stage, 3)
     learner.poll(0.0)
-    learner._owed = 300  # as where as many samples had come back without their network
+    learner._updates_to_repeat = 300  # as where as many samples had come back without their network
     learner.isolate((2,))
     Arm(learner, stage).rest(1.0 + MARGIN + 0.5)
     assert learner._spoiled.any()
