@@ -145,7 +145,7 @@ class Reader:
     def __init__(self, folder: Path) -> None:
         """Make the sound files that are damaged."""
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
-        from musculoskeletal_ae.learning.state import State
+        from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
         from musculoskeletal_ae.mae.training import initial_mae
         from musculoskeletal_ae.robot.robot import Robot
@@ -153,7 +153,7 @@ class Reader:
         self.folder, self.robot = folder, Robot.load('arm26')
         self.sound = self.robot.description.directory
         self.network = checkpoint.to_bytes(initial_mae(self.robot, steps=2).mae)
-        store, state = SampleStore(), State(folder / 'state', self.robot)
+        store, state = SampleStore(), StateStore(folder / 'state', self.robot)
         state.load(store)
         for theta in self.robot.random_postures(5, np.random.default_rng(0)):
             tension = np.full(self.robot.muscle_count, 50.0)
@@ -161,7 +161,7 @@ class Reader:
             store.add(Sample(theta, tension, length, np.zeros(self.robot.muscle_count)))
         state.keep(store, self.network)
         state.close()
-        self.state = (folder / 'state' / 'learner.sqlite').read_bytes()
+        self.state = (folder / 'state' / NEWEST).read_bytes()
         bag = _write_bag(folder / 'bag')
         self.bag = {file.name: file.read_bytes() for file in sorted(bag.iterdir())}
 
@@ -219,16 +219,16 @@ class Reader:
 
     def _state(self, trial: Path, rng: random.Random) -> Callable[[], object]:
         from musculoskeletal_ae.learning.samples import SampleStore
-        from musculoskeletal_ae.learning.state import State
+        from musculoskeletal_ae.learning.state import NEWEST, PREVIOUS, StateStore
 
-        name = rng.choice(['learner.sqlite'] * 4 + ['samples.log', 'checkpoint.safetensors'])
-        if name != 'learner.sqlite' or rng.random() < 0.3:
-            strange_file(trial / name, rng)
-        else:
-            (trial / name).write_bytes(damage(self.state, rng.randbytes(300), rng))
+        for name in rng.choice([(NEWEST,), (PREVIOUS,), (NEWEST, PREVIOUS)]):
+            if rng.random() < 0.3:
+                strange_file(trial / name, rng)
+            else:
+                (trial / name).write_bytes(damage(self.state, rng.randbytes(300), rng))
 
         def read() -> None:
-            state = State(trial, self.robot)
+            state = StateStore(trial, self.robot)
             state.load(SampleStore())
             state.close()
 

@@ -85,7 +85,7 @@ class Learner(Shell):
     def _directory(self, value: str) -> Path | None:
         if value != 'auto':
             return Path(value) if value else None
-        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `State` knows ~
+        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `StateStore` expands ~
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 

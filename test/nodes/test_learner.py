@@ -17,7 +17,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.learning.rest import MARGIN
-from musculoskeletal_ae.learning.state import FILE
+from musculoskeletal_ae.learning.state import NEWEST
 from musculoskeletal_ae.learning.training import Training
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
@@ -148,7 +148,7 @@ def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_trainin
     assert learner.samples >= 3
     assert versions(graph, arm26) == sorted(set(versions(graph, arm26)))
     assert learner.report().level == 'ok'
-    assert (Path(state) / FILE).exists()
+    assert (Path(state) / NEWEST).exists()
     assert graph.call(Trigger, 'learner/save').success
     first = learner.report().values['training process']
     os.kill(int(first), signal.SIGKILL)
@@ -202,7 +202,7 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
     assert graph.set_parameter('learner', 'checkpoint', trained_file) == (True, '')
     assert learner.samples == 0
     graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
-    assert (Path(state) / 'backup-1' / FILE).exists()
+    assert (Path(state) / 'backup-1.state').exists()
     assert graph.set_parameter('learner', 'fresh', True) == (True, '')
 
 
@@ -213,7 +213,7 @@ def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, graph, sta
     learner.node.core.close()
     fresh = host(state_directory=state, fresh=True)
     assert fresh.samples == 0
-    assert (Path(state) / 'backup-1' / FILE).exists()
+    assert (Path(state) / 'backup-1.state').exists()
     fresh.learn(lambda: fresh.updates >= 1, 'learning anew')
 
 
@@ -267,7 +267,7 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     # One start, and one backup of all that was known.
     assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
     assert learner.samples == 0
-    assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1']
+    assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
     assert together(checkpoint='').successful
 
 
