@@ -27,8 +27,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
-from musculoskeletal_ae.robot.description import RobotDescription, Wrap, shown
-from musculoskeletal_ae.robot.entries import refusal
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
