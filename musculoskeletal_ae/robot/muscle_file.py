@@ -27,7 +27,7 @@ Name = Annotated[str, Meta(min_length=1, max_length=200)]
 Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
 
 
-class ElasticEntry(Strict):
+class ElasticEntry(Strict, frozen=True):
     """Constants of a series elastic element; those left out are the default."""
 
     force: Positive | UnsetType = UNSET
@@ -35,7 +35,7 @@ class ElasticEntry(Strict):
     wire_stretch: NotNegative | UnsetType = UNSET
 
 
-class TensionEntry(Strict):
+class TensionEntry(Strict, frozen=True):
     """Tensions of a muscle [N]; those left out are the default."""
 
     bias: Positive | UnsetType = UNSET
@@ -43,7 +43,7 @@ class TensionEntry(Strict):
     max: Positive | UnsetType = UNSET
 
 
-class RouteEntry(Strict):
+class RouteEntry(Strict, frozen=True):
     """A point of a route or, with `wrap`, a surface that the tendon wraps around."""
 
     link: Name
@@ -56,7 +56,7 @@ class RouteEntry(Strict):
     def __post_init__(self) -> None:
         """Check which keys belong to which kind, and the geometry of a cylinder."""
         if self.wrap is None:
-            if not self.axis is self.radius is self.side is None:
+            if any(value is not None for value in (self.axis, self.radius, self.side)):
                 raise ValueError('axis, radius and side need wrap: sphere or wrap: cylinder')
             return
         if self.radius is None:
@@ -78,7 +78,7 @@ class RouteEntry(Strict):
                 raise ValueError('side: expected a point beside the axis, got one on it')
 
 
-class MuscleEntry(Strict):
+class MuscleEntry(Strict, frozen=True):
     """A muscle; what is left out is that of all muscles."""
 
     name: Name
@@ -99,7 +99,7 @@ class MuscleEntry(Strict):
             raise ValueError('route: expected a point before and after each wrap')
 
 
-class CouplingEntry(Strict):
+class CouplingEntry(Strict, frozen=True):
     """A joint that follows another: q = ratio · q_master + offset."""
 
     joint: Name
@@ -108,7 +108,7 @@ class CouplingEntry(Strict):
     offset: Number = 0.0
 
 
-class MuscleFile(Strict):
+class MuscleFile(Strict, frozen=True):
     """The whole file."""
 
     joints: Names

@@ -180,7 +180,7 @@ def test_a_muscle_has_a_tension_and_stiffness_of_its_own(tmp_path):
         arm.command_tension(np.full(robot.muscle_count, 1000.0))
     np.testing.assert_allclose(arm._muscle.reference, robot.tension.max)
     document['muscles'][1]['tension'] = {'bias': 400.0}
-    with pytest.raises(RobotDescriptionError, match=r"'pull_front_in': \$\.muscles\[1\]\.tension: expected bias"):
+    with pytest.raises(RobotDescriptionError, match=r"'pull_front_in': .*tension: expected bias"):
         Robot.load(write_muscles(tmp_path, document))
 
 
