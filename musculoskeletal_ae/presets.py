@@ -19,6 +19,7 @@ from musculoskeletal_ae.schema import Strict
 if TYPE_CHECKING:  # options are read without numpy
     from musculoskeletal_ae.robot.groups import Group
 
+Activation = Literal['tanh', 'silu']
 Count = Annotated[int, Meta(ge=1)]
 Positive = Annotated[float, Meta(gt=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -34,7 +35,7 @@ class NetworkSettings(Strict, frozen=True):
 
     hidden: tuple[Count, ...]  # units of the encoder's hidden layers; the decoder's are the reverse
     #: after every layer but the latent and the last one, which are linear
-    activation: Literal['tanh', 'silu']
+    activation: Activation
     standardise: bool  # centre inputs and divide by their spread in training; undone at the output
     #: a block of its own for each group of joints and muscles that share nothing with the others,
     #: whose layers grow with the group; else one network of `hidden` for any body

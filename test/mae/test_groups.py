@@ -135,7 +135,7 @@ def test_a_checkpoint_brings_the_groups_and_the_same_answers(mae, state):
         ({'groups': (*LIMBS[:2], Group((2, 3), (2, 3, 3)))}, 'each joint and muscle in one group'),
         ({'groups': (*LIMBS, Group((), ()))}, 'each joint and muscle in one group'),
         ({'groups': (Group((0, 1, 4), (0, 1, 5, 6, 7, 8)), LIMBS[2])}, 'layer_sizes'),
-        ({'groups': ()}, 'layer_sizes'),
+        ({'groups': ()}, 'groups'),
         ({'groups': 3}, 'groups'),
         ({'groups': [[[-1], [0]]]}, 'groups'),
         ({'layer_sizes': [1, 2, 3]}, 'layer_sizes'),
