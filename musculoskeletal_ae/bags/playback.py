@@ -21,7 +21,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import BagMessage
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.validity import MOST_ENTRIES, read_joints
+from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
@@ -117,7 +117,7 @@ def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
         joint_state = bag.decode(message)
         with suppress(MessageError):  # left out, as a node would
             names = sorted(joint_state.name)
-            values = read_joints(joint_state, names, foreign_allowed=False)
+            values = read_target(joint_state, names)
             theta = np.array([values[name][0] for name in names])
             postures[tuple(names)].append(((message.log_time - start) / 1e9, theta))
     if not postures:

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
@@ -126,7 +125,7 @@ def test_training_leaves_the_callers_random_state_and_threads_alone(robot):
 def test_training_goes_on_from_given_weights(robot, trained):
     rng = np.random.default_rng(2)
     batches = shuffled(random_states(robot, 2000, rng, 200.0).scaled(), 64, rng)
-    settings = replace(PAPER.training, steps=200, step_size=3e-4)
+    settings = structs.replace(PAPER.training, steps=200, step_size=3e-4)
     before = trained['paper']
     network = from_mae(before)
     observed: list[int] = []

@@ -19,7 +19,7 @@ from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_the_simulator_rests_at_the_tension_bias_before_a_command(arm, arm26, co
         ('quantity', 3, 18),
         ('muscle', 6, 6),
     ]
-    _, tension, temperature = read_array(message, 3, 6)
+    _, tension, temperature = read_muscle_states(message, 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     np.testing.assert_array_equal(temperature, 25.0)
     assert tuple(arm.next('sim/joint_states').name) == arm26.joints
@@ -136,7 +136,7 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
-    _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
+    _, tension, _ = read_muscle_states(arm.next('sim/muscle_states'), 6)
     assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
@@ -189,7 +189,7 @@ def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, 
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
     graph.wait(lambda: shell.left_out == (1,), 'the isolation')
     graph.next('muscle_states', 2)
-    _, tension, _ = read_array(graph.received['muscle_states'][-1], 3, 6)
+    _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     assert shell.longest_step == 1.0  # or at 2 Hz it would fall behind
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coupled joints, several end effectors, and what each muscle may have of its own."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,6 +15,7 @@ from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
+ANGLES = np.array([-0.5, 0.1, 0.2])  # angles of bend, lift and swing
 COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
 
 
@@ -114,13 +117,37 @@ def test_a_mimic_is_followed_in_a_default_namespace_and_wheels_elsewhere_are_hel
     [
         ([COUPLED, {'joint': 'bend', 'master': 'finger'}], 'follows itself'),
         ([{'joint': 'finger', 'master': 'toe'}], "unknown joint 'toe'"),
-        ([{**COUPLED, 'ratio': 'x'}], 'ratio: expected a finite number'),
+        ([{**COUPLED, 'ratio': 'x'}], r'couplings\[0\].ratio: expected float, got str'),
     ],
 )
 def test_a_wrong_coupling_is_refused(tmp_path, couplings, expected):
     directory = coupled_arm(tmp_path, joints=['lift', 'swing'], couplings=couplings)
     with pytest.raises(RobotDescriptionError, match=expected):
         Robot.load(directory)
+
+
+@pytest.mark.parametrize('limit', ['', '<limit lower="0" upper="0" effort="0" velocity="0"/>'])
+def test_a_continuous_joint_may_mimic_a_listed_one_since_it_needs_no_limits(tmp_path, limit):
+    urdf = coupled_arm(tmp_path) / 'robot.urdf'
+    mimic = 'type="continuous"><axis xyz="0 0 1"/><mimic joint="bend" multiplier="2"/>' + limit
+    joint, rest = urdf.read_text().split('<joint name="finger" type="revolute">')
+    rest = re.sub(r'<axis.*?<limit.*?/>', '', rest, count=1, flags=re.DOTALL)
+    urdf.write_text(f'{joint}<joint name="finger" {mimic}{rest}')
+    robot = Robot.load(tmp_path)
+    assert robot.description.joint_notes == ['finger = 2 · bend']
+    angles = dict(zip(robot.kinematics.model.names[1:], robot.kinematics.tree_angles(ANGLES)))
+    assert angles['finger'] == 2.0 * angles['bend']
+
+
+@pytest.mark.parametrize('master', ['wrist', 'toe'])
+def test_a_mimic_of_what_does_not_move_is_refused_by_the_name_of_urdf_and_joint(tmp_path, master):
+    urdf = coupled_arm(tmp_path) / 'robot.urdf'
+    mimic = f'<axis xyz="0 0 1"/><mimic joint="{master}"/>'
+    urdf.write_text(urdf.read_text().replace('<axis xyz="0 0 1"/>', mimic))
+    with pytest.raises(RobotDescriptionError) as error:
+        Robot.load(tmp_path)
+    assert f"{urdf}: joint 'finger': mimic: unknown joint '{master}'" in str(error.value)
+    assert 'muscles.yaml' not in str(error.value)
 
 
 def test_a_joint_that_is_listed_as_free_follows_none(tmp_path):
@@ -132,7 +159,7 @@ def test_a_joint_that_is_listed_as_free_follows_none(tmp_path):
 def test_several_end_effectors_are_drawn_and_the_first_one_used(tmp_path):
     write_robot(tmp_path, end_effectors=['lower', 'tool'])
     document = read_muscles(tmp_path)
-    with pytest.raises(RobotDescriptionError, match='both are given'):
+    with pytest.raises(RobotDescriptionError, match='got both'):
         Robot.load(tmp_path)
     del document['end_effector']
     robot = Robot.load(write_muscles(tmp_path, document))
@@ -152,7 +179,7 @@ def test_a_muscle_has_a_tension_and_stiffness_of_its_own(tmp_path):
     check = check_robot(robot, 20)
     assert np.nanmin(check.tension[:, 1]) >= 10.0 - 1e-6
     document['muscles'][1]['tension'] = {'bias': 400.0}
-    with pytest.raises(RobotDescriptionError, match="'pull_front_in': tension: expected bias"):
+    with pytest.raises(RobotDescriptionError, match=r"'pull_front_in': .*tension: expected bias"):
         Robot.load(write_muscles(tmp_path, document))
 
 
@@ -176,8 +203,8 @@ WRAP = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, 0], 'axis': [0, 0, 1]
 @pytest.mark.parametrize(
     ('place', 'change', 'expected'),
     [
-        (0, {}, 'stands between two points'),
-        (1, {'wrap': 'cone'}, "sphere or cylinder, got 'cone'"),
+        (0, {}, 'a point before and after each wrap'),
+        (1, {'wrap': 'cone'}, "one of cylinder, sphere, got 'cone'"),
         (1, {'radius': 0.0}, '> 0'),
         (1, {'side': [0, 0, 1]}, 'beside the axis'),
     ],
