@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TypeVar
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
-from musculoskeletal_ae.start import INTERRUPTED
+from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')

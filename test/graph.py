@@ -22,8 +22,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
+from musculoskeletal_ae.nodes.executor import LeanExecutor
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.nodes.running import LeanExecutor
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -177,7 +177,7 @@ class Graph:
         """Handle messages for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.look(LOOK)
+            self.executor.spin_once(LOOK)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Handle messages until a condition holds; fail with what was waited for."""
@@ -191,7 +191,7 @@ class Graph:
                 raise AssertionError(
                     f'waited {deadline:g} s in vain for {what}; {self._last_diagnostics()}'
                 )
-            self.executor.look(LOOK)
+            self.executor.spin_once(LOOK)
         return value
 
     def next(self, topic: str, count: int = 1) -> Any:

@@ -37,7 +37,7 @@ def test_only_nodes_imports_ros() -> None:
 
 def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
-        if file.parent.name not in ('nodes', 'tools'):
+        if file.parent.name not in ('nodes', 'tools') and file.name != 'executables.py':
             upward = [
                 n for n in imported(file) if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
             ]

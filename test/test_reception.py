@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is dropped as late, and under which names rejections are counted; no graph needed."""
 
-from types import coroutine
-
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
@@ -88,24 +86,10 @@ def test_rejections_are_counted_by_reason_and_the_last_is_kept_in_full(error, re
     assert not reception.take_received()
 
 
-def test_a_callback_in_pieces_counts_when_it_has_ended():
+def test_a_message_that_is_used_later_counts_once_it_is_used():
     reception = Reception(print)
-
-    @coroutine
-    def give_way():
-        yield
-
-    async def refuse(text):
-        await give_way()
-        if text:
-            raise MessageError('empty', text)
-
-    receive = reception.of('topic', refuse, lambda: 1)
-    for number, text in ((1, 'no joints'), (2, '')):
-        pieces = receive(text, {'source_timestamp': number, 'publication_sequence_number': number})
-        pieces.send(None)
-        assert not reception.take_received().get('topic')
-        with pytest.raises(StopIteration):
-            pieces.send(None)
-    assert reception.rejected == {'topic: empty': 1}
+    receive = reception.of('topic', lambda _: None, lambda: 1, is_used_at_once=False)
+    receive('message', {'source_timestamp': 1, 'publication_sequence_number': 1})
+    assert not reception.take_received().get('topic')
+    reception.note_used('topic')
     assert reception.take_received() == {'topic': 1}

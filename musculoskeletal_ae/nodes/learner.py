@@ -36,7 +36,7 @@ JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 class Learner(Shell):
     """Node shell of online learning."""
 
-    hurried = False
+    is_time_critical = False
 
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)

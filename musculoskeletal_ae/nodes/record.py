@@ -2,10 +2,10 @@
 """The tool `record`: the topics to an mcap bag that `ros2 bag` can read."""
 
 import math
-import signal
 import sys
 import time
 from argparse import ArgumentTypeError, Namespace
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,9 @@ from rosbags.interfaces import Qos
 from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 # What the recorder may lose when it is killed is what is younger than this.
 FLUSH_PERIOD = 0.5  # [s]
@@ -81,22 +82,18 @@ class Record(Node):
 
 
 def _record(options: Namespace, arguments: list[str]) -> None:
-    # The end is taken by hand, so that what waits in the queues is still written.
-    stop: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stop.append(received))
     start_ros(arguments)
     out = options.out or Path(f'{datetime.now():%Y_%m_%d-%H_%M_%S}_bag')  # noqa: DTZ005 - local
     with BagWriter(out, options.compression) as writer:
         node = Record(writer, options.topics)
-        spinner = Spinner(node)
-        with spinner:
+        with Spinner(node) as spinner:
             print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
-            spinner.spin_until(lambda: stop, options.duration or math.inf)
+            with suppress(KeyboardInterrupt):
+                spinner.spin_until(lambda: False, options.duration or math.inf)
             drained, before = time.monotonic() + DRAIN_TIME, -1
             while time.monotonic() < drained and node.received != before:
                 before = node.received
-                spinner.look(0.05)
+                spinner.spin_once(0.05)
         node.destroy_node()
     if node.timeless:
         problem = 'messages came before the first /clock, and are left out'
@@ -146,7 +143,8 @@ def _work(options: Namespace, arguments: list[str]) -> int:
             problem = f'left out, since they are not in CDR: {", ".join(left_out)}'
             print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
-        _record(options, arguments)
+        with STOP.reacting(Reaction.REMEMBER):  # what waits in the queues is still written
+            _record(options, arguments)
     return 0
 
 

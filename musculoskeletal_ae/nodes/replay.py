@@ -35,10 +35,11 @@ from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -119,6 +120,7 @@ class Replay(Node):
                     break
                 self._timeline.catch_up(message.log_time, time.monotonic())
                 self._tick()
+                STOP.raise_if_received()
                 self._publisher[message.topic].publish(message.data)
 
     def acknowledge(self) -> None:
@@ -140,7 +142,8 @@ class Replay(Node):
                 wait = min(wait, max(self._next_tick - now, 0.0))
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
-                self._spinner.look(wait)
+                self._spinner.spin_once(wait)
+                STOP.raise_if_received()
                 if now > self._next_report:
                     self._next_report = now + PERIOD
                     doing = 'paused' if self._timeline.paused else 'playing'
@@ -253,13 +256,14 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     if options.loop and not options.clock:
         problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
         print(f'warning: --loop: {problem}', file=sys.stderr)
-    start_ros(arguments)
-    node = Replay(bag, names, options)
-    bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
-    with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
-        node.get_ready(options.wait)
-        node.play(progress, options.loop)
-    node.acknowledge()
+    with STOP.reacting(Reaction.REMEMBER):
+        start_ros(arguments)
+        node = Replay(bag, names, options)
+        bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
+        with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
+            node.get_ready(options.wait)
+            node.play(progress, options.loop)
+        node.acknowledge()
     return 0
 
 

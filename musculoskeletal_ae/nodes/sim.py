@@ -33,7 +33,7 @@ class Sim(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
         Markers(self, 'sim', self._lines)
-        self.hurried = self.as_robot = self.parameter('as_robot')
+        self.is_time_critical = self.as_robot = self.parameter('as_robot')
         prefix = '' if self.as_robot else 'sim/'
         self.advertise(prefix, joint_sensors=True, description=self.as_robot)
         self.arm: Simulation | None = None

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, names
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -25,4 +25,4 @@ def main(argv: list[str] | None = None) -> int:
     text = 'end effector; joints beside the way to it are held'
     parser.add_argument('--end', metavar='LINK', help=text)
     args = parser.parse_args(argv)
-    return exit_status(lambda: load('musculoskeletal_ae.importing.convert').run(args))
+    return exit_status(lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args))

@@ -17,7 +17,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import NumberOfEntities, Waitable
 from trajectory_msgs.msg import JointTrajectory
 
-from musculoskeletal_ae.nodes import follow_joint_trajectory, running
+from musculoskeletal_ae.nodes import executor, follow_joint_trajectory
 
 from .test_motion import HERE, THERE, trajectory
 
@@ -165,14 +165,14 @@ class Asked(Waitable):
 
 
 def test_requests_of_an_action_are_served_at_once(monkeypatch):
-    monkeypatch.setattr(running, 'EVENTS_EVERY', 600)  # only what is served at once is served
+    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)  # only what is served at once is served
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('asked', context=context)
     asked = Asked(node)
-    executor = running.LeanExecutor(context=context)
-    executor.add_node(node)
-    spun = threading.Thread(target=lambda: _until_shutdown(executor), daemon=True)
+    lean = executor.LeanExecutor(context=context)
+    lean.add_node(node)
+    spun = threading.Thread(target=lambda: _until_shutdown(lean), daemon=True)
     spun.start()
     end = time.monotonic() + 60.0
     for count in range(1, 4):
@@ -184,6 +184,6 @@ def test_requests_of_an_action_are_served_at_once(monkeypatch):
     assert asked.served == ['asked'] * 3
 
 
-def _until_shutdown(executor):
-    with suppress(running.ExternalShutdownException):
-        executor.spin()
+def _until_shutdown(lean):
+    with suppress(executor.ExternalShutdownException):
+        lean.spin()

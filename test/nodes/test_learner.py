@@ -97,7 +97,7 @@ class HostedLearner:
         taken, deadline = self.taken, time.monotonic() + 1.0
         self.arm.publish()
         while self.taken == taken and time.monotonic() < deadline:
-            self.graph.executor.look(LOOK)
+            self.graph.executor.spin_once(LOOK)
 
     def run(self, seconds):
         """Let time pass."""

@@ -43,8 +43,8 @@ def test_help_tells_every_parameter_and_loads_nothing_heavy(node):
     code = f"""
 import sys
 sys.argv[1:] = ['--help']
-from musculoskeletal_ae.nodes import running
-running.run('{node}')
+from musculoskeletal_ae import executables
+executables.{node}()
 print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
