@@ -24,7 +24,7 @@ doc/your_robot.md leads from a robot of your own to one that learns.
   --combined                 estimator and controller in one process
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
-                             --hardware off: a real arm moves when it is told to)
+                             --hardware off: a real arm moves only on request)
   --no-learner               no online learning
   --preset default|paper     the best we can measure, or as printed in the paper (default: default)
   --seed N                   which individual arm the emulator is (default: 0)
@@ -35,12 +35,17 @@ doc/your_robot.md leads from a robot of your own to one that learns.
                              what the learner knows of joint angles: all of them, what a camera sees of
                              the hand, or nothing; the status line shows the emulator's own angles
                              (default: sensor)
+  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml
+  -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
+                             this and --params-file may be given several times, and win over all else
   --namespace NS             run everything under /NS
+  --network                  show an emulated arm to as much of the network as
+                             ROS_AUTOMATIC_DISCOVERY_RANGE says, as --hardware does (default: to
+                             this machine only)
   --duration S               stop after S seconds, counted from when the system is up
                              (default: run until Ctrl-C)
   --record DIR               record the topics to an mcap bag
-  --view                     show the arm on a page, http://localhost:8080 (the first time: installs
-                             what it needs)
+  --view                     show the arm on a page, http://localhost:8080
   --port N                   of the page (default: 8080)
   --read-only                a page without controls
   -h, --help                 this text
@@ -55,127 +60,109 @@ refuse() {
 }
 
 # --- options -------------------------------------------------------------------------------------
+# The nodes and tools check the values, and say what is wrong with them.
 
 robot=musashi_left_arm
 checkpoint=
-explore= # on, but for hardware
+hardware=false
+controller=true
+combined=false
+bag=
+explore= # on, except on hardware
+learner=true
 preset=default
 seed=0
 reality=kin
 joint_source=sensor
+parameters=() # of NODE:NAME:=VALUE
+parameter_files=()
 namespace=
-learner=true
-controller=true
-combined=false
-hardware=false
-bag=
+network=false
+duration= # until Ctrl-C
 record=
-view=
+view=false
 port=8080
 read_only=()
-duration= # until Ctrl-C
 
+nodes='controller|estimator|hardware_emulator|learner|sim'
+
+sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:,hardware \
+  --longoptions no-controller,combined,bag:,explore,no-explore,no-learner,preset:,seed:,reality: \
+  --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
+  --longoptions read-only,help -- "$@") || refuse 'legal options: see ./bringup.sh --help'
+eval set -- "$sorted"
+given=$sorted
 while [ $# -gt 0 ]; do
-  # Both "--seed 1" and "--seed=1".
-  value= # that comes with its option
-  if [[ $1 == --*=* ]]; then
-    value=$1
-    set -- "${1%%=*}" "${1#*=}" "${@:2}"
-  fi
   case $1 in
-    --robot | --checkpoint | --bag | --preset | --seed | --reality | --joint-source | --namespace | --duration | --record | --port)
-      if [ $# -lt 2 ] || [ -z "$2" ] || [[ $2 == --* ]]; then refuse "$1 needs a value"; fi
-      option=${1#--}
-      printf -v "${option//-/_}" %s "$2" && shift
-      value=
-      ;;
-    --view) view=view ;;
-    --read-only) read_only=(--read-only) ;;
-    --explore) explore=true ;;
-    --no-explore) explore=false ;;
-    --no-learner) learner=false ;;
+    --robot) robot=$2 && shift ;;
+    --checkpoint) checkpoint=$2 && shift ;;
     --hardware) hardware=true ;;
     --no-controller) controller=false ;;
     --combined) combined=true ;;
+    --bag) bag=$2 && shift ;;
+    --explore) explore=true ;;
+    --no-explore) explore=false ;;
+    --no-learner) learner=false ;;
+    --preset) preset=$2 && shift ;;
+    --seed) seed=$2 && shift ;;
+    --reality) reality=$2 && shift ;;
+    --joint-source) joint_source=$2 && shift ;;
+    --params-file) parameter_files+=("$2") && shift ;;
+    -p)
+      [[ $2 =~ ^($nodes):[^:]+:=. ]] ||
+        refuse "-p '$2' must be NODE:NAME:=VALUE, where NODE is one of ${nodes//|/, }"
+      parameters+=("$2") && shift
+      ;;
+    --namespace) namespace=${2#/} && shift ;;
+    --network) network=true ;;
+    --duration)
+      [[ $2 =~ ^[0-9]+(\.[0-9]+)?$ ]] || refuse "--duration '$2' must be a number of seconds"
+      duration=$2 && shift
+      ;;
+    --record) record=$2 && shift ;;
+    --view) view=true ;;
+    --port) port=$2 && shift ;;
+    --read-only) read_only=(--read-only) ;;
     -h | --help) usage && exit ;;
-    *) refuse "unknown option '$1'; legal are $(usage | grep -o -e '--[a-z-]*' | sort -u | paste -sd ' ')" ;;
+    --) [ $# = 1 ] || refuse "'$2' belongs to no option; see ./bringup.sh --help" ;;
   esac
-  [ -z "$value" ] || refuse "$1 takes no value, and '$value' gives it one"
   shift
 done
 
-if [ -f "$repository/config/$robot/muscles.yaml" ] && [[ $robot != */* ]]; then
-  robot_directory=$repository/config/$robot
-elif [ -d "$robot" ]; then
-  robot=$(cd "$robot" && pwd -P) || exit 2
-  robot_directory=$robot
-else
-  refuse "--robot '$robot' is neither a directory nor one of: $(
-    cd "$repository/config" && for each in */muscles.yaml; do printf '%s ' "${each%/*}"; done
-  )"
-fi
-if [ -n "$checkpoint" ]; then
-  if [ ! -r "$checkpoint" ] || [ ! -f "$checkpoint" ]; then
-    refuse "--checkpoint '$checkpoint' is not a file that can be read"
-  fi
-  checkpoint=$(cd "$(dirname "$checkpoint")" && pwd -P)/$(basename "$checkpoint")
-fi
-if [ -n "$bag" ]; then
-  [ -e "$bag" ] || refuse "--bag '$bag' is neither a bag directory nor an .mcap file"
-  bag=$(cd "$(dirname "$bag")" && pwd -P)/$(basename "$bag")
-  [ $hardware = false ] || refuse '--bag and --hardware exclude each other: which of them is it?'
-fi
-if [ $combined = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
-  refuse '--combined is estimator and controller in one process: not with --no-controller or --bag'
-fi
-if [ -z "$view" ] && { [ "$port" != 8080 ] || [ ${#read_only[@]} -gt 0 ]; }; then
-  refuse '--port and --read-only are of the page: they go with --view'
-fi
-if [ "$reality" != kin ] && { [ $hardware = true ] || [ -n "$bag" ]; }; then
-  refuse '--reality is of the emulator: not with --hardware or --bag'
-fi
-if [ "$explore" = true ] && { [ $controller = false ] || [ -n "$bag" ]; }; then
-  refuse '--explore moves the arm: not with --no-controller or --bag'
-fi
-if [ "$joint_source" = none ] && [ $learner = false ]; then
-  refuse '--joint-source none is for the learner: not with --no-learner'
-fi
-[ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
-if [ -n "$record" ]; then
-  [ ! -e "$record" ] || refuse "--record '$record' is there already; name a new directory"
-  record=$(realpath -m "$record")
-fi
-[[ $preset =~ ^(default|paper)$ ]] || refuse "--preset '$preset' must be default or paper"
-[[ $seed =~ ^[0-9]{1,9}$ ]] || refuse "--seed '$seed' must be a whole number from 0 to 999999999"
-seed=$((10#$seed))
-if [[ ! $reality =~ ^(kin|foreign)$ ]]; then
-  [ -f "$reality" ] || refuse "--reality '$reality' must be kin, foreign or an MJCF file"
-  reality=$(realpath "$reality")
-fi
-[[ $joint_source =~ ^(sensor|marker|none)$ ]] ||
-  refuse "--joint-source '$joint_source' must be sensor, marker or none"
-if [ -n "$duration" ]; then
-  [[ $duration =~ ^[0-9]{1,9}(\.[0-9]+)?$ && $duration =~ [1-9] ]] ||
-    refuse "--duration '$duration' must be a number of seconds above 0, such as 30 or 2.5"
-fi
-if ! [[ $port =~ ^[0-9]{1,5}$ ]] || [ $((10#$port)) -lt 1 ] || [ $((10#$port)) -gt 65535 ]; then
-  refuse "--port '$port' must be a whole number from 1 to 65535"
-fi
-namespace=${namespace#/}
-[[ -z $namespace ||
-  $namespace =~ ^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$ && $namespace != *__* && ${#namespace} -le 100 ]] ||
-  refuse "--namespace '$namespace' must be at most 100 letters, digits and single _ (and / between levels)"
+is_given() { [[ " $given " == *" $1 "* ]]; }
+
+exclude() { # OPTION OTHER_OPTION…
+  local other
+  is_given "$1" || return 0
+  for other in "${@:2}"; do
+    ! is_given "$other" || refuse "$1 and $other exclude each other"
+  done
+}
+exclude --bag --hardware --combined --explore --reality
+exclude --hardware --reality
+exclude --no-controller --combined --explore
+exclude --no-learner --joint-source
+for option in --port --read-only; do
+  ! is_given "$option" || [ $view = true ] || refuse "$option is about the page: it goes with --view"
+done
+
+robot_directory=$repository/config/$robot
+[ -f "$robot_directory/muscles.yaml" ] || robot_directory=$robot
+[ -d "$robot_directory" ] || refuse "--robot '$robot' is neither a directory nor one of: $(
+  cd "$repository/config" && dirname -- */muscles.yaml | paste -sd ' '
+)"
 
 # --- environment ---------------------------------------------------------------------------------
 
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"
-environment_setup $view # installs nothing more without --view
+environment_setup
 
-# Emulated arms are nobody else's business on the network, unless the user says so. A driver may well
-# run on another machine.
-[ $hardware = true ] ||
-  export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+# An emulated arm is nobody else's business. A driver may well run on another machine.
+if [ $hardware = false ] && [ $network = false ]; then
+  export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+  unset ROS_STATIC_PEERS
+fi
 use_udp
 
 # One arm to a namespace. The lock is held until the last of what is started here has ended, which
@@ -193,16 +180,13 @@ say "logs in $logs"
 
 # --- processes: start, watch, stop, always by pid ------------------------------------------------
 
-declare -A pid_of=()
-
-# Even if this script is killed with SIGKILL, the kernel ends what it started.
-with_us=()
-if setpriv --pdeathsig TERM true 2>/dev/null; then with_us=(setpriv --pdeathsig TERM); fi
+declare -A name_of=() # by pid
 
 launch() { # NAME ARGUMENT…
-  # Through $python, because a #! line cannot name a path with a space in it.
-  "${with_us[@]}" "$python" "$executables/$1" "${@:2}" </dev/null &
-  pid_of[$1]=$!
+  # If this script is killed with SIGKILL, the kernel ends what it started. The interpreter is named,
+  # because a #! line cannot name a path with a space in it.
+  setpriv --pdeathsig TERM "$python" "$executables/$1" "${@:2}" </dev/null &
+  name_of[$!]=$1
 }
 
 start() { # NAME ARGUMENT…   Output goes to NAME.log.
@@ -210,165 +194,148 @@ start() { # NAME ARGUMENT…   Output goes to NAME.log.
   launch "$@" >"$logs/$1.log" 2>&1
 }
 
-is_running() { kill -0 "$1" 2>/dev/null; }
-
-stop() {
-  local name pid deadline=$((SECONDS + 5))
-  for pid in "${pid_of[@]}"; do kill -TERM "$pid" 2>/dev/null; done
-  for name in "${!pid_of[@]}"; do
-    pid=${pid_of[$name]}
-    while is_running "$pid" && [ $SECONDS -lt $deadline ]; do sleep 0.1; done
-    if is_running "$pid"; then
-      printf '%s\n' "$name did not stop within 5 s: killed" >&2
-      kill -KILL "$pid"
-    fi
-    wait "$pid" 2>/dev/null
+# With the parameters of all nodes and those of this one. What --params-file and -p say comes last,
+# and wins.
+start_node() { # NAME PARAMETER…
+  local file parameter nodes_here=" $1 "
+  local -a chosen=()
+  [ "$1" != combined ] || nodes_here=' estimator controller '
+  for file in "${parameter_files[@]}"; do chosen+=(--params-file "$file"); done
+  for parameter in "${parameters[@]}"; do
+    [[ $nodes_here != *" ${parameter%%:*} "* ]] || chosen+=(-p "${parameter#*:}")
   done
-  pid_of=()
+  start "$1" "${common[@]}" "${@:2}" "${chosen[@]}"
 }
-
-finish() { # STATUS
-  trap '' INT TERM HUP PIPE
-  trap - EXIT
-  stop
-  [ -z "${training-}" ] || rm -rf "$training"
-  exit "$1"
-}
-trap 'say stopping; finish 130' INT
-trap 'finish 143' TERM
-trap 'finish 129' HUP
-trap 'finish 141' PIPE
-trap 'finish $?' EXIT
 
 died() { # NAME STATUS
-  trap '' PIPE
   printf '%s\n' "$1 ended with status $2. The end of $logs/$1.log:" >&2
   tail -n 20 "$logs/$1.log" >&2
-  finish 1
+  exit 1
 }
 
-# Watches everything until NAME (or the replayed bag) has ended, and returns its status; any other end
-# is a failure.
-watch_until_ended() { # NAME
-  local name status
-  while true; do
-    for name in "${!pid_of[@]}"; do
-      if ! is_running "${pid_of[$name]}"; then
-        status=0
-        wait "${pid_of[$name]}" || status=$?
-        unset "pid_of[$name]"
-        [ "$name" = "$1" ] || [ "$name $status" = 'replay 0' ] || died "$name" "$status"
-        return "$status"
-      fi
-    done
-    sleep 0.2
-  done
+# Waits until NAME has ended, and returns its status. Any other end is a failure, except that of a
+# recording.
+wait_for() { # NAME
+  local pid name status
+  wait -n -p pid "${!name_of[@]}"
+  status=$?
+  name=${name_of[$pid]}
+  unset "name_of[$pid]"
+  [ "$name" = "$1" ] || [ "$name $status" = 'replay 0' ] || died "$name" "$status"
+  return "$status"
 }
+
+# shellcheck disable=SC2329  # the trap calls it
+stop() {
+  local pid deadline=$((SECONDS + 5))
+  trap '' INT TERM HUP PIPE
+  [ ${#name_of[@]} -gt 0 ] || return
+  say stopping
+  kill -TERM "${!name_of[@]}" 2>/dev/null
+  while kill -0 "${!name_of[@]}" 2>/dev/null && [ "$SECONDS" -lt "$deadline" ]; do sleep 0.1; done
+  for pid in "${!name_of[@]}"; do
+    ! kill -KILL "$pid" 2>/dev/null || say "${name_of[$pid]} did not stop within 5 s: killed"
+  done
+  wait
+}
+trap stop EXIT
+trap 'exit 130' INT
+trap 'exit 143' TERM
+trap 'exit 129' HUP
 
 # --- checkpoint ----------------------------------------------------------------------------------
 
-# Sets $checkpoint. The name of the cached file tells what it was made from, so that another robot or
+# Sets $checkpoint. The file is named after what a network is made from, so that another robot or
 # another network is another file.
 train_once() {
-  local cache=${XDG_CACHE_HOME:-${HOME-}/.cache}/musculoskeletal_ae hash status=0
-  mkdir -p "$cache" 2>/dev/null && [ -w "$cache" ] || cache=$repository/.cache
+  local cache=${XDG_CACHE_HOME:-${HOME:-$repository}/.cache}/musculoskeletal_ae hash
+  local package=$repository/musculoskeletal_ae
+  mkdir -p "$cache" || exit 1
   hash=$(
-    {
-      (cd "$robot_directory" && sha256sum robot.urdf muscles.yaml) # what a network is made from
-      cd "$repository/musculoskeletal_ae" &&
-        find robot mae presets.* tools/initial_training.py \( -name '*.py' -o -name '*.yaml' \) \
-          -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
-    } | sha256sum | cut -c 1-16
+    find "$robot_directory"/{robot.urdf,muscles.yaml} "$package"/{robot,mae,presets.*} \
+      "$package/tools/initial_training.py" \( -name '*.py' -o -name '*.yaml' -o -name '*.urdf' \) \
+      -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -c 1-16
   )
-  checkpoint=$cache/$(basename "$robot_directory")-$preset-$hash.safetensors
+  checkpoint=$cache/$(basename "$(realpath "$robot_directory")")-$preset-$hash.safetensors
   if [ -s "$checkpoint" ]; then
     say "checkpoint from an earlier run: $checkpoint"
     return
   fi
-  # In a folder of its own, then renamed: neither an interruption nor a second run leaves half a file.
-  training=$(mktemp -d "$cache/.training-XXXXXX") || exit 1
   [ -t 1 ] || export TQDM_MININTERVAL=5 # a progress bar in a file: a line now and then
-  say "training the MAE of $(basename "$robot_directory"), once (about a minute)"
-  launch train --robot "$robot" --preset "$preset" --out "$training/$(basename "$checkpoint")" \
+  say "training the MAE of $robot, once (about a minute)"
+  launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
     > >(tee "$logs/train.log") 2>&1
-  watch_until_ended train || status=$?
-  [ $status -eq 0 ] || died train $status
-  mv -f "$training/$(basename "$checkpoint")" "$checkpoint" || exit 1
-  rm -rf "$training"
-  training=
+  wait_for train || died train $?
 }
 
 # --- The system ----------------------------------------------------------------------------------
 
+# What config/nodes.yaml says or, if it says something, the last of --params-file.
+value_in_files() { # NAME
+  cat "$repository/config/nodes.yaml" "${parameter_files[@]}" |
+    sed -n "s/^ *$1: *\([a-z0-9.]*\).*/\1/p" | tail -n 1
+}
+
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
 
-common=(--ros-args --params-file "$repository/config/nodes.yaml"
-  -p "robot:=$(quoted "$robot")" -p "preset:=$preset"
-  -p "seed:=$seed")
-remap=()
-[ -z "$namespace" ] || remap=(--ros-args -r "__ns:=/$namespace")
-[ -z "$namespace" ] || common+=(-r "__ns:=/$namespace")
+[ -n "$checkpoint" ] || train_once
 
-# A recording brings its own time and its own commands: no emulator and no controller.
-if [ -n "$bag" ]; then
-  common+=(-p use_sim_time:=true)
-elif [ $hardware = false ]; then
+under=()
+[ -z "$namespace" ] || under=(-r "__ns:=/$namespace")
+common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
+  -p "robot:=$(quoted "$robot")" -p "preset:=$preset" -p "seed:=$seed"
+  -p "checkpoint:=$(quoted "$checkpoint")")
+[ -z "$bag" ] || common+=(-p use_sim_time:=true)
+
+if [ $hardware = true ]; then
+  # Nothing that could move the arm is there before its driver says what it must.
+  check=(--robot "$robot" --wait --seconds 3 --rate "$(value_in_files rate)")
+  [ "$(value_in_files zero_at_start)" != true ] || check+=(--unzeroed)
+  launch check_driver "${check[@]}" --ros-args "${under[@]}"
+  wait_for check_driver || exit 1
+elif [ -z "$bag" ]; then
   camera=()
   [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
-  start hardware_emulator "${common[@]}" -p "reality:=$(quoted "$reality")" "${camera[@]}"
-  # Whether a file is the same robot is for who started it to know, not for a log alone.
-  tail -n +1 -s 0.2 -f --pid="${pid_of[hardware_emulator]}" "$logs/hardware_emulator.log" \
-    </dev/null 2>/dev/null |
+  start_node hardware_emulator -p "reality:=$(quoted "$reality")" "${camera[@]}"
+  # That a file is another robot is for who started this to know, not for a log alone.
+  tail -n +1 -s 0.2 -f --pid="$!" "$logs/hardware_emulator.log" </dev/null 2>/dev/null |
     sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &
 fi
 
-[ -n "$checkpoint" ] || train_once
-if [ $hardware = true ]; then
-  # Nothing that could move the arm is there before its driver says what it must.
-  rate=$(sed -n 's/^    rate: *\([0-9.]*\).*/\1/p' "$repository/config/nodes.yaml")
-  check=(--robot "$robot" --rate "$rate" --wait --seconds 3)
-  ! grep -qiE '^    zero_at_start: *(true|yes|on)' "$repository/config/nodes.yaml" || check+=(--unzeroed)
-  launch check_driver "${check[@]}" "${remap[@]}"
-  status=0
-  watch_until_ended check_driver || status=$?
-  [ $status -eq 0 ] || finish 1
+[ $combined = true ] || start_node estimator
+start_node sim
+if [ $learner = true ]; then
+  # What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware
+  # is the same arm tomorrow, and the learner goes on from where it was.
+  kept=()
+  [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/learner")")
+  start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
-common+=(-p "checkpoint:=$(quoted "$checkpoint")")
-
-[ $combined = true ] || start estimator "${common[@]}"
-start sim "${common[@]}"
-# What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware is
-# the same arm tomorrow, and the learner goes on from where it was.
-kept=(-p "state_directory:=$(quoted "$logs/learner")")
-[ $hardware = false ] || kept=()
-[ $learner = false ] || start learner "${common[@]}" "${kept[@]}" \
-  -p "joint_source:=$joint_source"
-[ -z "$record" ] || start record -o "$record" "${remap[@]}"
+[ -z "$record" ] || start record -o "$record" --ros-args "${under[@]}"
 if [ -n "$bag" ]; then
-  start replay "$bag" --clock "${remap[@]}"
+  # A recording brings its own time and its own commands: no controller.
+  start replay "$bag" --clock --ros-args "${under[@]}"
 elif [ $controller = true ]; then
+  [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   moving=(-p "explore:=$explore")
   # A pause of a busy desktop is no fault of an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
   name=controller
   [ $combined = false ] || name=combined
-  start $name "${common[@]}" "${moving[@]}"
+  start_node $name "${moving[@]}"
 fi
-
-if [ -n "$view" ]; then
-  start view --robot "$robot" --port "$port" "${read_only[@]}" "${remap[@]}"
-  say "the arm is on http://localhost:$port"
+if [ $view = true ]; then
+  start view --robot "$robot" --port "$port" "${read_only[@]}" --ros-args "${under[@]}"
+  say "the page will be on http://localhost:$port"
 fi
 
 # The status line. It counts --duration from when estimates arrive, however late that is on a slow
 # machine, and ends after it; without any estimate it gives up.
-seconds=${duration:-0} # 0: without end
-[[ $seconds == *.* ]] || seconds+=.0 # a ROS double
-launch bringup_status "${common[@]}" \
-  -p "duration:=$seconds" ${duration:+-p patience:=300.0} 2>"$logs/bringup_status.log"
-
-status=0
-watch_until_ended bringup_status || status=$?
-if [ $status -ne 0 ] || [ -z "$duration$bag" ]; then died bringup_status $status; fi
-say stopping
-finish 0
+limits=()
+if [ -n "$duration" ]; then
+  [[ $duration == *.* ]] || duration+=.0 # a ROS double
+  limits=(-p "duration:=$duration" -p patience:=300.0)
+fi
+launch bringup_status "${common[@]}" "${limits[@]}" 2>"$logs/bringup_status.log"
+wait_for bringup_status || died bringup_status $?
+exit 0

@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Install the package, its robots and its executables (see setup.cfg for where the latter go)."""
 
-import re
-import subprocess
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 from setuptools import find_packages, setup
-from setuptools.command.install_scripts import install_scripts
 
 NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
@@ -26,36 +22,7 @@ def config_files() -> list[tuple[str, list[str]]]:
     return list(folders.items())
 
 
-class Launchers(install_scripts):
-    """Write executables that show no traceback, however early Ctrl-C comes.
-
-    `env` holds it back while Python starts, `start.main` takes it. Where this `env` cannot, it just
-    ends the process, but for the 30 ms that Python needs to come to the first line.
-    """
-
-    def write_script(self, name: str, contents: str, *mode: Any) -> None:
-        """Write one of them."""
-        header, _, _ = contents.partition('# EASY-INSTALL')
-        env = ['/usr/bin/env', '-S', '--block-signal=INT']
-        held_back = subprocess.run([*env, 'true'], stderr=subprocess.DEVNULL, check=False)  # noqa: S603
-        if held_back.returncode == 0:
-            header = re.sub(r'^#!(?=/\S{1,80}$)', f'#!{" ".join(env)} ', header.strip()) + '\n'
-        super().write_script(name, header + LAUNCHER, *mode)
-
-
-LAUNCHER = f"""\
-import signal
-
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-from {NAME}.start import main
-
-if __name__ == '__main__':  # and not in the processes that multiprocessing starts
-    raise SystemExit(main())
-"""
-
 setup(
-    cmdclass={'install_scripts': Launchers},
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['bench', 'bench.*', 'test', 'test.*']),
@@ -78,7 +45,7 @@ setup(
     python_requires='>=3.10',
     entry_points={
         'console_scripts': [
-            f'{name} = {NAME}.start:main' for name in NODES + COMBINED + ROS_TOOLS + TOOLS
+            f'{name} = {NAME}.executables:{name}' for name in NODES + COMBINED + ROS_TOOLS + TOOLS
         ],
     },
 )

@@ -1,25 +1,23 @@
 # shellcheck shell=bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Sourced by bringup.sh and test.sh: makes .venv, installs what is missing, builds the package with
-# colcon and sets up this shell for it. Every step is skipped when its stamp says that nothing has
-# changed, so that the second run takes about a second.
+# Sourced by bringup.sh and test.sh. Installs what is missing into .venv, builds the package with
+# colcon, and sets up this shell for it. From the second run on this takes seconds.
 #
-#     repository=…                       # absolute, before sourcing
-#     environment_setup [test|view]      # "test": with the tools of test.sh, "view": with what the
-#                                        # page in the browser needs; exits on failure
+#     repository=…               # absolute, before sourcing
+#     environment_setup [test]   # "test": with the tools of test.sh; exits on failure
 #
-# Afterwards: $python is the interpreter, $executables the folder of the package's executables.
+# Afterwards $python is the interpreter, and $executables the folder of the package's executables.
 
 : "${repository:?is set before this file is sourced}"
 
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
-PIP=26.3 # Debian's takes twice as long to find out what fits together
-TORCH=$(sed -n 's/^torch==//p' "$repository/requirements.txt")
 
 venv=$repository/.venv
-executables=$repository/install/musculoskeletal_ae/lib/musculoskeletal_ae
 python=$venv/bin/python
+# shellcheck disable=SC2034  # for those who source this file
+executables=$repository/install/musculoskeletal_ae/lib/musculoskeletal_ae
+setup_log=$repository/log/setup.log
 
 say() { printf '%s\n' "-- $*"; }
 
@@ -28,378 +26,185 @@ fail() {
   exit 1
 }
 
-# --- one step, with progress -------------------------------------------------------------------
-
-# Usage: step TITLE COMMAND…   Output goes to the set-up's log; its tail is shown on failure.
+# Usage: step TITLE COMMAND…   Logs the output of the command, and shows the end of it on failure.
 step() {
-  local title=$1 pid status=0 start=$SECONDS shown=0 elapsed
+  say "$1"
+  printf '\n== %s\n' "$*" >>"$setup_log"
   shift
-  say "$title"
-  printf '\n== %s\n%s\n' "$title" "$*" >>"$setup_log"
-  set -m # a process group of its own, so that pip or apt-get ends with us and not after us
-  "$@" >>"$setup_log" 2>&1 </dev/null &
-  pid=$!
-  set +m
-  # shellcheck disable=SC2064  # the pid of now
-  trap "kill -- -$pid 2>/dev/null; wait $pid; exit 130" INT
-  # shellcheck disable=SC2064
-  trap "kill -- -$pid 2>/dev/null; wait $pid; exit 143" TERM HUP
-  while kill -0 "$pid" 2>/dev/null; do
-    sleep 0.2
-    elapsed=$((SECONDS - start))
-    if [ -t 1 ]; then
-      printf '\r   %d s  %.60s\033[K' "$elapsed" "$(tail -n 1 "$setup_log" | tr -cd '[:print:]')"
-    elif [ $((elapsed - shown)) -ge 10 ]; then
-      shown=$elapsed
-      printf '   … %d s\n' "$elapsed"
-    fi
-  done
-  [ -t 1 ] && printf '\r\033[K'
-  wait "$pid" || status=$?
-  trap - INT TERM HUP
-  if [ $status -ne 0 ]; then
-    printf '%s\n' "   failed with status $status; the end of $setup_log:" >&2
-    tail -n 15 "$setup_log" >&2
-  fi
-  return $status
+  "$@" 2>&1 </dev/null | tee -a "$setup_log" | show_progress
+  [ "${PIPESTATUS[0]}" -ne 0 ] || return 0
+  printf '%s\n' "   failed; the end of $setup_log:" >&2
+  tail -n 15 "$setup_log" >&2
+  return 1
 }
 
-# --- ROS: sourced or wheels ----------------------------------------------------------------------
-
-python_is_new_enough() {
-  "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
-    >/dev/null 2>&1 </dev/null
+# On a terminal each line takes the place of the one before.
+show_progress() {
+  local line
+  while read -r line; do
+    [ ! -t 1 ] || printf '\r   %.70s\033[K' "$line"
+  done
+  [ ! -t 1 ] || printf '\r\033[K'
 }
 
-# Sets $ros to "sourced" or "wheels", and $base_python to the Python that .venv is made from.
-# base_python stays empty where none is found.
-find_ros_and_python() {
-  local candidate
-  local -a candidates=(python3 python3.13 python3.12 python3.11 python3.10)
-  ros=wheels
-  base_python=
-  if [ "${ROS_DISTRO:-jazzy}" != jazzy ]; then
-    fail "ROS 2 '$ROS_DISTRO' is sourced in this shell, and this package is for jazzy." \
-      "Source /opt/ros/jazzy/setup.bash in a new shell, or start one with no ROS sourced:" \
-      "the ROS 2 Jazzy wheels are then installed into .venv."
-  fi
-  # A shell started from a Python with the ROS wheels hands down that Python's library folders.
-  unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-  LD_LIBRARY_PATH=$(printf '%s' "${LD_LIBRARY_PATH-}" | tr ':' '\n' |
-    grep -v '/site-packages/ros_[^/]*\.libs$' | paste -sd : -)
-  [ -n "$LD_LIBRARY_PATH" ] || unset LD_LIBRARY_PATH
-  unset PYTHONHOME
-  # Nor may our own .venv, where it is active, become the Python that it is made from.
-  PATH=:$PATH:
-  PATH=${PATH//":$venv/bin:"/:}
-  PATH=${PATH#:}
-  PATH=${PATH%:}
+# --- ROS 2 Jazzy: sourced, or from PyPI ----------------------------------------------------------
 
-  if [ "${ROS_DISTRO-}" = jazzy ]; then
-    for candidate in "${candidates[@]}" /usr/bin/python3; do
-      if python_is_new_enough "$candidate" &&
-        "$candidate" -c 'import rclpy' >/dev/null 2>&1 </dev/null; then # not .venv's: see PATH
-        ros=sourced
-        base_python=$(command -v "$candidate")
-        return
-      fi
-    done
-    say "ROS_DISTRO is jazzy, but no Python here can import rclpy: using the ROS wheels instead"
-  fi
-  # Nothing of another installation or virtual environment may leak in.
-  unset ROS_DISTRO PYTHONPATH AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
-  if [ "${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}" != rmw_fastrtps_cpp ]; then
-    say "RMW_IMPLEMENTATION=$RMW_IMPLEMENTATION is not among the wheels: using rmw_fastrtps_cpp"
-    export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
-  fi
-  for candidate in "${candidates[@]}"; do
-    if python_is_new_enough "$candidate"; then
-      base_python=$(command -v "$candidate")
-      return
-    fi
-  done
+# Sets $ros to "sourced" or "wheels".
+find_ros() {
+  case ${ROS_DISTRO-} in
+    jazzy) ros=sourced ;;
+    '')
+      ros=wheels
+      # The wheels are an installation of ROS of their own: nothing of another one may leak in.
+      unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH \
+        RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
+      export AMENT_PREFIX_PATH=$venv
+      ;;
+    *)
+      fail "ROS 2 '$ROS_DISTRO' is sourced in this shell, and this package is for jazzy." \
+        'Source /opt/ros/jazzy/setup.bash in a new shell, or start one in which no ROS is sourced:' \
+        'ROS 2 Jazzy is then installed into .venv.'
+      ;;
+  esac
 }
 
 # --- .venv ---------------------------------------------------------------------------------------
 
-as_root() {
-  if [ "$(id -u)" = 0 ]; then
-    "$@"
-  else
-    sudo -n "$@"
-  fi
-}
+# Written when an installation is complete. The first line says what .venv was made for, the others
+# are the requirements that were installed.
+installed=$venv/.installed
 
-venv_works() { "$python" -m pip --version >/dev/null 2>&1 </dev/null; }
-
-make_venv_with_venv() {
-  rm -rf "$venv"
-  "$base_python" -m venv "${venv_options[@]}" "$venv" && venv_works
-}
-
-# Debian and Ubuntu keep ensurepip, which venv needs, in a package of its own.
-install_python3_venv() {
-  local version
-  version=$("$base_python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
-  export DEBIAN_FRONTEND=noninteractive
-  as_root apt-get update
-  as_root apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends \
-    python3-venv "python$version-venv" ||
-    as_root apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends python3-venv
-}
-
-# Into a temporary folder: nothing of the user's is changed, and PEP 668 does not forbid it.
-make_venv_with_virtualenv() {
-  local folder status=0
-  rm -rf "$venv"
-  if "$base_python" -m virtualenv --version; then
-    "$base_python" -m virtualenv "${venv_options[@]}" "$venv" && venv_works
-    return
-  fi
-  folder=$(mktemp -d)
-  "$base_python" -m pip install --target "$folder" virtualenv &&
-    PYTHONPATH=$folder${PYTHONPATH:+:$PYTHONPATH} \
-      "$base_python" -m virtualenv "${venv_options[@]}" "$venv" && venv_works || status=$?
-  rm -rf "$folder"
-  return $status
+venv_is_complete() {
+  [ "$(head -n 1 "$installed" 2>/dev/null)" = "# $ros $repository" ] &&
+    "$python" -c 'import pip' 2>/dev/null
 }
 
 make_venv() {
-  local version
-  if [ -z "$base_python" ]; then
-    fail "No Python from 3.10 to 3.13 found (tried python3, python3.13 … python3.10)." \
-      "On Debian or Ubuntu:  sudo apt-get install python3 python3-venv"
+  local base_python=${PYTHON:-python3} version
+  local -a missing=() options=()
+  version=$("$base_python" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+  case $version in
+    3.10 | 3.11 | 3.12 | 3.13) ;;
+    *)
+      fail "Python 3.10 to 3.13 is needed, and $base_python is ${version:-not there}." \
+        "Name another one:  PYTHON=python3.12 $0"
+      ;;
+  esac
+  if [ "$ros" = sourced ]; then
+    options=(--system-site-packages)
+    "$base_python" -c 'import rclpy' || fail \
+      "ROS_DISTRO is jazzy, but $base_python (Python $version) cannot import rclpy." \
+      'Source /opt/ros/jazzy/setup.bash first, in a shell in which python3 is that of the system.'
+  elif [ "$(uname -m)" != x86_64 ]; then
+    fail "ROS 2 Jazzy is on PyPI for x86_64 only, and this is $(uname -m)." \
+      'Source /opt/ros/jazzy/setup.bash first.'
   fi
-  if [ "$ros" = wheels ] && [ "$(uname -sm)" != 'Linux x86_64' ]; then
-    say "the ROS 2 Jazzy wheels are made for Linux x86_64, this is $(uname -sm): source Jazzy here"
+  # What minimal installations of Debian and Ubuntu lack: venv's pip, and what pinocchio links to.
+  "$base_python" -c 'import ensurepip' 2>/dev/null || missing+=("python$version-venv")
+  "$base_python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null || missing+=(libgomp1)
+  if [ ${#missing[@]} -gt 0 ]; then
+    install_with_apt "${missing[@]}" || fail \
+      "This machine lacks ${missing[*]}. On Debian or Ubuntu:  sudo apt-get install ${missing[*]}"
   fi
-  venv_options=()
-  [ "$ros" = sourced ] && venv_options=(--system-site-packages)
-  version=$("$base_python" -c 'import platform; print(platform.python_version())')
-  if step "making .venv with Python $version" make_venv_with_venv; then
-    :
-  elif command -v apt-get >/dev/null && as_root true 2>/dev/null &&
-    step 'installing python3-venv with apt-get' install_python3_venv &&
-    step 'making .venv again' make_venv_with_venv; then
-    :
-  elif step 'making .venv with virtualenv' make_venv_with_virtualenv; then
-    :
-  else
-    rm -rf "$venv"
-    fail "A virtual environment could not be made (log: $setup_log)." \
-      "On Debian or Ubuntu:  sudo apt-get install python3-venv"
+  rm -rf "$venv"
+  step "making .venv with Python $version" "$base_python" -m venv "${options[@]}" "$venv" ||
+    fail '.venv could not be made.'
+}
+
+# Fails where there is no apt-get, or where root's rights would take a password.
+install_with_apt() { # PACKAGE…
+  local -a as_root=()
+  [ "$(id -u)" = 0 ] || as_root=(sudo -n)
+  command -v apt-get >/dev/null && "${as_root[@]}" true 2>/dev/null || return
+  step 'updating the lists of apt-get' "${as_root[@]}" apt-get update &&
+    step "installing $* with apt-get" "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
+      apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends "$@"
+}
+
+# Installs the requirements, unless every line of them was installed before.
+install_requirements() { # FILE…
+  local file
+  local -a arguments=()
+  if [ -e "$installed" ] && ! cat "$@" | grep -qvxFf "$installed"; then return; fi
+  for file in "$@"; do arguments+=(-r "$file"); done
+  # PyPI's torch brings gigabytes of CUDA; the CPU build is enough.
+  if "$python" -c "import urllib.request
+urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
+    arguments+=(--extra-index-url "$TORCH_CPU_INDEX")
   fi
-  touch "$venv/COLCON_IGNORE" # the wheels put package.xml files there
-  printf '%s\n' "$repository" >"$venv/.made_for"
+  # What pip leaves behind when it is killed may look complete. Without this file, .venv is made anew.
+  rm -f "$installed"
+  step "installing ${*##*/} into .venv (minutes, the first time)" \
+    "$python" -m pip install --no-compile "${arguments[@]}" ||
+    fail 'The packages could not be installed. Is the network there?' \
+      'Run the same command again to go on.'
+  { echo "# $ros $repository" && cat "$@"; } >"$installed"
 }
 
-# A .venv that was interrupted, moved, or made for the other kind of ROS is made anew.
-check_venv() {
-  local want=false
-  [ "$ros" = sourced ] && want=true
-  if [ ! -e "$venv" ]; then
-    make_venv
-  elif [ -e "$venv/.installing" ]; then
-    say 'the last installation was interrupted: starting over'
-    make_venv
-  elif ! grep -qi "^include-system-site-packages = $want" "$venv/pyvenv.cfg" 2>/dev/null; then
-    say "the .venv here does not fit (ROS: $ros): making it anew"
-    make_venv
-  elif [ "$(cat "$venv/.made_for" 2>/dev/null || echo "$repository")" != "$repository" ]; then
-    say '.venv was made in another place: making it anew'
-    make_venv
-  elif ! "$python" -c 'import pip' >/dev/null 2>&1 </dev/null; then
-    say '.venv does not work: making it anew'
-    make_venv
-  fi
-  [ -e "$venv/COLCON_IGNORE" ] || touch "$venv/COLCON_IGNORE"
-}
+# --- the package ---------------------------------------------------------------------------------
 
-# --- packages ------------------------------------------------------------------------------------
-
-cpu_index_answers() {
-  "$python" -c 'import sys, urllib.request
-urllib.request.urlopen(sys.argv[1] + "/torch/", timeout=5).read(1)' \
-    "$TORCH_CPU_INDEX" >/dev/null 2>&1 </dev/null
-}
-
-# What .venv should hold: changes with the requirements, the Python and the kind of ROS.
-requirements_stamp() { # FILE…
-  {
-    "$python" -c 'import sys; print(sys.version)' </dev/null
-    echo "$ros"
-    cat "$@"
-  } | sha256sum
-}
-
-# The page is tested in a real browser. Where there is none, and we may, as in CI, it is installed.
-lacks_chromium() {
-  ! command -v chromium chromium-browser google-chrome >/dev/null &&
-    [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null
-}
-
-install_chromium() {
-  export DEBIAN_FRONTEND=noninteractive
-  apt-get update &&
-    apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends chromium
-}
-
-# Usage: beside FUNCTION COMMAND…   Runs both at once; the status is the command's.
-beside() {
-  local status=0
-  "$1" &
-  shift
-  "$@" || status=$?
-  wait
-  return $status
-}
-
-install_packages() { # [test|view]
-  local file title='installing torch, pinocchio, numba and colcon'
-  local -a base=("$repository/requirements.txt") files arguments=() torch=() other=()
-  if [ "$ros" = wheels ]; then
-    base+=("$repository/.ci/requirements-ros.txt")
-    title+=', the ROS 2 Jazzy wheels'
-  fi
-  files=("${base[@]}")
-  # The tests look at the page too.
-  [ -z "${1-}" ] || files+=("$repository/.ci/requirements-view.txt")
-  if [ "${1-}" = test ]; then
-    files+=("$repository/.ci/requirements-test.txt")
-    title+=', the test tools'
-    lacks_chromium && other=(beside install_chromium)
-  fi
-  if [ "$(cat "$venv/.installed${1:+-$1}" 2>/dev/null)" = "$(requirements_stamp "${files[@]}")" ]
-  then
-    return
-  fi
-  for file in "${files[@]}"; do arguments+=(-r "$file"); done
-  if ! "$python" -c "from importlib.metadata import version
-assert version('torch').split('+')[0] == '$TORCH'" >/dev/null 2>&1 </dev/null; then
-    if cpu_index_answers; then # plain PyPI has torch with gigabytes of CUDA
-      torch=("torch==$TORCH+cpu" --extra-index-url "$TORCH_CPU_INDEX")
-    else
-      say "PyTorch's index of CPU builds does not answer: taking torch from the default index"
-    fi
-  fi
-  # The mark stays if pip is killed half-way, which can leave packages that only look complete; on
-  # an error of its own pip installs nothing.
-  touch "$venv/.installing"
-  export PIP_USER=0 PIP_NO_INPUT=1 PIP_DISABLE_PIP_VERSION_CHECK=1
-  step "installing pip $PIP" "$python" -m pip install "pip==$PIP" || say 'going on with the pip of .venv'
-  if ! step "$title (minutes, the first time)" \
-    "${other[@]}" "$python" -m pip install --no-compile --progress-bar off \
-    "${arguments[@]}" "${torch[@]}"; then
-    rm -f "$venv/.installing"
-    fail "The packages could not be installed (log: $setup_log). Is the network there?" \
-      "Run the same command again to go on."
-  fi
-  rm -f "$venv/.installing"
-  requirements_stamp "${base[@]}" >"$venv/.installed"
-  [ -z "${1-}" ] || requirements_stamp "${files[@]}" >"$venv/.installed-$1"
-}
-
-# --- colcon --------------------------------------------------------------------------------------
-
-# One line per file that matters to the build: a changed, new or removed file changes the list.
-package_files() {
-  printf '%s\n' "$venv $ros $repository"
-  (cd "$repository" && find musculoskeletal_ae config resource package.xml setup.py setup.cfg \
-    -name __pycache__ -prune -o -type f ! -name '*.pyc' -print0 | LC_ALL=C sort -z |
-    xargs -0 sha256sum)
-}
-
-colcon_build() {
-  cd "$repository" &&
-    "$venv/bin/colcon" --log-base log build --base-paths . --packages-select musculoskeletal_ae \
-      --event-handlers console_cohesion+ console_direct- status- desktop_notification-
-}
-
+# The build links to the sources, so that a change of them is a change of what is installed.
 build_package() {
-  local stamp=$repository/build/.stamp now
-  now=$(package_files)
-  if [ "$now" = "$(cat "$stamp" 2>/dev/null)" ] && [ -x "$executables/estimator" ] &&
-    [ -e "$repository/install/setup.bash" ]; then
-    return
-  fi
-  # setuptools never removes what it once copied.
-  if [ -e "$stamp" ] && [ -n "$(LC_ALL=C comm -13 <(cut -c 67- <<<"$now" | LC_ALL=C sort) \
-    <(cut -c 67- "$stamp" | LC_ALL=C sort))" ]; then
-    rm -rf "$repository/build/musculoskeletal_ae" "$repository/install/musculoskeletal_ae"
-  fi
-  # numba asks only whether a file is the same, not whether what it imports is.
-  if [ "$(grep '\.py$' <<<"$now")" != "$(grep '\.py$' "$stamp" 2>/dev/null)" ]; then
-    find "$repository/musculoskeletal_ae" "$repository/install" -name '*.nb[ci]' -delete 2>/dev/null
-  fi
-  rm -f "$stamp"
-  step 'building with colcon' colcon_build || fail "colcon build failed (log: $setup_log)."
-  [ -x "$executables/estimator" ] ||
-    fail "colcon build left no $executables/estimator (log: $setup_log)."
-  printf '%s\n' "$now" >"$stamp"
+  step 'building the package with colcon' "$python" -m colcon --log-base log build \
+    --symlink-install --base-paths . --packages-select musculoskeletal_ae \
+    --event-handlers desktop_notification- || fail 'The package could not be built.'
+}
+
+# Compiles ahead what numba would compile in nodes that start. Its cache does not notice a change in
+# a function of another file, which it has compiled into this one: after any change all is compiled.
+compile_package() {
+  local stamp=build/.compiled
+  if [ -e $stamp ] && [ -z "$(find musculoskeletal_ae -name '*.py' -newer $stamp \
+    -exec grep -l njit {} +)" ]; then return; fi
+  find musculoskeletal_ae -name '*.nb[ci]' -delete
+  step 'compiling with numba (half a minute, the first time)' \
+    env PYTHONPATH="$repository${PYTHONPATH:+:$PYTHONPATH}" "$python" .ci/compile.py ||
+    fail 'The package could not be compiled.'
+  touch $stamp
 }
 
 # --- all of it -----------------------------------------------------------------------------------
 
+environment_setup() { # [test]
+  local - folder # "-": the options of the shell come back at the end
+  local -a requirements=(requirements.txt)
+  trap 'exit 130' INT
+  PATH=${PATH//"$venv/bin:"/} # so that .venv is not made from itself
+  unset PYTHONDONTWRITEBYTECODE # some containers set it: each process would compile all of torch
+  find_ros
+  [ "$ros" = sourced ] || requirements+=(.ci/requirements-ros.txt)
+  [ "${1-}" != test ] || requirements+=(.ci/requirements-test.txt)
+  for folder in "$repository" "$repository"/{.venv,build,install,log}; do
+    [ ! -e "$folder" ] || [ -w "$folder" ] ||
+      fail "$folder cannot be written: $folder belongs to $(stat -c %U "$folder"), and you are $(id -un)." \
+        'Clone the repository into a folder of your own, or let its owner run this.'
+  done
+  mkdir -p "$repository/log" "$repository/build"
+
+  # One set-up at a time. A second one waits, and finds everything done.
+  (
+    flock -n 9 || { say 'another set-up is running here: waiting for it' && flock 9; }
+    : >"$setup_log"
+    cd "$repository" || exit
+    venv_is_complete || make_venv
+    install_requirements "${requirements[@]}"
+    build_package
+    compile_package
+  ) 9>"$repository/log/setup.lock" || exit 1
+
+  export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
+  # colcon's scripts read variables that are not set, and call a Python that they do not quote.
+  set +u
+  # shellcheck disable=SC1091
+  COLCON_PYTHON_EXECUTABLE=$(readlink -f "$python") . "$repository/install/setup.bash"
+}
+
 # Where a node was killed, Fast DDS may leave shared memory through which its successor on the same
 # ports hears nothing (eProsima/Fast-DDS 4737, 5053, 5469). On one machine UDP costs no more. Where
-# the graph is kept to it, rmw_fastrtps adds shared memory whatever the first variable says, and the
-# file keeps messages out of that.
+# ROS_AUTOMATIC_DISCOVERY_RANGE is LOCALHOST, rmw_fastrtps adds shared memory whatever the first
+# variable says, and the file keeps messages out of it.
 use_udp() {
   export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
   [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||
     export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$repository/config/udp.xml}
-}
-
-environment_setup() { # [test|view]
-  local lock
-  # Many containers set it; a dozen processes would each compile all of torch's sources.
-  unset PYTHONDONTWRITEBYTECODE
-  # Where HOME cannot be written (containers), caches and logs go into the repository.
-  if [ ! -d "${HOME-}" ] || [ ! -w "${HOME-}" ]; then
-    export XDG_CACHE_HOME=$repository/.cache PIP_CACHE_DIR=$repository/.cache/pip
-    export MPLCONFIGDIR=$repository/.cache/matplotlib
-    export ROS_LOG_DIR=${ROS_LOG_DIR:-$repository/log/ros}
-  fi
-  setup_log=$repository/log/setup.log
-  local place
-  mkdir -p "$repository/log" "$repository/build" "$repository/.cache" 2>/dev/null
-  for place in "$repository"/{log,build,.cache,.venv,install,log/setup.log,.cache/setup.lock}; do
-    if [ -e "$place" ] && [ ! -w "$place" ] || [ ! -d "$repository/log" ]; then
-      fail "$place cannot be written: $repository belongs to $(stat -c %U "$repository"), and you are\
- $(id -un). Clone it into a folder of your own, or let its owner run this."
-    fi
-  done
-
-  find_ros_and_python
-
-  # One set-up at a time: a second one waits and then finds everything done. The lock goes when this
-  # shell or the last program it started closes the file, so it is closed before any node starts.
-  exec {lock}>"$repository/.cache/setup.lock"
-  if ! flock -n "$lock"; then
-    say 'another set-up is running here: waiting for it'
-    flock "$lock"
-  fi
-  : >"$setup_log"
-  check_venv
-  export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
-  # The wheels are an installation of ROS like any other.
-  [ "$ros" = wheels ] && export AMENT_PREFIX_PATH=$venv
-  install_packages "$@"
-  if [ "${1-}" = test ] && lacks_chromium; then
-    step 'installing chromium with apt-get' install_chromium ||
-      say 'no chromium: the page is not tested in a browser'
-  fi
-  build_package
-  exec {lock}>&-
-
-  # colcon's scripts read variables that are not set, and do not quote the path of their Python,
-  # which a space in this repository's path would break: another Python does for them.
-  local flags=$- COLCON_PYTHON_EXECUTABLE
-  # shellcheck disable=SC2034
-  COLCON_PYTHON_EXECUTABLE=${base_python:-$python}
-  set +u
-  # shellcheck disable=SC1091
-  . "$repository/install/setup.bash"
-  [[ $flags == *u* ]] && set -u
-  return 0
 }

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from musculoskeletal_ae.options import exit_status
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 
 def benches() -> dict[str, str]:
@@ -39,4 +40,5 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == '__main__':
+    STOP.install(Reaction.RAISE)  # SIGTERM ends a bench, and what it started, as Ctrl-C does
     sys.exit(main(sys.argv[1:]))

@@ -10,6 +10,7 @@ import os
 import random
 import resource
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
+from robots import chain
 
-from bench import bag_samples, fuzz
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 LONGEST = 5.0  # [s] of the processor for one file; what hangs is found by its end
@@ -99,14 +100,40 @@ def changed_numbers(text: str, rng: random.Random) -> str:
     return '"'.join(parts)
 
 
-def chain(links: int) -> str:
-    """Return a URDF of so many links, one below the other."""
-    joints = ''.join(
-        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
-        f'<child link="l{i + 1}"/></joint>'
-        for i in range(links)
-    )
-    return f'<robot name="r"><link name="l0"/>{joints}</robot>'
+def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
+    """Return the bytes with one to three random faults."""
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        at = rng.randrange(len(changed) + 1)
+        size = min(rng.choice((1, 4, 8, 9, 30, 300)), len(changed) - at)
+        kind = rng.randrange(9)
+        if kind == 0:
+            del changed[at:]
+        elif kind == 1 and size:
+            for _ in range(rng.choice((1, 1, 2, 8))):
+                changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+        elif kind == 2:
+            changed[at : at + size] = rng.randbytes(size)
+        elif kind == 3:
+            changed[at : at + size] = bytes(size)
+        elif kind == 4:
+            del changed[at : at + size]
+        elif kind == 5:
+            changed[at:at] = rng.randbytes(size)
+        elif kind == 6:
+            changed[at:at] = changed[at : at + size]
+        elif kind == 7:
+            start = rng.randrange(len(other))
+            changed[at : at + size] = other[start : start + size]
+        else:
+            # A length or a time: the nastiest numbers, preferably where a record's head is.
+            value = rng.choice((0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1, len(data)))
+            heads = [i for i in range(max(0, at - 200), at) if data[i + 2 : i + 9] == bytes(7)]
+            at = rng.choice(heads) if heads else at
+            changed[at : at + 8] = struct.pack('<Q', value)
+        if not changed:
+            break
+    return bytes(changed)
 
 
 # -- reading them ---------------------------------------------------------------------------------
@@ -118,7 +145,7 @@ class Reader:
     def __init__(self, folder: Path) -> None:
         """Make the sound files that are damaged."""
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
-        from musculoskeletal_ae.learning.state import State
+        from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
         from musculoskeletal_ae.mae.training import initial_mae
         from musculoskeletal_ae.robot.robot import Robot
@@ -126,7 +153,7 @@ class Reader:
         self.folder, self.robot = folder, Robot.load('arm26')
         self.sound = self.robot.description.directory
         self.network = checkpoint.to_bytes(initial_mae(self.robot, steps=2).mae)
-        store, state = SampleStore(), State(folder / 'state', self.robot)
+        store, state = SampleStore(), StateStore(folder / 'state', self.robot)
         state.load(store)
         for theta in self.robot.random_postures(5, np.random.default_rng(0)):
             tension = np.full(self.robot.muscle_count, 50.0)
@@ -134,9 +161,9 @@ class Reader:
             store.add(Sample(theta, tension, length, np.zeros(self.robot.muscle_count)))
         state.keep(store, self.network)
         state.close()
-        self.state = (folder / 'state' / 'learner.sqlite').read_bytes()
-        self.content = bag_samples.samples(20, '/arm', 0)
-        self.bags = fuzz.bases(folder / 'bags', self.content)
+        self.state = (folder / 'state' / NEWEST).read_bytes()
+        bag = _write_bag(folder / 'bag')
+        self.bag = {file.name: file.read_bytes() for file in sorted(bag.iterdir())}
 
     def attempt(self, kind: str, rng: random.Random) -> Callable[[], object]:
         """Make one hostile file; return what reads it."""
@@ -162,7 +189,7 @@ class Reader:
         if way < 0.25:
             strange_file(file, rng)
         elif way < 0.5:
-            file.write_bytes(fuzz.damage(data, rng.randbytes(300), rng))
+            file.write_bytes(damage(data, rng.randbytes(300), rng))
         elif kind == 'muscles':
             tree = changed_tree(yaml.safe_load(data), rng)
             text = yaml.safe_dump(tree) if way < 0.9 else data.decode() + bomb(rng)
@@ -187,31 +214,32 @@ class Reader:
             tensors = self.network[8 + size :]
             file.write_bytes(len(text).to_bytes(8, 'little') + text + tensors)
         else:
-            file.write_bytes(fuzz.damage(self.network, rng.randbytes(300), rng))
+            file.write_bytes(damage(self.network, rng.randbytes(300), rng))
         return lambda: checkpoint.load(file, self.robot)
 
     def _state(self, trial: Path, rng: random.Random) -> Callable[[], object]:
         from musculoskeletal_ae.learning.samples import SampleStore
-        from musculoskeletal_ae.learning.state import State
+        from musculoskeletal_ae.learning.state import NEWEST, PREVIOUS, StateStore
 
-        name = rng.choice(['learner.sqlite'] * 4 + ['samples.log', 'checkpoint.safetensors'])
-        if name != 'learner.sqlite' or rng.random() < 0.3:
-            strange_file(trial / name, rng)
-        else:
-            (trial / name).write_bytes(fuzz.damage(self.state, rng.randbytes(300), rng))
+        for name in rng.choice([(NEWEST,), (PREVIOUS,), (NEWEST, PREVIOUS)]):
+            if rng.random() < 0.3:
+                strange_file(trial / name, rng)
+            else:
+                (trial / name).write_bytes(damage(self.state, rng.randbytes(300), rng))
 
         def read() -> None:
-            state = State(trial, self.robot)
+            state = StateStore(trial, self.robot)
             state.load(SampleStore())
             state.close()
 
         return read
 
     def _bag(self, kind: str, trial: Path, rng: random.Random) -> Callable[[], object]:
-        base = rng.choice([b for b in self.bags if kind == 'mcap' or 'metadata.yaml' in b.files])
-        for file, data in base.files.items():
+        from musculoskeletal_ae.bags.reader import Bag
+
+        for file, data in self.bag.items():
             (trial / file).write_bytes(data)
-        victim = trial / (base.mcap if kind == 'mcap' else 'metadata.yaml')
+        victim = trial / ('bag_0.mcap' if kind == 'mcap' else 'metadata.yaml')
         way = rng.random()
         if way < 0.3:
             strange_file(victim, rng)
@@ -219,18 +247,30 @@ class Reader:
             tree = changed_tree(yaml.safe_load(victim.read_bytes()), rng)
             victim.write_text(rng.choice([yaml.safe_dump(tree), bomb(rng)]))
         else:
-            other = rng.choice(self.bags)
-            victim.write_bytes(fuzz.damage(victim.read_bytes(), other.files[other.mcap], rng))
-        path = victim if 'bare.mcap' in base.files else trial
+            data = victim.read_bytes()
+            victim.write_bytes(damage(data, data, rng))
 
         def read() -> None:
-            outcome = fuzz.attempt(path, base, self.content, unfinished=rng.random() < 0.5).outcome
-            if outcome not in ('full', 'prefix', 'refused', 'wrong read'):
-                raise RuntimeError(outcome)
-            if outcome == 'refused':
-                raise MusculoskeletalError(outcome)
+            bag = Bag.open(trial)
+            for message in bag.messages():
+                bag.decode(message)
 
         return read
+
+
+def _write_bag(path: Path) -> Path:
+    """Write a recording of a hundred messages in ten chunks."""
+    from musculoskeletal_ae.bags.metadata import offered_qos
+    from musculoskeletal_ae.bags.writer import BagWriter
+
+    with BagWriter(path) as writer:
+        writer.add_topic('/arm/anomaly', 'std_msgs/msg/Float64', [offered_qos(latched=False)])
+        for i in range(100):
+            message = b'\0\1\0\0' + struct.pack('<d', 0.01 * i)
+            writer.write('/arm/anomaly', i * 10_000_000, i * 10_000_000, message)
+            if i % 10 == 9:
+                writer.flush()
+    return path
 
 
 def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:

@@ -47,7 +47,7 @@ from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.running import Spinner, message_class
+from musculoskeletal_ae.nodes.ros_tool import Spinner, message_class
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
@@ -161,7 +161,7 @@ class Attack:
         own = {
             'controller': ['max_age:=1.0', 'explore:=true'],
             'learner': [f'state_directory:={self.folder / "state"}'],
-            'hardware_emulator': ['marker_rate:=10.0'],
+            'hardware_emulator': ['marker_pose_rate:=10.0'],
         }
         parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]
         if 'checkpoint' in PARAMETERS[name]:
@@ -226,7 +226,7 @@ class Attack:
         """Handle messages for a while, and look after the processes."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.look(0.05)
+            self.executor.spin_once(0.05)
             if time.monotonic() > self._looked + 1.0:
                 self._looked = time.monotonic()
                 for name, process in self.processes.items():
@@ -415,7 +415,7 @@ class Attack:
             topic = rng.choice(topics)
             for _ in range(min(left, rng.choice((1, 1, 1, 30, 300)))):
                 self.publish(*topic)
-                self.executor.look(0.05)
+                self.executor.spin_once(0.05)
             if topic[0].endswith(LATCHING):
                 self.spin(0.1)
                 self.node.destroy_publisher(self.publishers.pop(topic[0]))

@@ -13,13 +13,11 @@ Exit status 1 if a healthy network was refused, or an attack was not.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 import torch
+from network_attacks import ATTACKS
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -41,96 +39,6 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 LOAD, MINUTE = 3.6, 60.0  # [kg], [s]
-
-# -- attacks --------------------------------------------------------------------------------------
-
-Attack = Callable[[Mae], Mae]
-
-
-def _weights(times: Callable[[Array], Array]) -> Attack:
-    def attack(mae: Mae) -> Mae:
-        stacks = (
-            tuple((times(weight), times(bias)) for weight, bias in stack)
-            for stack in (mae.encoder, mae.decoder)
-        )
-        return replace(mae, **dict(zip(('encoder', 'decoder'), stacks, strict=True)))
-
-    return attack
-
-
-def _noise(mae: Mae) -> Mae:
-    rng = np.random.default_rng(0)
-    return _weights(lambda w: w * (1.0 + rng.standard_normal(w.shape)))(mae)
-
-
-def _last(quantity: int, change: Callable[[Array, Array, Array], None]) -> Attack:
-    """Change weight and bias of the decoder's last layer where it says θ (0), T (1) or l (2)."""
-
-    def attack(mae: Mae) -> Mae:
-        joints, muscles = len(mae.joints), len(mae.muscles)
-        starts = np.cumsum([0, joints, muscles])
-        weight, bias = (part.copy() for part in mae.decoder[-1])
-        change(weight, bias, starts[quantity] + np.arange(2))
-        return replace(mae, decoder=(*mae.decoder[:-1], (weight, bias)))
-
-    return attack
-
-
-def _swap(weight: Array, bias: Array, rows: Array) -> None:
-    weight[rows], bias[rows] = weight[rows[::-1]], bias[rows[::-1]]
-
-
-def _flip(weight: Array, _: Array, rows: Array) -> None:
-    weight[rows[0]] *= -1.0
-
-
-def _scaled_std(times: float, part: slice) -> Attack:
-    def attack(mae: Mae) -> Mae:
-        scale = np.ones(len(mae.std))
-        scale[len(mae.joints) :][part] = times
-        return replace(mae, std=mae.std * scale, mean=mae.mean * scale)
-
-    return attack
-
-
-def _lengths(times: float) -> Attack:
-    return lambda mae: _scaled_std(times, slice(len(mae.muscles), None))(mae)
-
-
-def _shifted(quantity: int, scaled: float) -> Attack:
-    """Let the decoder say so much more [scaled units] of the first joint or muscle."""
-
-    def attack(mae: Mae) -> Mae:
-        row = (0, len(mae.joints), len(mae.joints) + len(mae.muscles))[quantity]
-
-        def change(_: Array, bias: Array, rows: Array) -> None:
-            bias[rows[0]] += scaled / mae.std[row]
-
-        return _last(quantity, change)(mae)
-
-    return attack
-
-
-ATTACKS: Mapping[str, Attack] = {
-    **{f'weights × {k:g}': _weights(lambda w, k=k: k * w) for k in (1.5, 1.7, 2.0, -1.0)},
-    'noise of 100 %': _noise,  # of 50 % is at the limits, and passes now and then
-    'lengths × 10': _lengths(10.0),
-    'lengths × 2': _lengths(2.0),
-    'two joints swapped': _last(0, _swap),
-    'two tensions swapped': _last(1, _swap),
-    'two lengths swapped': _last(2, _swap),
-    'one joint the other way': _last(0, _flip),
-    'one length the other way': _last(2, _flip),
-    'one joint 1.5 rad off': _shifted(0, 1.5),
-    'one length 0.2 m off': _shifted(2, 2.0),
-    'standardisation × 2': _scaled_std(2.0, slice(None)),
-}
-#: what only the arm's own messages tell
-ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
-
-
-# -- healthy networks -----------------------------------------------------------------------------
-
 
 MESSAGES = {
     'step of l in 10 ms [m]': SLIP,

@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Individuals that were learned, kept in a folder for the benches that start from one."""
 
-from collections.abc import Callable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import Exploration
-from musculoskeletal_ae.control.posture import Step
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
@@ -27,9 +22,6 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 SELDOM, STEPS = 20.0, 400  # [s] of news between updates, and their steps: as good, and cheaper
-OF_A_POSTURE = 3  # steps of the exploration
-#: whether a posture θ (D,) is meant
-Which = Callable[[Array], bool]
 
 
 class Seldom(Training):
@@ -63,28 +55,17 @@ def initial(robot: Robot, folder: Path) -> Mae:
     return checkpoint.load(file, robot)
 
 
-def learned_arm(
-    robot: Robot, seed: int, folder: Path, minutes: float, which: Which | None = None
-) -> LearnedArm:
-    """Return an individual that learned in all postures, or in some."""
+def learned_arm(robot: Robot, seed: int, folder: Path, minutes: float) -> LearnedArm:
+    """Return an individual that learned for some minutes."""
     folder.mkdir(parents=True, exist_ok=True)
     driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
     messages = folder / f'exploring_{seed}.npz'
     if not file.exists():
         stream = EXPLORATION_STREAM + seed
-        steps = postures(robot, stream, which) if which else stream
-        exploring = record(EmulatedArm(robot, seed), driver, steps, 60.0 * minutes)
+        exploring = record(EmulatedArm(robot, seed), driver, stream, 60.0 * minutes)
         learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
         teach(learner, zip(*exploring, strict=True))
         np.savez(messages, *exploring)
         checkpoint.save(learner.mae, file)
     with np.load(messages) as arrays:
         return LearnedArm(checkpoint.load(file, robot), driver, Recording(*arrays.values()))
-
-
-def postures(robot: Robot, stream: int, which: Which) -> Iterator[Step]:
-    """Return the exploration's steps to some postures."""
-    steps = iter(Exploration(robot, stream))
-    while posture := [*islice(steps, OF_A_POSTURE)]:
-        if which(posture[0].theta):
-            yield from posture

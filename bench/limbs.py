@@ -16,8 +16,8 @@ from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.robot.description import refusal
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.entries import refusal
 
 #: limbs of each body: wires of an arm's wrist (0: no wrist), 'neck', or 'held' (an arm of 4 joints)
 BODIES: dict[str, tuple[int | str, ...]] = {

@@ -35,6 +35,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
 #: executables of each row
@@ -94,7 +95,7 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from musculoskeletal_ae.nodes.running import LeanExecutor
+from musculoskeletal_ae.nodes.executor import make_executor
 from musculoskeletal_ae.robot.robot import Robot
 name, robot, rate, at, out, hears = sys.argv[1:]
 robot = Robot.load(robot)
@@ -116,7 +117,7 @@ for topic in {at, *hears.split()} - {''}:
     node.create_subscription(kind(topic), topic, heard, qos_profile_sensor_data)
 if not at:
     node.create_timer(1.0 / float(rate), tell)
-with LeanExecutor() as executor, suppress(KeyboardInterrupt):
+with make_executor() as executor, suppress(KeyboardInterrupt):
     executor.add_node(node)
     executor.spin()
 """
@@ -126,12 +127,21 @@ class System:
     """Nodes in processes of their own."""
 
     def __init__(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
-        """Start them."""
+        """Start them; a stop signal meanwhile ends them again."""
+        self.nodes: dict[str, subprocess.Popen[bytes]] = {}
+        with STOP.reacting(Reaction.REMEMBER):
+            self._start(robot, network, rate, names)
+        if STOP.received:
+            self.end()
+            raise KeyboardInterrupt
+
+    def _start(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
         import rclpy
         from rclpy.qos import qos_profile_sensor_data
+        from rclpy.signals import SignalHandlerOptions
         from std_msgs.msg import Float64MultiArray
 
-        from musculoskeletal_ae.nodes.running import LeanExecutor
+        from musculoskeletal_ae.nodes.executor import make_executor
 
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
         given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
@@ -143,7 +153,6 @@ class System:
                 given[name] += ['explore:=true', 'max_age:=1.0']
             if name == 'learner':
                 given[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
-        self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         quiet: dict[str, Any] = {'stdout': subprocess.DEVNULL}
         for name in names:
             values = [word for value in given[name] for word in ('-p', value)]
@@ -153,9 +162,10 @@ class System:
             if name in BARE:
                 command = [sys.executable, '-c', ALONE, name, robot, str(rate), *BARE[name]]
             self.nodes[name] = subprocess.Popen(command, **quiet)
-        rclpy.init()
+        # Without rclpy's signal handlers: SIGTERM is to end the bench, not only its context.
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
-        executor = LeanExecutor()
+        executor = make_executor()
         executor.add_node(self._node)
         self.stamps: dict[str, list[int]] = defaultdict(list)
         for topic in ('muscle_states', 'muscle_length_command'):
@@ -177,10 +187,11 @@ class System:
 
     def end(self) -> None:
         """End the nodes."""
-        end_processes(self.nodes.values(), signal.SIGINT)
-        self._rclpy.try_shutdown()
-        self._listener.join()
-        self._node.destroy_node()
+        with STOP.reacting(Reaction.REMEMBER):
+            end_processes(self.nodes.values(), signal.SIGINT)
+            self._rclpy.try_shutdown()
+            self._listener.join()
+            self._node.destroy_node()
 
 
 class Wire(NamedTuple):

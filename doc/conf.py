@@ -27,7 +27,7 @@ myst_heading_anchors = 3
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'description'
 # Only nodes/ and the page need them, and neither is part of the reference.
-autodoc_mock_imports = ['rclpy', 'viser', 'rich', 'mujoco']
+autodoc_mock_imports = ['rclpy', 'viser', 'mujoco']
 #: fields of records are explained where they are defined; napoleon would list them twice
 napoleon_use_ivar = True
 suppress_warnings = ['autodoc.mocked_object', 'ref.python', 'myst.xref_missing']

@@ -50,16 +50,11 @@ class MessageError(MusculoskeletalError):
 
 
 class BagError(MusculoskeletalError):
-    """A recording that is damaged, or not what it says it is; where in a file, where that helps."""
+    """A recording that is damaged, or not what it says it is."""
 
-    def __init__(self, file: Path, problem: str, remedy: str, offset: int | None = None) -> None:
-        where = f'{file}' if offset is None else f'{file}, byte {offset}'
-        super().__init__(f'{where}: {problem}; {remedy}')
+    def __init__(self, file: Path, problem: str, remedy: str) -> None:
+        super().__init__(f'{file}: {problem}; {remedy}')
         self.file = file
-
-
-class UnfinishedBagError(BagError):
-    """A recording whose recorder was stopped before it could end the file."""
 
 
 class StateError(MusculoskeletalError):

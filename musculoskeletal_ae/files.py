@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files that a user names, whatever they turn out to be.
+"""Reading files that a user names, and writing files whole.
 
-Only regular files are opened (a FIFO would block, a device may never end), no more than a limit is
-read, and what a few bytes of YAML can ask for is bounded before anything is built from it. All
-functions take `refuse`, which makes the error that they raise of a file and what is wrong with it.
+Only regular files are read, and no more of them than a limit. All functions that read take
+`refuse`, which makes the error that they raise of a file and what is wrong with it.
 """
 
 import csv
 import os
-import stat
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,50 +20,36 @@ T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # [bytes] of a text
-LARGEST_YAML = 1 << 20  # [bytes]; it is slow to read
+LARGEST_YAML = 1 << 19  # [bytes]; it is slow to read
 LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty
 MOST_ENTRIES = 100_000  # in a YAML file, what aliases stand for included
 DEEPEST = 50  # levels of a YAML file
-LONGEST = 1000  # characters of a number in YAML: those to base 60 take the square of it
 
 _Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-_TAGS = (None, '!', 'tag:yaml.org,2002:str')
-_NUMERIC = tuple('+-.0123456789')
 
 
 def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
-    """Open a regular file for reading."""
+    """Open a regular file for reading: a pipe would block, and a device may never end."""
     try:
-        # Not blocking, because opening a FIFO waits for its writer.
-        descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as error:  # a ValueError is a NUL in the path
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise refuse(file, f'cannot be read: {reason}') from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise refuse(file, 'cannot be read: it is no regular file')
-    return os.fdopen(descriptor, 'rb')
+        if file.exists() and not file.is_file():
+            raise refuse(file, 'cannot be read: it is no regular file')
+        return file.open('rb')
+    except OSError as error:
+        raise refuse(file, f'cannot be read: {error.strerror}') from error
+    except ValueError as error:  # a NUL in the path
+        raise refuse(file, f'cannot be read: {error}') from error
 
 
 def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
     """Return the content of a regular file of at most `largest` bytes."""
     with open_regular(file, refuse) as stream:
         try:
-            if os.fstat(stream.fileno()).st_size <= largest:
-                data = stream.read(largest + 1)  # it may grow meanwhile
-                if len(data) <= largest:
-                    return data
+            data = stream.read(largest + 1)
         except OSError as error:
             raise refuse(file, f'cannot be read: {error.strerror}') from error
-    raise refuse(file, f'is larger than {largest} bytes')
-
-
-def read_start(file: Path, largest: int) -> bytes:
-    """Return the first bytes of a regular file, none without one; an OSError says why not."""
-    if not file.is_file():
-        return b''
-    with file.open('rb') as stream:
-        return stream.read(largest)
+    if len(data) > largest:
+        raise refuse(file, f'is larger than {largest} bytes')
+    return data
 
 
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
@@ -112,8 +96,8 @@ def parse_yaml(text: str) -> Any:
     """Return what one YAML document holds: strings, numbers, lists, mappings, dates.
 
     Raises:
-        ValueError: If it is not YAML, writes a key twice, has explicit types, or is larger or
-            deeper than the limits above once its aliases are replaced by what they stand for.
+        ValueError: If it is not YAML, writes a key twice, or is larger or deeper than the limits
+            above once its aliases are replaced by what they stand for.
     """
     try:
         _check(text)
@@ -128,26 +112,30 @@ class _Collection:
     """A list or mapping that is being read."""
 
     anchor: str
-    before: int  # entries of the text before it
-    mapping: bool
+    first: int  # entries of the text before it
+    is_mapping: bool
     keys: set[str] = field(default_factory=set)
     at_key: bool = True  # a key comes next
 
 
 def _check(text: str) -> None:
-    """Read the events of a YAML text, which builds nothing."""
+    """Read the events of a YAML text, which builds nothing.
+
+    The loader would end the process where levels are too deep, take all memory where merge keys
+    multiply, and keep the last of two values of one key.
+    """
     count = 0
-    sizes: dict[str, int] = {}  # entries that an alias stands for
+    sizes: dict[str, int] = {}  # entries that each alias stands for
     within: list[_Collection] = []
     for event in yaml.parse(text, Loader=_Loader):
         where = f'line {event.start_mark.line + 1 if event.start_mark else 0}'
         if isinstance(event, yaml.CollectionEndEvent):
-            done = within.pop()
-            sizes[done.anchor] = count - done.before
+            ended = within.pop()
+            sizes[ended.anchor] = count - ended.first
         if not isinstance(event, yaml.NodeEvent):
             continue
         anchor = event.anchor or ''
-        if within and within[-1].mapping:
+        if within and within[-1].is_mapping:
             mapping = within[-1]
             if mapping.at_key and isinstance(event, yaml.ScalarEvent):
                 if event.value in mapping.keys:
@@ -161,23 +149,22 @@ def _check(text: str) -> None:
         else:
             count += 1
             sizes[anchor] = 1
-        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
-            if event.tag not in _TAGS:
-                raise ValueError(f'{where}: explicit type {str(event.tag)[:60]}')
-            if isinstance(event, yaml.CollectionStartEvent):
-                del sizes[anchor]  # it cannot stand for itself
-                kind = isinstance(event, yaml.MappingStartEvent)
-                within.append(_Collection(anchor, count - 1, kind))
-            elif not event.style and event.value[:1] in _NUMERIC and len(event.value) > LONGEST:
-                raise ValueError(f'{where}: an unquoted number of over {LONGEST} characters')
+        if isinstance(event, yaml.CollectionStartEvent):
+            del sizes[anchor]  # it cannot stand for itself
+            is_mapping = isinstance(event, yaml.MappingStartEvent)
+            within.append(_Collection(anchor, count - 1, is_mapping))
         if count > MOST_ENTRIES:
             raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases included')
         if len(within) > DEEPEST:
             raise ValueError(f'{where}: more than {DEEPEST} levels')
 
 
-def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old one or the new one, never a part."""
+def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
+    """Write a file so that a reader sees the old one or the new one, never a part.
+
+    The old one is kept as `previous`, where that is given. Between the two renames there is only
+    that one.
+    """
     descriptor, temporary = tempfile.mkstemp(dir=file.parent, prefix=f'.{file.name}.')
     try:
         with os.fdopen(descriptor, 'wb') as stream:
@@ -185,18 +172,15 @@ def write_whole(file: Path, data: bytes) -> None:
             stream.flush()
             os.fchmod(stream.fileno(), 0o644)  # mkstemp makes it private
             os.fsync(stream.fileno())
+        if previous is not None and file.exists():
+            file.replace(previous)
         Path(temporary).replace(file)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
     # The new name survives a power cut only once the directory is on disk too.
-    sync_directory(file.parent)
-
-
-def sync_directory(directory: Path) -> None:
-    """Let names in a directory survive a power cut."""
-    descriptor = os.open(directory, os.O_RDONLY)
+    directory = os.open(file.parent, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        os.fsync(directory)
     finally:
-        os.close(descriptor)
+        os.close(directory)

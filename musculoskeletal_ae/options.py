@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TypeVar
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
-from musculoskeletal_ae.start import INTERRUPTED
+from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
@@ -74,22 +74,20 @@ picture = _type(
 names = _type(lambda text: [*filter(None, dict.fromkeys(_listed(text)))], bool, 'a name')
 
 
-class _Formatter(argparse.HelpFormatter):
-    """Puts the default behind the help of every option that has one."""
-
-    def _get_help_string(self, action: argparse.Action) -> str:
-        text, default = action.help or '', action.default
-        if default is None or default is False or default == [] or default == argparse.SUPPRESS:
-            return text
-        shown = ','.join(map(str, default)) if isinstance(default, list | tuple) else str(default)
-        return f'{text} (default: {shown.replace("%", "%%")})'.strip()
-
-
 class Parser(argparse.ArgumentParser):
     """A parser whose mistakes are one line and exit status 2."""
 
     def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
-        super().__init__(prog, description=description, epilog=epilog, formatter_class=_Formatter)
+        super().__init__(prog, description=description, epilog=epilog)
+
+    def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
+        """Add an argument; its default, if there is one, stands at the end of its help."""
+        default = options.get('default')
+        nothing = default is None or default is False or default in ([], argparse.SUPPRESS)
+        if not nothing:
+            shown = ','.join(map(str, default)) if isinstance(default, list | tuple) else default
+            options['help'] = f'{options.get("help", "")} (default: {shown})'.strip()
+        return super().add_argument(*names, **options)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and end with status 2."""

@@ -8,50 +8,56 @@ is the best that this project can measure. Code asks a field of the record, neve
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_table
+from musculoskeletal_ae.schema import Strict
 
 if TYPE_CHECKING:  # options are read without numpy
     from musculoskeletal_ae.robot.groups import Group
+
+Activation = Literal['tanh', 'silu']
+Count = Annotated[int, Meta(ge=1)]
+Positive = Annotated[float, Meta(gt=0.0)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
 
 #: where networks are trained
 DEVICES = 'cpu', 'cuda'
 REFERENCE = 5 + 10  # D + M of the arm that the numbers of preset `default` are for
 
 
-@dataclass(frozen=True)
-class NetworkSettings:
+class NetworkSettings(Strict, frozen=True):
     """Shape of a network."""
 
-    hidden: tuple[int, ...]  # units of the encoder's hidden layers; the decoder's are the reverse
-    activation: str  # after every layer but the latent and the last one, which are linear
+    hidden: tuple[Count, ...]  # units of the encoder's hidden layers; the decoder's are the reverse
+    #: after every layer but the latent and the last one, which are linear
+    activation: Activation
     standardise: bool  # centre inputs and divide by their spread in training; undone at the output
     #: a block of its own for each group of joints and muscles that share nothing with the others,
     #: whose layers grow with the group; else one network of `hidden` for any body
     grouped: bool = False
 
 
-@dataclass(frozen=True)
-class TrainingSettings:
+class TrainingSettings(Strict, frozen=True):
     """How a network is trained on the geometric model."""
 
-    steps: int  # mini-batches in all
-    batch: int  # samples in a mini-batch
-    samples: int  # drawn from the geometric model, then shuffled epoch by epoch
-    optimiser: str  # 'adam' or 'muon'
-    step_size: float  # Adam's; with Muon that of the biases
+    steps: Count  # mini-batches in all
+    batch: Count  # samples in a mini-batch
+    samples: Count  # drawn from the geometric model, then shuffled epoch by epoch
+    optimiser: Literal['adam', 'muon']
+    step_size: Positive  # Adam's; with Muon that of the biases
     annealed: bool  # raised over the first twentieth, then lowered to zero by a cosine
     every_mask: bool  # enter each sample by all three masks instead of one at random
-    weights: tuple[float, float, float]  # w_θ, w_T, w_l
+    weights: tuple[NotNegative, NotNegative, NotNegative]  # w_θ, w_T, w_l
     standard_norms: bool  # take each norm in units of the spread of the data
-    slope_weight: float = 0.0  # w_G of the slope ∂l/∂θ through ①; needs samples in twins
+    slope_weight: NotNegative = 0.0  # w_G of the slope ∂l/∂θ through ①; needs samples in twins
 
 
-@dataclass(frozen=True)
-class Preset:
+class Preset(Strict, frozen=True):
     """Everything in which two presets differ.
 
     The numbers of `default` are those of an arm of 5 joints and 10 muscles. In proportion to
@@ -65,10 +71,10 @@ class Preset:
     network: NetworkSettings
     training: TrainingSettings  # initial training
     corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
-    least_samples: int  # from how many samples on it learns online
+    least_samples: Count  # from how many samples on it learns online
     gated: bool  # the learner tries what it learned by `estimation.gate`; as printed it does not
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
-    to_limits: float  # share of a joint's targets that exploration takes at its limits
+    to_limits: Share  # share of a joint's targets that exploration takes at its limits
     whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed
 
     def grown(self, number: int, groups: Iterable[Group], power: float = 1.0) -> int:

@@ -3,7 +3,6 @@
 
 from collections import Counter
 from collections.abc import Callable
-from inspect import iscoroutinefunction
 from typing import Any
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
@@ -28,15 +27,19 @@ class Reception:
         self.turns: Counter[str] = Counter()
 
     def of(
-        self, topic: str, callback: Callable[[Any], Any], publishers: Callable[[], int]
-    ) -> Callable[[Any, dict[str, Any]], Any]:
+        self,
+        topic: str,
+        callback: Callable[[Any], Any],
+        publishers: Callable[[], int],
+        is_used_at_once: bool = True,
+    ) -> Callable[[Any, dict[str, Any]], None]:
         """Return what to subscribe with: calls `callback` unless the message comes twice or late.
 
         That is, of one publisher, one sent no later than the last that was taken, and numbered no
         higher: numbers go on when its clock steps back. 0 is not known. The callback raises a
-        `MusculoskeletalError` to reject the message; if it is a coroutine, so is what is returned.
-        `publishers` counts who publishes there: a message does not say who sent it, and two clocks
-        or counters cannot be compared.
+        `MusculoskeletalError` to reject the message. If the message is not used at once, whoever
+        uses it calls `note_used`. `publishers` counts who publishes there: a message does not say
+        who sent it, and two clocks or counters cannot be compared.
         """
         before, last = 0, 0  # when the last one was sent [ns], and its number
 
@@ -60,18 +63,13 @@ class Reception:
                 except MusculoskeletalError as error:
                     self.reject(topic, error.reason, str(error))
                 else:
-                    self._received[topic] += 1
+                    self._received[topic] += is_used_at_once
 
-        async def receive_in_pieces(message: Any, info: dict[str, Any]) -> None:
-            if is_new(info):
-                try:
-                    await callback(message)
-                except MusculoskeletalError as error:
-                    self.reject(topic, error.reason, str(error))
-                else:
-                    self._received[topic] += 1
+        return receive
 
-        return receive_in_pieces if iscoroutinefunction(callback) else receive
+    def note_used(self, topic: str) -> None:
+        """Count a message that was used later than it was received."""
+        self._received[topic] += 1
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a message or request; say whether it is the first for this reason."""

@@ -5,9 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
+from musculoskeletal_ae.nodes.executor import LeanExecutor
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.nodes.running import LeanExecutor
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
+PATIENCE = 600.0  # [s] a process may take to write its next line or to end
 LOOK = 0.05  # [s] until a condition is looked at again
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
@@ -41,14 +43,47 @@ def executable(name: str) -> list[str]:
 
 
 class Process:
-    """One command, ended when the test ends."""
+    """One command, ended when the test ends.
+
+    Its output goes to a file: a pipe that nobody reads would block the command once it is full.
+    """
 
     def __init__(self, name: str, command: list[str], **options: Any) -> None:
         """Start a command; options are those of Popen."""
         self.name = name
+        self._file = tempfile.NamedTemporaryFile(prefix=f'{name}-', suffix='.log')  # noqa: SIM115
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+            command, stdout=self._file, stderr=subprocess.STDOUT, **options
         )
+
+    @property
+    def output(self) -> str:
+        """What it has written so far."""
+        return Path(self._file.name).read_text('utf-8', errors='replace')
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines of its output as they are written, until it ends."""
+        count, deadline = 0, time.monotonic() + PATIENCE
+        while True:
+            has_ended = not self.alive()  # asked first: nothing is written after the end
+            lines = self.output.splitlines(keepends=True)
+            if lines and not has_ended and not lines[-1].endswith('\n'):
+                lines.pop()  # the rest of this line is still to come
+            for line in lines[count:]:
+                count += 1
+                deadline = time.monotonic() + PATIENCE
+                yield line
+            if has_ended:
+                return
+            assert time.monotonic() < deadline, f'{self.name} wrote nothing for {PATIENCE:g} s'
+            time.sleep(LOOK)
+
+    def wait_for_output(self, text: str) -> str:
+        """Wait until a line contains a text; return that line."""
+        for line in self.lines():
+            if text in line:
+                return line
+        raise AssertionError(f'{self.name} ended without {text!r}: {self.output[-2000:]}')
 
     def alive(self) -> bool:
         """Whether it still runs."""
@@ -63,11 +98,11 @@ class Process:
     def ended(self) -> tuple[int, str]:
         """Wait for its end; return exit status and output."""
         try:
-            output, _ = self.process.communicate(timeout=2 * DEADLINE)
+            self.process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self.process.kill()
-            output, _ = self.process.communicate()
-        return self.process.returncode, output
+            self.process.wait()
+        return self.process.returncode, self.output
 
 
 class Graph:
@@ -142,7 +177,7 @@ class Graph:
         """Handle messages for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.look(LOOK)
+            self.executor.spin_once(LOOK)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Handle messages until a condition holds; fail with what was waited for."""
@@ -153,8 +188,10 @@ class Graph:
                 status, output = dead[0].end()
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
-                raise AssertionError(f'waited {deadline:g} s in vain for {what}; {self._told()}')
-            self.executor.look(LOOK)
+                raise AssertionError(
+                    f'waited {deadline:g} s in vain for {what}; {self._last_diagnostics()}'
+                )
+            self.executor.spin_once(LOOK)
         return value
 
     def next(self, topic: str, count: int = 1) -> Any:
@@ -174,14 +211,14 @@ class Graph:
                     return Report(LEVELS[status.level], status.message, values)
         return Report('warn', 'not heard of', {})
 
-    def _told(self) -> str:
+    def _last_diagnostics(self) -> str:
         messages = self.received['/diagnostics'][-200:]
         last = {
             s.name: (s.message, {v.key: v.value for v in s.values})
             for m in messages
             for s in m.status
         }
-        return '\n'.join(f'{name}: {said}' for name, said in last.items())
+        return '\n'.join(f'{name}: {reported}' for name, reported in last.items())
 
     def call(self, kind: type, service: str, request: Any = None) -> Any:
         """Call a service and return its response."""

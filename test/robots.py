@@ -167,3 +167,13 @@ def write_muscles(directory: Path, document: object) -> Path:
     text = yaml.safe_dump(copy.deepcopy(document), sort_keys=False, allow_unicode=True)
     (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
     return directory
+
+
+def chain(links: int) -> str:
+    """Return a URDF of so many links, one below the other."""
+    joints = ''.join(
+        f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
+        f'<child link="l{i + 1}"/></joint>'
+        for i in range(links)
+    )
+    return f'<robot name="r"><link name="l0"/>{joints}</robot>'

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from bench import sim_pictures
 from bench.__main__ import benches, main
+from musculoskeletal_ae.robot.robot import Robot
 
 
 def test_every_bench_is_listed_with_what_it_measures(capsys):
@@ -20,13 +22,6 @@ def test_every_bench_is_explained():
     # One that lost its main would else leave the list without a word.
     text = (Path(__file__).parents[1] / 'bench' / 'README.md').read_text(encoding='utf-8')
     assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
-
-
-def test_what_draws_flames_is_there_before_anything_is_measured(monkeypatch, tmp_path, capsys):
-    monkeypatch.setenv('PATH', str(tmp_path))
-    with pytest.raises(SystemExit):
-        importlib.import_module('bench.performance').main(['--flames', '--out', str(tmp_path)])
-    assert 'pip install py-spy' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', benches())
@@ -48,13 +43,7 @@ def test_what_the_package_refuses_is_one_line_and_status_1(capsys):
     assert error.startswith("error: robot 'nowhere'") and error.count('\n') == 1
 
 
-def test_options_and_status_are_handed_through(monkeypatch):
-    given = []
-
-    def fuzz(argv):
-        given.append(argv)
-        return 3
-
-    monkeypatch.setattr('bench.fuzz.main', fuzz)
-    assert main(['fuzz', '--count', '5']) == 3
-    assert given == [['--count', '5']]
+def test_pictures_of_an_arm_at_rest_and_loaded_are_written(trained, tmp_path):
+    files = sim_pictures.save_both(Robot.load('arm26'), trained['default'], tmp_path / 'new')
+    assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
+    assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)

@@ -13,7 +13,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def test_the_page_of_public_classes_is_the_one_that_the_code_makes():
+def test_the_page_of_public_classes_is_up_to_date():
     sys.path.insert(0, str(ROOT / 'doc'))
     import make
 
@@ -22,7 +22,7 @@ def test_the_page_of_public_classes_is_the_one_that_the_code_makes():
     assert (ROOT / 'doc' / 'api.md').read_text('utf-8') == page, 'run: python doc/make.py'
 
 
-def test_three_lines_of_python_without_ros_do_what_the_readme_says(trained_file, tmp_path):
+def test_the_three_lines_of_python_of_the_readme_estimate_without_ros(trained_file, tmp_path):
     readme = (ROOT / 'README.md').read_text('utf-8')
     (lines,) = re.findall(r'```python\n(.*?)```', readme, re.S)
     assert len(list(filter(None, lines.splitlines()))) == 3
@@ -48,7 +48,7 @@ print(*theta)
     assert np.linalg.norm(estimated - theta) < 0.3
 
 
-def test_options_and_executables_that_the_guide_names_are_there():
+def test_options_and_executables_that_the_guide_names_exist():
     guide = (ROOT / 'doc' / 'your_robot.md').read_text('utf-8')
     bringup = (ROOT / 'bringup.sh').read_text('utf-8')
     for option in set(re.findall(r'bringup\.sh[^\n]*? (--[\w-]+)', guide)):

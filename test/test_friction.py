@@ -21,7 +21,7 @@ def test_friction_acts_against_the_last_sliding_and_ignores_noise():
 
 
 @pytest.mark.parametrize(('distance', 'most'), [(0.0003, 0.24), (0.0005, 0.15)])
-def test_a_wire_that_hardly_slides_is_followed_through_noise(distance, most):
+def test_small_sliding_is_followed_through_noise(distance, most):
     rng, off, s = np.random.default_rng(0), [], 0.0
     moves = rng.uniform(-0.001, 0.001, 100)
     slid = np.concatenate([[*np.full(50, move / 50), *np.zeros(100)] for move in moves])
@@ -34,7 +34,7 @@ def test_a_wire_that_hardly_slides_is_followed_through_noise(distance, most):
 
 
 @given(st.floats(-0.02, 0.02), st.sampled_from([-1.0, 1.0]))
-def test_a_reading_that_is_off_turns_no_friction_round(error, way):
+def test_one_wrong_reading_does_not_reverse_friction(error, way):
     friction, slide = FrictionDirection(), np.arange(0.0, 0.01, 2e-4)
     for length in way * np.array([*slide, 0.01, 0.01 + error, *np.full(20, 0.01)]):
         direction = friction.step(np.array([length]))

@@ -51,11 +51,11 @@ class Motors:
             arm._muscle.tension[:] = self.pulled
             warm(self.wound, arm._muscle, arm._command, round(1.0 / modules.STEP))
             self.read = arm._muscle.housing + self.rng.normal(0.0, 0.1, COUNT)
-            self.told()
+            self.hand_on()
             self.errors.append(self.heat.core - arm.winding)
         return np.abs(self.errors[-round(seconds) :])
 
-    def told(self):
+    def hand_on(self):
         """Hand on what was read."""
         self.heat.step(self.pulled, self.read, 1.0)
 
@@ -69,13 +69,13 @@ class Watched(Motors):
         self.core.use(mae)
         self.heat = self.core.heat
 
-    def told(self):
+    def hand_on(self):
         length = ROBOT.muscle_lengths(POSTURE, self.pulled)
         self.now += 1.0
         self.core.step(self.pulled, length, self.now, self.now, self.read)
 
 
-def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
+def test_a_step_of_any_length_solves_the_thermal_model():
     state = Heat(ROBOT)._state
     state[0], state[1] = 10.0, 50.0
     kappa, tau, slow = np.exp(state[2:5])
@@ -92,7 +92,7 @@ def test_a_step_is_that_of_the_two_resistors_whatever_its_length():
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_after_twenty_minutes_the_winding_is_known(seed):
+def test_the_winding_temperature_is_estimated_after_twenty_minutes(seed):
     motors = Motors(seed)
     first = motors.run(300)
     motors.run(900)
@@ -104,7 +104,7 @@ def test_after_twenty_minutes_the_winding_is_known(seed):
     assert motors.heat.changed == {}
 
 
-def test_what_is_held_at_the_limit_reaches_the_highest_temperature_and_no_more():
+def test_a_muscle_held_at_its_limit_reaches_the_highest_temperature_and_no_more():
     motors = Motors()
     motors.run(1200)
     held = motors.run(1800, lambda: motors.heat.limits(HIGHEST)[0])
@@ -119,7 +119,7 @@ def test_what_is_held_at_the_limit_reaches_the_highest_temperature_and_no_more()
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
 
 
-def test_cool_muscles_are_not_limited_and_a_moment_allows_more_than_long():
+def test_cool_muscles_are_not_limited_and_short_pulls_may_be_stronger_than_long_ones():
     motors = Motors()
     motors.run(10, TENSION.bias)
     long, moment = motors.heat.limits(HIGHEST)
@@ -132,7 +132,7 @@ def test_cool_muscles_are_not_limited_and_a_moment_allows_more_than_long():
 
 
 @pytest.mark.parametrize('constant', ['loss', 'housing_resistance'])
-def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained, constant):
+def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, constant):
     motors = Watched(trained['default'], seed=1)
     motors.run(1.2 * LEARNED)
     assert motors.heat.changed == {}
@@ -148,21 +148,21 @@ def test_a_module_that_changes_is_an_anomaly_that_names_it_and_no_other(trained,
     assert motors.core.cause == ''
 
 
-def test_a_cool_muscle_is_named_but_not_stopped_for_it(trained):
+def test_an_anomaly_of_a_cool_muscle_is_reported_without_a_stop(trained):
     motors = Watched(trained['default'], seed=1, most=0.6 * TENSION.limit)
     motors.run(1.2 * LEARNED)
     motors.wound.loss[2] *= 2.2
     motors.run(600)
     assert motors.core.cause == ''
-    said, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
-    assert said.level == 'warn'
-    assert said.message.startswith(f'anomaly of a cool muscle: {how}')
-    assert said.values['suspect muscle'] == ROBOT.muscles[2]
+    reported, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
+    assert reported.level == 'warn'
+    assert reported.message.startswith(f'anomaly of a cool muscle: {how}')
+    assert reported.values['suspect muscle'] == ROBOT.muscles[2]
     motors.run(120, TENSION.limit)
     assert motors.core.cause.startswith(how)
 
 
-def test_hours_of_health_change_no_constant():
+def test_hours_of_healthy_work_are_no_anomaly():
     motors = Motors(5, hold=60)
     motors.run(3600)
     motors.run(1800, TENSION.bias)
@@ -171,7 +171,7 @@ def test_hours_of_health_change_no_constant():
 
 
 @pytest.mark.parametrize('most', [1.0, 1.3])
-def test_a_minute_of_which_nothing_is_known_changes_no_constant(most):
+def test_a_gap_of_a_minute_in_the_messages_is_no_anomaly(most):
     motors = Motors(3, most=most * TENSION.limit)
     motors.run(1500)
     arm = motors.arm
@@ -183,7 +183,7 @@ def test_a_minute_of_which_nothing_is_known_changes_no_constant(most):
         assert motors.heat.changed == {}
 
 
-def test_an_unknown_temperature_limits_nothing_and_comes_back():
+def test_an_unknown_temperature_limits_no_tension_until_it_is_known():
     heat, pull = Heat(ROBOT), TENSION.limit
     known = np.full(COUNT, 84.9)
     unknown = np.where(np.arange(COUNT) == 1, -np.inf, known)
@@ -194,7 +194,7 @@ def test_an_unknown_temperature_limits_nothing_and_comes_back():
         np.testing.assert_array_equal(free, ~np.isfinite(read))
 
 
-def test_a_thermometer_that_comes_and_goes_leaves_all_other_windings_watched():
+def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
     sound, flaky = Motors(seed=3), Motors(seed=3)
     read = np.full((2, COUNT), AIR + 5.0)
     for n in range(1200):
@@ -203,8 +203,8 @@ def test_a_thermometer_that_comes_and_goes_leaves_all_other_windings_watched():
             heat.step(1.2 * TENSION.limit, here, 0.25)
     others = np.arange(COUNT) != 1
     np.testing.assert_allclose(flaky.heat.core[others], sound.heat.core[others], atol=0.1)
-    for known, seen in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
-        np.testing.assert_allclose(seen[others], known[others], atol=0.5)
+    for known, observed in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
+        np.testing.assert_allclose(observed[others], known[others], atol=0.5)
     # Its own winding warms all the same, as far as is known.
     flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
     assert flaky.heat.core[1] > AIR + 40.0

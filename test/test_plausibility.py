@@ -18,7 +18,7 @@ ROBOT = Robot.load('arm26')
 WARM = np.full(ROBOT.muscle_count, 30.0)
 
 
-def test_a_cut_wire_may_be_wound_in_further_than_any_joint_allows_but_not_without_end():
+def test_a_tendon_without_tension_may_be_wound_in_beyond_the_joints_by_a_bounded_length():
     plausibility, tension = Plausibility(ROBOT), np.full(ROBOT.muscle_count, ROBOT.tension.bias)
     tension[0] = 0.0
     end = -longest_lengths(ROBOT)[0]
@@ -31,7 +31,7 @@ def test_a_cut_wire_may_be_wound_in_further_than_any_joint_allows_but_not_withou
         plausibility.check_muscles(tension, row, WARM, 0.01 * n + 0.01)
 
 
-def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
+def test_a_tendon_under_tension_has_a_length_that_the_joints_allow():
     tension = np.full(ROBOT.muscle_count, 2.0 * SLACK * ROBOT.tension.bias)
     row = np.zeros(ROBOT.muscle_count)
     row[0] = 1.01 * -longest_lengths(ROBOT)[0]
@@ -39,7 +39,7 @@ def test_a_wire_that_pulls_is_as_long_as_the_joints_allow():
         Plausibility(ROBOT).check_muscles(tension, row, WARM, 0.0)
 
 
-def test_lengths_are_others_once_the_clock_has_jumped_back():
+def test_other_lengths_are_accepted_after_the_clock_has_jumped_back():
     watch, there = Watch(ROBOT, Settings()), np.full(ROBOT.muscle_count, 0.05)
     for length in (0.0 * there, there):
         for n in range(2):
@@ -51,7 +51,7 @@ def test_lengths_are_others_once_the_clock_has_jumped_back():
 
 
 @pytest.mark.parametrize('temperature', [500.0, np.inf, np.nan])
-def test_an_isolated_muscle_may_say_anything(temperature):
+def test_readings_of_an_isolated_muscle_are_not_checked(temperature):
     robot = copy.copy(ROBOT)
     plausibility, hot = Plausibility(robot), WARM.copy()
     hot[1] = temperature
@@ -63,7 +63,7 @@ def test_an_isolated_muscle_may_say_anything(temperature):
     plausibility.check_muscles(*values, 0.01)
 
 
-def test_what_slides_is_told_in_metres(tmp_path):
+def test_errors_of_prismatic_joints_are_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     assert (
         robot.told(np.full(4, 0.5)) == 'bend 0.50 rad, lift 0.50 rad, swing 0.50 rad, wrist 0.50 m'

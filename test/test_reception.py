@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is dropped as late, and under which names rejections are counted; no graph needed."""
 
-from types import coroutine
-
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
@@ -23,7 +21,7 @@ class Inbox:
         self.receive(message, {'source_timestamp': time, 'publication_sequence_number': number})
 
 
-def test_what_comes_twice_or_late_is_dropped_and_counted():
+def test_repeated_and_late_messages_are_dropped_and_counted():
     inbox = Inbox()
     for number, time in ((1, 10), (2, 20), (2, 20), (1, 15), (3, 30)):
         inbox.get(number, time * SECOND // 100, number)
@@ -31,7 +29,7 @@ def test_what_comes_twice_or_late_is_dropped_and_counted():
     assert inbox.reception.rejected == {'topic: repeated or reordered': 2}
 
 
-def test_a_publisher_whose_clock_stepped_back_is_heard():
+def test_messages_are_used_after_the_clock_of_the_publisher_stepped_back():
     inbox = Inbox()
     inbox.get('before', 100 * SECOND, 1)
     inbox.get('after', 100 * SECOND - SECOND // 2, 2)
@@ -39,7 +37,7 @@ def test_a_publisher_whose_clock_stepped_back_is_heard():
     assert inbox.used == ['before', 'after', 'much later']
 
 
-def test_of_two_publishers_neither_hides_the_other():
+def test_messages_of_two_publishers_are_all_used():
     inbox = Inbox(publishers=2)
     inbox.get('ahead', 100 * SECOND, 50)
     inbox.get('behind', 100 * SECOND - SECOND // 2, 1)
@@ -71,7 +69,7 @@ def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number,
         (CheckpointError('made for other joints'), 'topic: unfit checkpoint'),
     ],
 )
-def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reason):
+def test_rejections_are_counted_by_reason_and_the_last_is_kept_in_full(error, reason):
     warnings = []
     reception = Reception(warnings.append)
 
@@ -88,24 +86,10 @@ def test_a_rejection_has_few_names_and_the_last_one_is_told_in_full(error, reaso
     assert not reception.take_received()
 
 
-def test_what_comes_in_pieces_is_counted_once_the_last_one_has_gone():
+def test_a_message_that_is_used_later_counts_once_it_is_used():
     reception = Reception(print)
-
-    @coroutine
-    def give_way():
-        yield
-
-    async def refuse(text):
-        await give_way()
-        if text:
-            raise MessageError('empty', text)
-
-    receive = reception.of('topic', refuse, lambda: 1)
-    for number, text in ((1, 'no joints'), (2, '')):
-        pieces = receive(text, {'source_timestamp': number, 'publication_sequence_number': number})
-        pieces.send(None)
-        assert not reception.take_received().get('topic')
-        with pytest.raises(StopIteration):
-            pieces.send(None)
-    assert reception.rejected == {'topic: empty': 1}
+    receive = reception.of('topic', lambda _: None, lambda: 1, is_used_at_once=False)
+    receive('message', {'source_timestamp': 1, 'publication_sequence_number': 1})
+    assert not reception.take_received().get('topic')
+    reception.note_used('topic')
     assert reception.take_received() == {'topic': 1}

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: rosbag2 directories with one mcap file, written, checked and read without ROS."""
+"""Recordings of rosbag2: written, read, checked and played without ROS."""

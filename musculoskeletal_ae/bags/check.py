@@ -17,11 +17,12 @@ from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printa
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
-# Another muscle must explain a column this much better before its place is doubted: bodies differ
-# from their model by some of it, and neighbouring muscles are alike.
-_DOUBT = 2.5
-_LEAST_MOTION = 0.005  # [m] spread below which a muscle has not moved enough to be told
+# Another muscle must explain a column this much better before the order of muscles is questioned:
+# bodies differ from their model, and neighbouring muscles are similar.
+_BETTER_FIT = 2.5
+_LEAST_MOTION = 0.005  # [m] spread of a muscle's length below which its column is not judged
 _MOST_SAMPLES = 2000
+_RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
 @dataclass
@@ -37,15 +38,15 @@ class BagCheck:
 
 
 def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
-    """Read a recording (a directory or a .mcap) from end to end, every message, and report.
+    """Read a recording from end to end, every message, and report.
 
     Without a robot (shipped name or directory) the report says which of the shipped ones fit; the
     namespace is the one that is meant where the bag has several.
     """
     check = BagCheck()
     try:
-        bag = Bag.open(path, unfinished=True)
-        check.faults += [f'unfinished: {reason}' for reason in bag.unfinished]
+        bag = Bag.open(path)
+        check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
         check.lines += _contents(bag)
         interface_topics(bag, namespace)
     except MusculoskeletalError as error:
@@ -80,17 +81,17 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     theta = pairs.theta[rows].clip(robot.lower, robot.upper)
     length, tension = pairs.length[rows], pairs.tension[rows]
     moved = length.std(axis=0) > _LEAST_MOTION
-    moved &= ~(pairs.isolated == 1).any(axis=0)  # what these read may be anything
+    moved &= ~(pairs.isolated == 1).any(axis=0)  # their readings may be anything
     columns = range(robot.muscle_count)
     # The tension of the column stretches whichever muscle it is.
-    alike = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
-    modelled = [robot.muscle_lengths(theta, stretching) for stretching in alike]
+    tensions = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
+    modelled = [robot.muscle_lengths(theta, stretching) for stretching in tensions]
     errors = np.array([(length[:, [i]] - modelled[i]).std(axis=0) for i in columns])
     _, best = linear_sum_assignment(errors)
     return [
         (robot.muscles[i], robot.muscles[j])
         for i, j in enumerate(best)
-        if moved[i] and errors[i, i] > _DOUBT * errors[i, j]
+        if moved[i] and errors[i, i] > _BETTER_FIT * errors[i, j]
     ]
 
 
@@ -98,20 +99,14 @@ def _contents(bag: Bag) -> list[str]:
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)
-        if not bag.topics[message.topic].refused:
+        if not bag.topics[message.topic].problem:
             bag.decode(message)
     begin = datetime.fromtimestamp(bag.start / 1e9, timezone.utc)
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
-    summarised = all(file.summarised for file in bag.files)
-    checked = all(file.checked for file in bag.files)
-    backward = sum(file.backward for file in bag.files) or 'no'
-    summary = 'as in the summary' if summarised else 'no summary to compare with'
-    metadata = 'as in' if bag.metadata and not bag.unfinished else 'no final'
+    has_checksums = all(file.has_checksums for file in bag.files)
     lines = [
         f'{bag.path}: {bag.message_count} messages, {length}',
-        f'counts: {summary}, {metadata} metadata.yaml',
-        f'checksums: {"of everything" if checked else "none, or not of everything"}',
-        f'order: {backward} messages in the file are earlier than the one before',
+        f'checksums: {"of all messages" if has_checksums else "none, or not of all messages"}',
         '',
         f'{"topic":<44} {"messages":>9} {"Hz":>9} {"gap s":>8}  type',
     ]
@@ -119,8 +114,8 @@ def _contents(bag: Bag) -> list[str]:
         gaps = np.diff(times[name]) / 1e9
         rate = f'{1 / gaps.mean():.2f}' if gaps.any() else ''
         line = f'{name:<44} {len(times[name]):>9} {rate:>9} {gaps.max(initial=0.0):8.3f}'
-        refused = f'; ignored: {topic.refused}' if topic.refused else ''
-        lines.append(f'{line}  {topic.type}{refused}')
+        ignored = f'; ignored: {topic.problem}' if topic.problem else ''
+        lines.append(f'{line}  {topic.type}{ignored}')
     return [*lines, '']
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message types as ROS 2 Jazzy defines them; a bag's own definitions are compared, never used.
+"""Message types as ROS 2 Jazzy defines them.
 
-Libraries that read bags compile the definitions found in them. Here a definition is only parsed and
-compared, and messages are decoded with the fixed types of rosbags.
+Libraries that read bags compile the definitions found in them. Here messages are decoded with the
+types that rosbags ships; a recorded definition is parsed and compared with them, never compiled.
 """
 
 from functools import cache, lru_cache
@@ -14,14 +14,10 @@ TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 # Far above any message here; the payload's own length bounds it further.
 TYPESTORE.max_sequence_length = 1 << 26
 
-ENCODING = 'ros2msg'
-ORDERS = {b'\0\0': False, b'\0\1': True}  # of bytes: whether the lowest comes first
-_LONGEST = 1 << 18  # [bytes] of a definition, ten times that of any type here
-
-
-def known(type_name: str) -> bool:
-    """Say whether it is a message type of ROS 2 Jazzy."""
-    return type_name in TYPESTORE.fielddefs
+CDR = 'cdr'  # the message encoding of ROS 2
+MSG = 'ros2msg'  # the encoding of definitions that are written as .msg files
+_LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}  # by the first bytes of a message in CDR
+_LONGEST_DEFINITION = 1 << 16  # [bytes], several times that of any type here
 
 
 @cache
@@ -36,48 +32,58 @@ def type_hash(type_name: str) -> str:
     return TYPESTORE.hash_rihs01(type_name)
 
 
+def is_known(type_name: str) -> bool:
+    """Return whether this is a message type of ROS 2 Jazzy."""
+    return type_name in TYPESTORE.fielddefs
+
+
 def decode(data: bytes, type_name: str) -> Any:
-    """Return the message in serialized bytes; a ValueError says that they are none of the type.
+    """Return the message in serialized bytes; raises various errors if they are not of the type.
 
-    As for ROS, more may follow: rmw_fastrtps sends all that it reserved, and it reserves too much.
+    Bytes may follow the message: rmw_fastrtps sends all the space that it reserved. (For those the
+    type store's own `deserialize_cdr` raises an error.)
     """
-    little_endian = ORDERS.get(bytes(data[:2]))
-    if little_endian is None:
-        raise ValueError(f'not a {type_name}: {data[:2].hex()} is no encapsulation of CDR')
-    try:
-        kind = TYPESTORE.get_msgdef(type_name)
-        read = kind.deserialize_cdr_le if little_endian else kind.deserialize_cdr_be
-        return read(data[4:], 0, kind.cls, TYPESTORE)[0]
-    # The library lets KeyError, IndexError, OverflowError, MemoryError and others out of bytes
-    # that are not a message; all of them mean the same.
-    except Exception as error:
-        raise ValueError(f'not a {type_name}: {error}') from error
+    message_type = TYPESTORE.get_msgdef(type_name)
+    if _LITTLE_ENDIAN[bytes(data[:2])]:
+        deserialize = message_type.deserialize_cdr_le
+    else:
+        deserialize = message_type.deserialize_cdr_be
+    return deserialize(data[4:], 0, message_type.cls, TYPESTORE)[0]
 
 
-def contradiction(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
-    """Say where a recorded definition of a known type differs from ROS 2 Jazzy's; '' if nowhere.
+def mismatch(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
+    """Return why messages of a recorded type cannot be decoded; '' if they can.
 
-    The encoding says how the definition is written; the RIHS01 hash is '' where none was recorded.
+    The name says which type is meant. The RIHS01 hash and a definition in .msg format must agree
+    with ROS 2 Jazzy; recorders may leave out both ('' and an empty encoding).
     """
-    if encoding != ENCODING:
-        return f'is written in {encoding[:40]!r}, not {ENCODING!r}'
+    if not is_known(type_name):
+        return f'has the type {type_name[:80]!r}, which ROS 2 Jazzy does not define'
     if recorded_hash not in ('', type_hash(type_name)):
-        return f'has the hash {recorded_hash[:80]!r}, not {type_hash(type_name)!r}'
-    if len(text) > _LONGEST:
-        return f'is longer than {_LONGEST} bytes'
+        differs = f'the hash {recorded_hash[:80]!r} instead of {type_hash(type_name)!r}'
+    elif encoding == MSG:
+        differs = _differing_fields(type_name, text)
+    else:
+        differs = ''
+    return differs and f'was recorded with another {type_name} than that of ROS 2 Jazzy: {differs}'
+
+
+def _differing_fields(type_name: str, text: bytes) -> str:
+    if len(text) > _LONGEST_DEFINITION:
+        return f'its definition is longer than {_LONGEST_DEFINITION} bytes'
     try:
         recorded = _fields(type_name, text.decode())
-    except Exception as error:  # noqa: BLE001 - whatever the parser lets out, it is no definition
-        return f'cannot be read: {" ".join(str(error).split())[:100]}'
+    except Exception as error:  # noqa: BLE001 - the parser raises many kinds
+        return f'its definition cannot be read ({" ".join(str(error).split())[:100]})'
     for name, fields in _fields(type_name, definition(type_name)).items():
         if recorded.get(name) != fields:
-            return f'has other fields for {name} than ROS 2 Jazzy'
+            return f'the fields of {name} differ'
     return ''
 
 
 @lru_cache(maxsize=100)
 def _fields(type_name: str, text: str) -> dict[str, Any]:
-    # Of a type and all it contains, constants and defaults left out. The parser takes neither
-    # comments everywhere nor the line ends of Windows.
+    # Fields of a type and of all it contains, without constants and defaults. The parser accepts
+    # neither comments everywhere nor the line ends of Windows.
     text = '\n'.join(line.split('#')[0].strip() for line in text.splitlines())
     return {name: fields for name, (_, fields) in get_types_from_msg(text, type_name).items()}

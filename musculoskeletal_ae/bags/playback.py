@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Playing a recording: what comes in one lap, and recorded time against the steady clock.
+"""Playing a recording: the messages of one lap, and recorded time against the steady clock.
 
-recorded(t) = anchor_recorded + rate · (t − anchor_steady),  standing still while paused
+    recorded(t) = anchor_recorded + rate · (t − anchor_steady),  standing still while paused
 
-Or what a hand showed an arm, as a trajectory that the arm can follow: smoothed, evenly spaced.
+Or the motion that a hand taught an arm, as a trajectory that the arm can follow: smoothed, evenly
+spaced.
 """
 
 import math
@@ -16,21 +17,21 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.bags.mcap_file import BagMessage
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import BagMessage
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.validity import MOST_ENTRIES, read_joints
+from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
 
-SHOWN = 'estimated_joint_states'
+TAUGHT_TOPIC = 'estimated_joint_states'
 SMOOTHING = 0.15  # [s] standard deviation: a hand is slower, noise of the estimate is faster
 SPACING = 0.1  # [s] between points
-LEAD = 3.0  # [s] to go to where it was begun
-LEAST = 0.5  # [s]
-LONGEST_HOLE = 1.0  # [s] between two messages, over which nobody knows the motion
+LEAD_TIME = 3.0  # [s] to reach the first posture
+SHORTEST_MOTION = 0.5  # [s]
+LONGEST_GAP = 1.0  # [s] between two messages, over which the motion is unknown
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
@@ -96,7 +97,7 @@ class Timeline:
             self.jump(recorded, now)
 
 
-class Shown(NamedTuple):
+class TaughtMotion(NamedTuple):
     """N points of a trajectory."""
 
     joints: tuple[str, ...]
@@ -105,37 +106,51 @@ class Shown(NamedTuple):
     velocity: Array  # [rad/s], at rest at both ends, (N, D)
 
 
-def shown(bag: Bag, topic: str, start: int, stop: int) -> Shown:
+def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
     """Return the motion on a recorded topic of JointState, from start to stop [ns, recorded].
 
     It is of the joints that most messages name. A BagError says that there is none, or none that a
     controller could follow.
     """
-    found = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
+    postures = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
     for message in bag.messages([topic], start, stop):
-        said = bag.decode(message)
+        joint_state = bag.decode(message)
         with suppress(MessageError):  # left out, as a node would
-            values = read_joints(said, names := sorted(said.name), foreign_allowed=False)
+            names = sorted(joint_state.name)
+            values = read_target(joint_state, names)
             theta = np.array([values[name][0] for name in names])
-            found[tuple(names)].append(((message.log_time - start) / 1e9, theta))
-    joints = max(found, key=lambda names: len(found[names]), default=())
-    seen, theta = map(np.array, zip(*found[joints])) if joints else (np.zeros(1), np.zeros(1))
-    if (span := float(seen[-1] - seen[0])) < LEAST:
-        problem = f'{topic} holds no motion of at least {LEAST:g} s'
-        raise BagError(bag.path, problem, 'record it while the arm is shown one')
-    if (hole := float((gaps := np.diff(seen)).max())) > LONGEST_HOLE:
-        problem = f'{topic} says nothing for {hole:.1f} s after {seen[gaps.argmax()]:.1f} s'
-        raise BagError(bag.path, problem, 'choose a part without holes by --start and --duration')
-    if span > (longest := SPACING * (MOST_ENTRIES // len(joints) - 2)):
-        problem = f'{topic} goes on for {span:.0f} s, and a trajectory for {longest:.0f} s at most'
-        raise BagError(bag.path, problem, 'choose a part by --start and --duration')
-    time = np.linspace(seen[0], seen[-1], max(2, round((seen[-1] - seen[0]) / SPACING)) + 1)
-    # What lies further off than the longest hole weighs nothing.
-    ends = np.searchsorted(seen, [time - LONGEST_HOLE, time + LONGEST_HOLE]).T
+            postures[tuple(names)].append(((message.log_time - start) / 1e9, theta))
+    if not postures:
+        raise _no_motion(bag, topic)
+    joints = max(postures, key=lambda names: len(postures[names]))
+    recorded, theta = map(np.array, zip(*postures[joints]))
+    _check_motion(bag, topic, recorded, len(joints))
+    time = np.linspace(recorded[0], recorded[-1], max(2, round(np.ptp(recorded) / SPACING)) + 1)
+    # Messages that are further away than the longest gap have no weight.
+    ends = np.searchsorted(recorded, [time - LONGEST_GAP, time + LONGEST_GAP]).T
     smooth: Array = np.empty((len(time), len(joints)))
     for n, (first, last) in enumerate(ends):
-        weight = np.exp(-0.5 * ((time[n] - seen[first:last]) / SMOOTHING) ** 2)
+        weight = np.exp(-0.5 * ((time[n] - recorded[first:last]) / SMOOTHING) ** 2)
         smooth[n] = weight @ theta[first:last] / weight.sum()
     velocity = np.gradient(smooth, time, axis=0)
     velocity[[0, -1]] = 0.0
-    return Shown(joints, LEAD + time - time[0], smooth, velocity)
+    return TaughtMotion(joints, LEAD_TIME + time - time[0], smooth, velocity)
+
+
+def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
+    span = float(time[-1] - time[0])
+    if span < SHORTEST_MOTION:
+        raise _no_motion(bag, topic)
+    gaps = np.diff(time)
+    if (gap := float(gaps.max())) > LONGEST_GAP:
+        problem = f'{topic} has no message for {gap:.1f} s after {time[gaps.argmax()]:.1f} s'
+        raise BagError(bag.path, problem, 'choose a part without gaps by --start and --duration')
+    longest = SPACING * (MOST_ENTRIES // joint_count - 2)
+    if span > longest:
+        problem = f'{topic} lasts {span:.0f} s; a trajectory may last {longest:.0f} s'
+        raise BagError(bag.path, problem, 'choose a part by --start and --duration')
+
+
+def _no_motion(bag: Bag, topic: str) -> BagError:
+    problem = f'{topic} holds no motion of at least {SHORTEST_MOTION:g} s'
+    return BagError(bag.path, problem, 'record it while the arm is taught a motion')

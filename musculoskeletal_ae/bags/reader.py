@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens recordings: all of the messages in the order of their time, or an error.
+"""Opens recordings of rosbag2: all messages in the order of their time, or an error.
 
 bag = Bag.open('my_bag')
 for message in bag.messages(): …
@@ -9,52 +9,59 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from musculoskeletal_ae.bags import message_types
-from musculoskeletal_ae.bags.mcap_file import DAMAGED, LATEST, BagMessage, BagTopic, McapFile
-from musculoskeletal_ae.bags.metadata import FILE, REMEDY, Metadata, read_metadata
-from musculoskeletal_ae.exceptions import BagError, UnfinishedBagError
+from musculoskeletal_ae.bags import mcap_file, message_types, sqlite3_file
+from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
+from musculoskeletal_ae.bags.storage import (
+    LATEST,
+    LONGEST_DISORDER,
+    BagMessage,
+    BagTopic,
+    StorageFile,
+    add_topic,
+    open_file,
+    reading,
+)
+from musculoskeletal_ae.exceptions import BagError
 
-# Recorders may write checksums at the end only, or none.
-UNCHECKED = 'no checksum protects what is left'
-# Recorders differ in whether the first message or the earliest one starts the bag.
-_TIME_TOLERANCE = 1_000_000_000  # [ns]
 # Messages that may be held at once to bring them into order.
-_MOST_HELD = 256 << 20  # [bytes]
-_OVERHEAD = 100  # [bytes] a message counts beside its data; one chunk always fits
+MOST_HELD = 64 << 20  # [bytes]
+_OVERHEAD = 100  # [bytes] that a message counts beside its data
 
 
 @dataclass
 class Bag:
-    """A recording that has been read once from end to end and found whole."""
+    """A recording: a directory of rosbag2, or one mcap or sqlite3 file."""
 
-    path: Path  # directory or mcap file
+    path: Path
+    files: list[StorageFile]
     topics: dict[str, BagTopic] = field(default_factory=dict)  # by recorded name
-    unfinished: list[str] = field(default_factory=list)  # why it is not complete; usually empty
-    metadata: Metadata | None = None  # None for a bare mcap file
-    files: list[McapFile] = field(default_factory=list)
+    unfinished: list[str] = field(default_factory=list)  # why it may be incomplete; usually empty
 
     @classmethod
-    def open(cls, path: str | Path, unfinished: bool = False) -> Bag:
-        """Read a rosbag2 directory or a bare .mcap from end to end.
+    def open(cls, path: str | Path) -> Bag:
+        """Read a recording from end to end.
+
+        What a killed recorder left is read up to its last complete record, and `unfinished` says
+        so.
 
         Raises:
-            UnfinishedBagError: If it was not ended; `unfinished` allows that and takes what a
-                killed recorder left, up to the last complete record.
-            BagError: If it is damaged or not what it says.
+            BagError: If it is damaged or not a recording.
         """
-        bag = cls(Path(path))
-        for file in bag._paths():
-            bag._add(McapFile.read(file))
-        if bag.unfinished and not unfinished:
-            problem = f'the recording is unfinished ({"; ".join(bag.unfinished)})'
-            remedy = 'run `record --recover` to keep what is there'
-            raise UnfinishedBagError(bag.path, problem, remedy)
-        if bag.metadata and not bag.unfinished:
-            bag._compare(bag.metadata)
+        path = Path(path)
+        contents = read_metadata(path) if path.is_dir() else Contents([path], None, '')
+        bag = cls(path, [_open_file(file) for file in contents.files])
+        for file in bag.files:
+            for topic in file.topics.values():
+                add_topic(bag.topics, topic, file.path)
+        reasons = [contents.problem, *(file.unfinished for file in bag.files)]
+        if contents.message_count not in (None, bag.message_count):
+            counts = f'{contents.message_count} messages; there are {bag.message_count}'
+            reasons.append(f'{FILE} counts {counts}')
+        bag.unfinished = [reason for reason in reasons if reason]
         return bag
 
     @property
@@ -65,102 +72,61 @@ class Bag:
     @property
     def start(self) -> int:
         """Earliest log time [ns], 0 without messages."""
-        return min((block.start for file in self.files for block in file.blocks), default=0)
+        return min((file.start for file in self.files), default=0) if self.message_count else 0
 
     @property
     def end(self) -> int:
         """Latest log time [ns], 0 without messages."""
-        return max((block.end for file in self.files for block in file.blocks), default=0)
+        return max((file.end for file in self.files), default=0)
 
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
         """Yield messages on topics (None: all) from start to stop [ns, log time], both included.
 
-        They come by log time; equal times keep the order of the files. A BagError says that a file
-        has changed, or is so far out of order that memory would not do.
+        They come in the order of their log times; equal times keep the order of the file.
         """
-        wanted = self.topics.keys() if topics is None else set(topics)
-        blocks = [
-            (block.start, number, block, file)
-            for number, (file, block) in enumerate((f, b) for f in self.files for b in f.blocks)
-            if block.start <= stop and block.end >= start and not wanted.isdisjoint(block.topics)
-        ]
-        # What is earlier than all blocks to come is due; the heap holds what is not.
-        heap: list[tuple[int, int, int, BagMessage]] = []
-        held = 0
-        for begin, number, block, file in sorted(blocks, key=lambda entry: entry[:2]):
-            while heap and heap[0] < (begin, number):
-                message = heapq.heappop(heap)[-1]
-                held -= len(message.data) + _OVERHEAD
-                yield message
-            for row, message in enumerate(file.messages(block)):
-                if message.topic in wanted and start <= message.log_time <= stop:
-                    heapq.heappush(heap, (message.log_time, number, row, message))
-                    held += len(message.data) + _OVERHEAD
-                if held > _MOST_HELD:
-                    problem = f'messages are out of order by more than {_MOST_HELD >> 20} MiB'
-                    raise BagError(file.path, problem, 'sort the file first', block.offset)
-        while heap:
-            yield heapq.heappop(heap)[-1]
+        wanted = frozenset(self.topics if topics is None else topics)
+        ordered = (_in_order(file.messages(wanted, start, stop)) for file in self.files)
+        return heapq.merge(*ordered, key=lambda message: message.log_time)
 
     def decode(self, message: BagMessage) -> Any:
-        """Return the deserialised message; a BagError says that it is not what its type says."""
+        """Return the deserialized message; a BagError says that it is not what its type says."""
         topic = self.topics[message.topic]
-        try:
-            if topic.refused:
-                raise ValueError(f'the topic {topic.refused}')
-            return message_types.decode(message.data, topic.type)
-        except ValueError as error:
-            problem = f'a message of {topic.name} cannot be decoded: {error}'
-            raise BagError(message.file, problem, DAMAGED, message.offset) from error
+        with reading(message.file):
+            if topic.problem:
+                raise ValueError(f'topic {topic.name} {topic.problem}')
+            try:
+                return message_types.decode(message.data, topic.type)
+            except Exception as error:
+                problem = f'a message of {topic.name} is not a {topic.type}: {error}'
+                raise ValueError(problem) from error
 
-    def _paths(self) -> list[Path]:
-        if not self.path.is_dir():
-            return [self.path]
-        self.metadata = read_metadata(self.path)
-        if self.metadata is None:
-            files = sorted(self.path.glob('*.mcap'))
-            if not files:
-                raise BagError(self.path, f'has neither {FILE} nor an mcap file', 'name a bag')
-            self.unfinished.append(f'{FILE} is missing')
-            return files
-        if not self.metadata.finished:
-            self.unfinished.append(f'{FILE} was not completed')
-        return [self.path / name for name in self.metadata.relative_file_paths]
 
-    def _add(self, file: McapFile) -> None:
-        self.files.append(file)
-        if not file.ended:
-            if not file.checked:
-                self.unfinished.append(f'{file.path.name}: {UNCHECKED}')
-            self.unfinished.append(
-                f'{file.path.name} ends at byte {file.size}, within or before the record that '
-                f'begins at byte {file.end}'
-            )
-        for topic in file.channels.values():
-            earlier = self.topics.setdefault(topic.name, replace(topic, message_count=0))
-            if (earlier.type, earlier.refused) != (topic.type, topic.refused):
-                problem = f'topic {topic.name} has the types {earlier.type}, {topic.type}'
-                raise BagError(file.path, problem, 'record one type on a topic')
-            earlier.message_count += topic.message_count
+def _open_file(path: Path) -> StorageFile:
+    """Read an mcap or a sqlite3 file from end to end, or raise a BagError."""
+    with open_file(path) as stream:
+        head = stream.read(max(len(mcap_file.MAGIC), len(sqlite3_file.MAGIC)))
+    if not head:
+        raise BagError(path, 'the file is empty', 'nothing was recorded: record again')
+    if head.startswith(sqlite3_file.MAGIC):
+        return sqlite3_file.Sqlite3File(path)
+    if head.startswith(mcap_file.MAGIC):
+        return mcap_file.McapFile(path)
+    raise BagError(path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or a .mcap')
 
-    def _compare(self, metadata: Metadata) -> None:
-        said = {
-            (t.topic_metadata.name, t.topic_metadata.type): t.message_count
-            for t in metadata.topics_with_message_count
-            if t.message_count
-        }
-        read = {(t.name, t.type): t.message_count for t in self.topics.values() if t.message_count}
-        file = self.path / FILE
-        if said != read:
-            (name, _), _ = min(said.items() ^ read.items())
-            problem = (
-                f'counts {sum(said.values())} messages, the mcap file has '
-                f'{self.message_count}; topic {name[:80]} differs'
-            )
-            raise BagError(file, problem, REMEDY)
-        late = metadata.starting_time.nanoseconds_since_epoch - self.start
-        longer = metadata.duration.nanoseconds - (self.end - self.start)
-        if read and max(abs(late), abs(longer)) > _TIME_TOLERANCE:
-            raise BagError(file, 'has another start or duration than the mcap file', REMEDY)
+
+def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
+    """Sort messages by log time that are at most LONGEST_DISORDER out of order."""
+    waiting: list[tuple[int, int, BagMessage]] = []
+    newest = held = 0
+    for number, message in enumerate(messages):
+        newest = max(newest, message.log_time)
+        heapq.heappush(waiting, (message.log_time, number, message))
+        held += len(message.data) + _OVERHEAD
+        while waiting[0][0] < newest - LONGEST_DISORDER or held > MOST_HELD:
+            _, _, earliest = heapq.heappop(waiting)
+            held -= len(earliest.data) + _OVERHEAD
+            yield earliest
+    while waiting:
+        yield heapq.heappop(waiting)[-1]

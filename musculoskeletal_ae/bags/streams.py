@@ -20,7 +20,7 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
 
 class Series(NamedTuple):
@@ -37,14 +37,14 @@ class Pairs(NamedTuple):
     theta: Array  # θ [rad], (P, D); NaN of joints without a sensor
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
-    isolated: Ints  # 1 of isolated muscles, 0 of others, -1 where nothing says who is, (P, M)
+    isolated: Ints  # 1 of isolated muscles, 0 of others, -1 where that was not recorded, (P, M)
 
 
 class Streams(NamedTuple):
-    """What one arm sensed and was told; a topic that is not in the bag is an empty series."""
+    """What one arm measured and was commanded; a topic that the bag lacks is an empty series."""
 
     joints: Series  # θ [rad], (N, D); NaN of joints without a sensor
-    muscles: Series  # length [m] less its zero, tension [N], temperature [°C], (N, 3, M)
+    muscles: Series  # length [m] from its zero, tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
     isolated: Series  # 1 of isolated muscles, else 0, (N, M)
@@ -92,29 +92,29 @@ class _Stream:
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
-    From lengths comes off what `muscle_length_zeros` said last, before its first message too if
-    that says known zeros; while zeros are being found they are left out. What is not finite of
-    isolated muscles is 0, a temperature NaN. A BagError says that no message of a topic fits the
-    robot, or that the bag is damaged.
+    The zeros of the last `muscle_length_zeros` are subtracted from lengths, and those of its first
+    message also from what came before, if they are known. Messages that came while zeros were being
+    found are left out. Values of isolated muscles that are not finite become 0, temperatures NaN. A
+    BagError says that no message of a topic fits the robot, or that the bag is damaged.
     """
     muscles, joints = robot.muscle_count, robot.joints
 
-    def who(message: Any, _: float) -> Array:
-        found = robot.muscle_indices(read_names(message))
-        return np.isin(np.arange(muscles), found).astype(float)
+    def isolated_mask(message: Any, _: float) -> Array:
+        indices = robot.muscle_indices(read_names(message))
+        return np.isin(np.arange(muscles), indices).astype(float)
 
-    def states(message: Any, came: float) -> Array:
+    def muscle_states(message: Any, came: float) -> Array:
         last = isolated.values and isolated.values[_latched(isolated.times, came)]
         ignored = np.flatnonzero(last)
-        return read_array(message, len(QUANTITIES), muscles, ignored)
+        return read_muscle_states(message, muscles, ignored)
 
     def rows(count: int) -> Callable[[Any, float], Array]:
         return lambda message, _: read_array(message, count, muscles)
 
-    isolated = _Stream((muscles,), who)
+    isolated = _Stream((muscles,), isolated_mask)
     streams = {
         'joint_states': _Stream((len(joints),), lambda m, _: read_posture(m, joints, some=True)),
-        'muscle_states': _Stream((3, muscles), states),
+        'muscle_states': _Stream((3, muscles), muscle_states),
         'muscle_length_command': _Stream((muscles,), rows(1)),
         'muscle_tension_command': _Stream((muscles,), rows(1)),
         'isolated_muscles': isolated,
@@ -122,14 +122,14 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     }
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
-    start, told = bag.start, list[str]()
-    reception = Reception(told.append)
+    start, warnings = bag.start, list[str]()
+    reception = Reception(warnings.append)
     receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
-    # Who is isolated first: the recorder may have heard of them later than of what they read.
+    # Isolated muscles come first: the recorder may have received them later than the readings.
     early = [name for name, topic in topics.items() if topic is isolated]
     for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
         decoded = bag.decode(message)
-        # Who publishes some of the joints only has a clock of its own.
+        # Publishers of different joints on one topic have clocks of their own.
         sender = message.topic, *getattr(decoded, 'name', ())
         if sender not in receive:
             take = topics[message.topic].take
@@ -137,18 +137,18 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         receive[sender](((message.log_time - start) / 1e9, decoded), sent)
     for topic, stream in topics.items():
-        why = [each.partition(f' {topic}: ')[2] for each in told if f' {topic}: ' in each]
-        if why and not stream.values:
-            problem = f'no message of {topic} fits the robot ({why[-1]})'
+        reasons = [text.partition(f' {topic}: ')[2] for text in warnings if f' {topic}: ' in text]
+        if reasons and not stream.values:
+            problem = f'no message of {topic} fits the robot ({reasons[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
-    theta, read, lengths, tensions, who_was, zeros = (
+    joint_states, states, lengths, tensions, isolated_series, zeros = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
-    read, lost = _from_zero(read, zeros)
-    if lost:
-        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += lost
-    return Streams(theta, read, lengths, tensions, who_was, reception.rejected)
+    states, left_out = _from_zero(states, zeros)
+    if left_out:
+        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += left_out
+    return Streams(joint_states, states, lengths, tensions, isolated_series, reception.rejected)
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:
@@ -157,7 +157,7 @@ def _latched(times: ArrayLike, when: ArrayLike) -> Any:
 
 
 def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:
-    """Return states with lengths from the zeros of their time, and of how many there are none."""
+    """Return states with lengths from the zeros of their time, and how many had no known zeros."""
     known = np.array([Zeros(*rows).known for rows in zeros.values], dtype=bool)
     since = np.searchsorted(zeros.time, states.time, side='right')  # 0: nothing was said yet
     if known[:1].any():  # latched before the bag: the recorder heard the estimator a little late

@@ -18,8 +18,6 @@ class Topic(NamedTuple):
 
 
 DIAGNOSTICS = '/diagnostics'  # the one absolute name
-# Messages of a topic may be written that late; a clock is set back further.
-LONGEST_DISORDER = 1_000_000_000  # [ns]
 DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
@@ -30,9 +28,8 @@ def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
     `namespace` is the one that is meant where the bag has several; a BagError asks for it, or says
-    that a topic has a type other than the interface's, or that the recorder's clock went back.
+    that a topic has a type other than the interface's.
     """
-    _check_times(bag)
     names = _relative_names(bag, namespace)
     ours = {relative: name for name, relative in names.items() if relative in TOPICS}
     for relative, name in ours.items():
@@ -49,24 +46,23 @@ def select(
     the interface), or relative or recorded names, which may be foreign to the interface.
     `namespace` is the one that is meant where the bag has several.
     """
-    _check_times(bag)
     if keep_names and namespace is None:
         # Several namespaces are no problem when all names stay as they are.
         names = {name: interface_name(name) for name in bag.topics}
     else:
         names = _relative_names(bag, namespace)
-    has = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
+    topics_of_bag = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
     if list(wanted) in ([DEFAULT], [ALL]):
         relevant = SENT if wanted[0] == DEFAULT else TOPICS
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
-            problem = f'has no topic to replay by default; {has}'
+            problem = f'has no topic to replay by default; {topics_of_bag}'
             raise BagError(bag.path, problem, 'choose with --topics all or --topics NAME,…')
     else:
         chosen = [name for one in wanted for name in names if one in (name, names[name])]
         for one in wanted:
             if one not in {*names, *names.values()}:
-                raise BagError(bag.path, f'topic {one} is not in the bag', has)
+                raise BagError(bag.path, f'topic {one} is not in the bag', topics_of_bag)
     for name in chosen:
         _compare_type(bag, name, names[name])
     return {name: name if keep_names else names[name] for name in chosen}
@@ -81,7 +77,7 @@ def latched_topics(bag: Bag) -> set[str]:
     return {
         name
         for name, topic in bag.topics.items()
-        if 'transient_local' in topic.qos or interface_name(name) in ours
+        if topic.is_latched or interface_name(name) in ours
     }
 
 
@@ -122,20 +118,11 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
     return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}
 
 
-def _check_times(bag: Bag) -> None:
-    """Refuse a recording whose clock went back: two motions would be one, taken in turns."""
-    for file in bag.files:
-        if file.set_back > LONGEST_DISORDER:
-            problem = f'the clock of the recorder went back by {file.set_back / 1e9:.3g} s'
-            remedy = 'record again, without a jump of time, --loop or another /clock meanwhile'
-            raise BagError(file.path, problem, remedy)
-
-
 def _compare_type(bag: Bag, name: str, relative: str) -> None:
     topic = bag.topics[name]
     expected = TOPICS[relative].type if relative in TOPICS else topic.type
     if topic.type != expected:
         problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
         raise BagError(bag.path, problem, 'rename the topic where it is recorded')
-    if topic.refused:
-        raise BagError(bag.path, f'topic {name} {topic.refused}', 'leave it out')
+    if topic.problem:
+        raise BagError(bag.path, f'topic {name} {topic.problem}', 'leave it out')

@@ -18,7 +18,7 @@ from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.plausibility import length_range
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states, read_posture
 
 RATE_TOLERANCE = 0.2
 LONGEST_GAP = 0.2  # [s], the controller's `max_age`
@@ -28,8 +28,8 @@ TEMPERATURES = -20.0, 130.0  # [°C]
 BEYOND = 0.1, 1.0  # [m] that l may lie beyond what the routes allow, with and without known zeros
 BEYOND_JOINT = 0.3  # [rad]
 # How far the lengths of healthy arms are from the model's, as these see it, individuals 0–9 of both
-# shipped arms (`python -m bench driver_margins`): offset at most 42 mm, changes by 0.31 to 1.55 of
-# the model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
+# shipped arms (notes/removed_benches.md): offset at most 42 mm, changes by 0.31 to 1.55 of the
+# model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
 ZERO_TOLERANCE = 0.045  # [m]
 SLOPES = 0.2, 2.2
 MISPLACED = 0.012  # [m] by which l follows the model worse than another muscle's, and this …
@@ -70,7 +70,7 @@ class Listening:
         """Take a message of muscle_states."""
         self._times.append(now)
         with self._rejecting('muscle_states'):
-            states = read_array(message, len(QUANTITIES), self._robot.muscle_count)
+            states = read_muscle_states(message, self._robot.muscle_count)
             self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:

@@ -1,20 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is judged of a driver, what may be wrong with it, and what came of it."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.schema import Strict
 
 #: what is judged of each muscle: messages and their rate, rows and places in the array, units, the
 #: sign and zero of l, the MSC law, its clip at tension.max, latency
-CHECKS = ('rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency')
+Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
+CHECKS: tuple[Check, ...] = get_args(Check)
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
-#: check, what was seen, what to change, by what is wrong
-FAULTS = read_table(__file__, 'faults.yaml', dict[str, tuple[str, str, str]])
+
+
+class FaultTexts(Strict, frozen=True, array_like=True):
+    """An entry of faults.yaml."""
+
+    check: Check
+    seen: str
+    change: str
+
+
+#: by what is wrong
+FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
 
 
 class Fault(NamedTuple):
@@ -43,13 +55,14 @@ class Verdict:
 
     def failed(self, what: str, *muscles: int, **seen: object) -> None:
         """Note one of the FAULTS, of some muscles (none: of all), with what its texts name."""
-        check, saw, change = FAULTS[what]
+        texts = FAULTS[what]
         if muscles:
             first, robot = muscles[0], self.robot
             seen['law'] = LAW.format(robot.tension.bias[first], robot.stiffness[first])
         muscles = muscles or tuple(range(self.robot.muscle_count))
-        self._state[list(muscles), CHECKS.index(check)] = WRONG
-        self.faults.append(Fault(check, muscles, saw.format(**seen), change.format(**seen)))
+        self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
+        change = texts.change.format(**seen)
+        self.faults.append(Fault(texts.check, muscles, texts.seen.format(**seen), change))
 
     @property
     def wrong(self) -> set[str]:

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.emulator import modules, wrapping
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState

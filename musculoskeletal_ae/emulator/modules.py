@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.kinematics import RACK, Kinematics

@@ -13,9 +13,9 @@ import math
 from collections import namedtuple
 
 import numpy as np
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, MuscleState

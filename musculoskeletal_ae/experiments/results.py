@@ -18,9 +18,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, UndefinedError
-from msgspec import Struct
+from msgspec import MsgspecError, Struct
 from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -29,6 +30,7 @@ from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.schema import Strict, convert
 
 #: result.json of every experiment that was run, by name
 Results = Mapping[str, Mapping[str, Any]]
@@ -62,7 +64,7 @@ def measure(args: Namespace) -> None:
                 bar.set_description_str(running)
 
             parts = run(study, names, args.jobs, report)
-        files = [*write(study, parts, args.out), write_report(args.out, names)]
+        files = [*write(study, parts, args.out), write_report(args.out)]
     if args.readme:
         files += update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
@@ -100,22 +102,59 @@ def write(
     return files
 
 
+class About(Strict, frozen=True):
+    """What was measured."""
+
+    robot: str
+    preset: str
+    reality: str
+    minutes: float
+    quick: bool
+    seeds: tuple[int, ...]
+
+
+class Plot(Strict, frozen=True):
+    """A picture beside result.json."""
+
+    file: str
+    caption: str
+
+
+class Result(Struct, frozen=True):
+    """What every result.json holds, beside the numbers of its experiment."""
+
+    about: About
+    seeds: dict[str, dict[str, Any]]  # numbers by individual
+    plots: tuple[Plot, ...] = ()
+    failed: dict[str, str] = {}  # reason by individual
+
+
 def read(folder: Path) -> Results:
-    """Return every result.json below a folder, by experiment; one that is none is left out."""
+    """Return every result.json below a folder, by experiment.
+
+    One that is damaged is left out, with a warning.
+    """
     results: dict[str, Any] = {}
     for name in EXPERIMENTS:
         file = folder / name / 'result.json'
-        if not file.is_file():
-            continue
-        try:
-            result = json.loads(file.read_text(encoding='utf-8'))
-        except ValueError:
-            result = None
-        if isinstance(result, dict) and {'about', 'seeds'} <= result.keys():
-            results[name] = result
-        else:
-            print(f'warning: {file} is no result of an experiment: left out', file=sys.stderr)
+        if file.is_file():
+            try:
+                results[name] = _read_result(file)
+            except MusculoskeletalError as error:
+                print(f'warning: {error}: left out', file=sys.stderr)
     return results
+
+
+def _read_result(file: Path) -> dict[str, Any]:
+    def fail(problem: str) -> MusculoskeletalError:
+        return MusculoskeletalError(f'{file} is no result of an experiment: {problem}')
+
+    try:
+        result: dict[str, Any] = msgspec.json.decode(file.read_bytes())
+    except (MsgspecError, OSError, RecursionError) as error:
+        raise fail(str(error)) from error
+    convert(result, Result, fail)
+    return result
 
 
 def combined(study: Study, rows: Rows) -> dict[str, Any]:
@@ -156,7 +195,7 @@ class Cells(NamedTuple):
     verdict: str  # 'met', by how much the aim is missed, or '' without aim or number
 
 
-class Row(Struct, frozen=True):
+class Row(Strict, frozen=True):
     """One quantity of an experiment; keys are paths into its result.json, parts joined by dots."""
 
     quantity: str  # with its unit
@@ -267,21 +306,18 @@ def _around_table(readme: Path) -> tuple[str, str]:
     return head, rest
 
 
-def write_report(folder: Path, fresh: Sequence[str] = ()) -> Path:
+def write_report(folder: Path) -> Path:
     """Write report.html from all that is in a folder, of this call or an earlier one.
 
-    What an earlier version measured may lack what is asked for here: then it has the `fresh` only.
+    Raises:
+        MusculoskeletalError: If a result.json lacks numbers that the report shows.
     """
-    results, file = read(folder), folder / 'report.html'
+    file = folder / 'report.html'
     try:
-        page = _page(folder, results)
-    except (UndefinedError, LookupError, TypeError, AttributeError):
-        own = {name: result for name, result in results.items() if name in fresh}
-        if len(own) in (0, len(results)):
-            raise
-        older = ', '.join(results.keys() - own.keys())
-        print(f'warning: left out of {file}, of another version: {older}', file=sys.stderr)
-        page = _page(folder, own)
+        page = _page(folder, read(folder))
+    except (UndefinedError, LookupError, TypeError, AttributeError) as error:
+        problem = f'{file} was not written, since a result.json in {folder} lacks a number: {error}'
+        raise MusculoskeletalError(f'{problem}; measure into an empty folder') from error
     file.write_text(page, encoding='utf-8')
     return file
 

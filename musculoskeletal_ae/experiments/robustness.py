@@ -5,25 +5,17 @@ Paper. The body that was learned is a real one; what is wrong with it is not kno
 
 Here. Both bodies, each explored by the default network and by preset paper as in online learning:
 `kin`, which differs from its model in what the learner fits, and `foreign`, whose mechanics are
-foreign too. "Frozen" is the learner before it was changed for the foreign body, taught by the same
-messages. Oracle: least squares on one message with the true routes and elastic constants. The
-informed oracle also knows the errors of the tension and length sensors, and how much each wire
-rubs; neither knows what a message does not tell: which way a wire slid, loops, creep, drift. What
-is learned comes from the joint sensors, whose own error is there, too. The
-ablation leaves out some effects of the foreign body, the rest of the individual staying as it is;
-"links" adds one, of link lengths, axes and masses, which the paper takes as exact.
+foreign too. Oracle: least squares on one message with the true routes and elastic constants. The
+informed oracle also knows the errors of the tension and length sensors, and the friction of each
+tendon; neither knows what a message does not hold: which way a tendon slid, loops, creep, drift.
+What is learned comes from the joint sensors, so that their error is shown, too. The ablation leaves
+out some effects of the foreign body and keeps the rest of the individual as it is; "links" adds
+one, of link lengths, axes and masses, which the paper takes as exact.
 """
 
-import io
 import json
-import os
-import subprocess
-import sys
-import zipfile
 from dataclasses import replace
-from pathlib import Path
 from shutil import copyfile
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,7 +23,6 @@ import numpy as np
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN
 from musculoskeletal_ae.emulator.wires import GUIDES, load_cell, spooled
-from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.experiments import online_learning, plots
 from musculoskeletal_ae.experiments.least_squares import EVERY, nominal, oracle
 from musculoskeletal_ae.experiments.recording import (
@@ -45,26 +36,6 @@ from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Row
 from musculoskeletal_ae.presets import PRESETS
 
 REALITIES = KIN, FOREIGN
-FROZEN = '86c8dfc'  # the commit
-#: reads the recordings below folders; prints what its learner is left with after each
-FROZEN_RUN = """
-import sys
-import numpy as np
-from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.robot.robot import Robot
-directory, seed, *folders = sys.argv[1:]
-robot = Robot.load(directory)
-initial = initial_mae(robot, 'default').mae
-for folder in folders:
-    learner = Learner(robot, initial, 'default', int(seed))
-    kept = np.load(f'{folder}/exploring_{seed}.npz')
-    for n, (theta, length, tension) in enumerate(zip(*(kept[f'arr_{i}'] for i in (1, 2, 3)))):
-        learner.step(0.01 * n, theta, tension, length)
-    truth, _, length, tension, _ = np.load(f'{folder}/held_out_{seed}.npz').values()
-    off = learner.mae.estimate(tension, length).theta - truth
-    print('frozen', np.linalg.norm(off, axis=1).mean())
-"""
 #: what the ablation leaves out
 ABLATED = {
     'route points': ('attachment',),
@@ -86,12 +57,8 @@ def measure(study: Study, seed: int) -> Measured:
     """Measure an individual of each body; the ablation is of the first one."""
     parts = {reality: _learned(study, seed, reality) for reality in REALITIES}
     numbers: dict[str, Any] = {at: _numbers(part, seed) for at, part in parts.items()}
-    frozen, why = _frozen(study, seed, [part.folder for part in parts.values()])
-    for reality, error in zip(REALITIES, frozen, strict=True):
-        numbers[reality]['frozen_after_rad'] = error
     if not study.quick:
         numbers['links_rad'] = _otherwise(parts[FOREIGN], seed, links=1.0)
-    numbers |= {'frozen': why} if why else {}
     if seed == study.seeds[0]:
         numbers['ablation_rad'] = {
             name: _otherwise(parts[FOREIGN], seed, **dict.fromkeys(effects, 0.0))
@@ -147,36 +114,6 @@ def _informed(arm: Any, recording: Recording) -> float:
     return estimator.error(part._replace(tension=pull, length=length), np.s_[:])
 
 
-def _frozen(study: Study, seed: int, folders: list[Path]) -> tuple[list[float | None], str]:
-    """Return what the frozen learner is left with, or why that is not known."""
-    nothing: list[float | None] = [None] * len(folders)
-    if study.quick:
-        return nothing, 'the frozen learner is left out of a quick run'
-    here = Path(__file__).parent
-    try:
-        git = ['git', '-C']
-        root = _output([*git, here, 'rev-parse', '--show-toplevel']).decode().strip()
-        archive = _output([*git, root, 'archive', '--format=zip', FROZEN, 'musculoskeletal_ae'])
-    except (OSError, subprocess.CalledProcessError) as error:
-        return nothing, f'no frozen learner: commit {FROZEN} is not at hand ({error})'
-    with TemporaryDirectory() as folder, zipfile.ZipFile(io.BytesIO(archive)) as files:
-        files.extractall(folder)
-        arguments = study.robot.description.directory.resolve(), str(seed), *folders
-        try:
-            said = _output([sys.executable, '-c', FROZEN_RUN, *arguments], cwd=folder)
-        except subprocess.CalledProcessError as error:  # as of a robot that it cannot read yet
-            last = error.stderr.decode(errors='replace').strip().rpartition('\n')[2]
-            why = printable(last) or f'status {error.returncode}'
-            return nothing, f'no frozen learner: that of commit {FROZEN} ended with {why}'
-    return [float(line.split()[1]) for line in said.splitlines() if line.startswith(b'frozen')], ''
-
-
-def _output(command: list[Any], cwd: str | None = None) -> bytes:
-    environment = {**os.environ, 'PYTHONPATH': cwd} if cwd else None
-    options: dict[str, Any] = {'capture_output': True, 'cwd': cwd, 'env': environment}
-    return bytes(subprocess.run(command, check=True, **options).stdout)  # noqa: S603
-
-
 def _otherwise(study: Study, seed: int, **effects: float) -> float:
     """Return what learning is left with where an individual has other effects [rad]."""
     from musculoskeletal_ae.emulator.effects import Effects
@@ -196,7 +133,6 @@ ESTIMATES = {
     'least_squares_rad': 'least squares, geometric model',
     'before_rad': 'before learning',
     'paper_after_rad': 'preset paper',
-    'frozen_after_rad': 'frozen learner',
     'after_rad': 'learned',
     'oracle_rad': 'oracle',
     'informed_oracle_rad': 'informed oracle',

@@ -48,8 +48,8 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
         fallback = f'muscle_{len(source.routes)}'
         kinds = [via.get('type') for via in muscle.findall('link/viaPoint')]
         if sum(kind not in ROUND for kind in kinds) < 2:
-            told = f'muscle {muscle.get("name") or fallback}: fewer than 2 points'
-            source.note('dropped', told)
+            problem = f'muscle {muscle.get("name") or fallback}: fewer than 2 points'
+            source.note('dropped', problem)
             continue
         name = source.rename('muscle', muscle.get('name'), fallback, source.routes)
         route: list[RoutePoint | Wrap] = []
@@ -168,8 +168,8 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
-            told = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'
-            raise refuse(file, f'{told}, poses in radians and in their usual frames')
+            problem = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'
+            raise refuse(file, f'{problem}, poses in radians and in their usual frames')
 
     def value(element: ET.Element | None, tag: str, count: int = 1, default: str = '0') -> Array:
         if element is None:
@@ -208,8 +208,8 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
             joint = carried_by[name]
             label, kind = joint.get('name', ''), joint.get('type', '')
             here, axis = placed(name) * pose(joint), value(joint, 'axis/xyz', 3, '0 0 1')
-            told = joint.findtext('axis/use_parent_model_frame', frame_of_axis)
-            if told.strip() in ('1', 'true'):
+            in_model_frame = joint.findtext('axis/use_parent_model_frame', frame_of_axis)
+            if in_model_frame.strip() in ('1', 'true'):
                 axis = here.rotation.T @ pose(model).rotation @ axis
             if kind in ONE_AXIS:
                 limit = joint.find('axis/limit') if kind != 'continuous' else None

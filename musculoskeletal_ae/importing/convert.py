@@ -13,7 +13,6 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
-from musculoskeletal_ae.importing.opensim import read_osim
 from musculoskeletal_ae.importing.source import POSTURES, Source, compare, cut, refuse, write
 from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
 from musculoskeletal_ae.robot.kinematics import resolved
@@ -21,11 +20,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
 LARGEST = 20_000_000  # [bytes] of a model
+OPENSIM = (
+    'OpenSim models are not read; convert it to MJCF with MyoConverter '
+    '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
+)
 #: reader of each format, by the root element of its files
 READERS = {
     'mujoco': read_mjcf,
     'cardsflow': read_cardsflow,
-    'OpenSimDocument': read_osim,
     'robot': read_urdf_skeleton,
 }
 
@@ -39,13 +41,14 @@ class Imported(NamedTuple):
 
 
 def read_source(file: Path) -> Source:
-    """Read a file of any of the formats, told by its root element.
+    """Read a file of any of the formats, recognised by its root element.
 
     A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
     """
     text = read_text(file, refuse, LARGEST)
-    # OpenSim writes names of C++ as tags, as HuntCrossleyForce::ContactParameters.
-    text = re.sub(r'</?\w+(?:::\w+)+', lambda tag: tag[0].replace('::', '.'), text)
+    # Before parsing: OpenSim writes tags that are not XML, as HuntCrossleyForce::ContactParameters.
+    if '<OpenSimDocument' in text:
+        raise refuse(file, OPENSIM)
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
@@ -55,16 +58,16 @@ def read_source(file: Path) -> Source:
             raise
         root = ET.Element('mujoco')
     if root.tag not in READERS:
-        told = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
-        raise refuse(file, f'{told}; an SDF is read beside its cardsflow.xml')
+        problem = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
+        raise refuse(file, f'{problem}; an SDF is read beside its cardsflow.xml')
     if any('/xacro}' in element.tag for element in root.iter()):
         raise refuse(file, 'it is a xacro: expand it first, by xacro FILE > arm.urdf')
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        told = str(e) if isinstance(e, ValueError) else repr(e)
-        raise refuse(file, f'it cannot be imported: {told}') from e
+        problem = str(e) if isinstance(e, ValueError) else repr(e)
+        raise refuse(file, f'it cannot be imported: {problem}') from e
     if not source.routes:
         raise refuse(file, '; '.join(['it has no muscle with a route', *source.lost()[-3:]]))
     return source
@@ -99,8 +102,8 @@ def run(args: Namespace) -> int:
     robot, notes, errors = import_robot(args.file, args.out, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
-    for told in robot.description.joint_notes:
-        print(f'coupled: {told}')
+    for note in robot.description.joint_notes:
+        print(f'coupled: {note}')
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
     print(length_verdict(errors))
@@ -115,14 +118,14 @@ def length_verdict(errors: dict[str, float] | None) -> str:
         return 'lengths: not compared, the source has none of its own here'
     worst = sorted(errors.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
-    told = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
-    told += f', {sum(e <= 1e-3 for e in errors.values())} of {len(errors)} muscles within 1 mm'
-    return told + (f'; worst [mm]: {named}' if named else '')
+    verdict = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
+    verdict += f', {sum(e <= 1e-3 for e in errors.values())} of {len(errors)} muscles within 1 mm'
+    return verdict + (f'; worst [mm]: {named}' if named else '')
 
 
 def check_verdict(check: RobotCheck) -> str:
     """Say in a line what `check_robot` finds."""
     shares = f'held {100 * check.held.mean():.0f} %, stiff {100 * check.stiff.mean():.0f} %'
     kinds = Counter(fault.kind for fault in check.faults)
-    told = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
-    return f'check_robot: {f"not sound: {told}" if told else "sound"}; {shares}'
+    faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
+    return f'check_robot: {f"not sound: {faults}" if faults else "sound"}; {shares}'

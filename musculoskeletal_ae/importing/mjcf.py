@@ -85,15 +85,15 @@ class _Reader:
     def _names(self, kind: str) -> list[str]:
         """Return the name of each thing of a kind, or its kind and number."""
         get, count = getattr(self.model, kind), getattr(self.model, COUNTS[kind])
-        given = [get(i).name for i in range(count)]
-        names = names_of_all(kind, given)
-        for each, name in zip(given, names, strict=True):
+        original = [get(i).name for i in range(count)]
+        names = names_of_all(kind, original)
+        for each, name in zip(original, names, strict=True):
             self.source.renamed(kind, each, name)
         return names
 
     def _not_modelled(self) -> None:
         m = self.model
-        for kind, told, values in (
+        for kind, effect, values in (
             ('joint', 'springs', m.jnt_stiffness),
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
             ('joint', 'damping', m.dof_damping[m.jnt_dofadr]),
@@ -105,7 +105,7 @@ class _Reader:
             ('body', 'compensated weight', m.body_gravcomp),
         ):
             if named := ', '.join(self.names[kind][i] for i in np.flatnonzero(values).tolist()):
-                self.source.note('dropped', f'{told}: {kind} {named}')
+                self.source.note('dropped', f'{effect}: {kind} {named}')
         touching = int(np.count_nonzero(m.geom_contype | m.geom_conaffinity))
         if m.npair or touching > 1:
             self.source.note('dropped', f'contacts: {touching} geoms may touch each other')
@@ -117,8 +117,8 @@ class _Reader:
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
             for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
                 if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-                    told = f'free joint {self.names["joint"][j]}, where the file puts it'
-                    self.source.note('held fixed', told)
+                    problem = f'free joint {self.names["joint"][j]}, where the file puts it'
+                    self.source.note('held fixed', problem)
                     continue
                 before, stand = stand, pin.SE3(turn, data.xanchor[j].copy())
                 carrier = self._joint(j, carrier, before.inverse() * stand)
@@ -160,8 +160,8 @@ class _Reader:
             while leader in self.polynomials:
                 leader = self.polynomials[leader][0]
             if slave in self.polynomials or leader == slave:
-                told = f'equality {self.names["equality"][e]}: joint {name} is coupled already'
-                source.note('dropped', told)
+                problem = f'equality {self.names["equality"][e]}: joint {name} is coupled already'
+                source.note('dropped', problem)
                 continue
             self.polynomials[slave], zero = (master, terms.copy()), m.qpos0[m.jnt_qposadr[slave]]
             if master < 0:
@@ -212,8 +212,10 @@ class _Reader:
         # A force that shortens is negative in MuJoCo.
         pull = float(max(-gear * ends)) if gear else 0.0
         if pull <= 0.0:
-            told = f'actuator {self.names["actuator"][a]}: it can only push, and a wire only pulls'
-            self.source.note('dropped', told)
+            problem = (
+                f'actuator {self.names["actuator"][a]}: it can only push, and a wire only pulls'
+            )
+            self.source.note('dropped', problem)
         return max(pull, 0.0) if pull <= STRONGEST else np.inf
 
     def _route(self, name: str, wraps: range) -> None:
@@ -233,8 +235,10 @@ class _Reader:
                 branches[-1].append(self._wrap(name, i, int(m.wrap_prm[w]), round_axis))
         branches = [branch for branch in branches if branch]
         if divided or len(branches) > 1:
-            told = f'muscle {name}: of {len(branches)} branches over pulleys one is kept, undivided'
-            self.source.note('approximated', told)
+            problem = (
+                f'muscle {name}: of {len(branches)} branches over pulleys one is kept, undivided'
+            )
+            self.source.note('approximated', problem)
         # Of several branches the format keeps one: the one that joints move most.
         kept = max(branches, key=lambda branch: len({item.link for item in branch}))
         self.source.routes[name] = tuple(kept)
@@ -245,8 +249,8 @@ class _Reader:
         if site >= 0:
             side = turn.T @ (data.site_xpos[site] - data.xpos[body])
             if m.site_bodyid[site] != body:
-                told = f'muscle {name}: side site {m.site(site).name!r} is on another body'
-                self.source.note('approximated', f'{told}; taken where it is at the start')
+                problem = f'muscle {name}: side site {m.site(site).name!r} is on another body'
+                self.source.note('approximated', f'{problem}; taken where it is at the start')
         axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
         radius = float(m.geom_size[geom][0])
         if axis is not None and side is not None:

@@ -63,32 +63,32 @@ class Source:
     end_effector: str = ''
     above: dict[str, str] = field(default_factory=dict)  # link that each link hangs on, where known
 
-    def note(self, kind: str, told: str) -> None:
+    def note(self, kind: str, text: str) -> None:
         """Remember, in a line, what was 'chosen', 'dropped', 'held fixed', 'renamed' and so on."""
-        self.notes.append(f'{kind}: {printable(told)}')
+        self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
         """Return the notes that say why something did not become a muscle, or is none any more."""
         return [note for note in self.notes if re.match(r'dropped: .*(muscle|tendon)', note)]
 
-    def rename(self, kind: str, given: str | None, fallback: str, taken: Iterable[str]) -> str:
-        """Return a safe name that is not taken, and say so where it is not the given one."""
-        (name,) = distinct([safe_name(given, fallback)], taken)
-        self.renamed(kind, given, name)
+    def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
+        """Return a safe name that is not taken, and say so where it is not the original one."""
+        (name,) = distinct([safe_name(original, fallback)], taken)
+        self.renamed(kind, original, name)
         return name
 
-    def renamed(self, kind: str, given: str | None, name: str) -> None:
-        """Say so where a name is not the given one."""
-        if given and name != given:
-            self.note('renamed', f'{kind} {given} is {name} here')
+    def renamed(self, kind: str, original: str | None, name: str) -> None:
+        """Say so where a name is not the original one."""
+        if original and name != original:
+            self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
         """Return limits of a joint, chosen ones where there are none."""
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
             return float(low), float(high)
         end = UNLIMITED[slides]
-        given = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
-        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has {given}')
+        range_text = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
+        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has {range_text}')
         return -end, end
 
     def add_joint(
@@ -136,8 +136,8 @@ class Source:
         slope, offset = (round(float(v), 12) for v in np.polyfit(x, y, 1))
         self.couplings[slave] = Coupling(master, slope, offset)
         if (error := float(np.abs(slope * x + offset - y).max())) > 1e-6:
-            told = f'{slave} follows {master} by a line, off by up to {error:.3g}'
-            self.note('approximated', f'joint {told} {"m" if self.slides(slave) else "rad"}')
+            problem = f'{slave} follows {master} by a line, off by up to {error:.3g}'
+            self.note('approximated', f'joint {problem} {"m" if self.slides(slave) else "rad"}')
 
     def settle(self) -> None:
         """Let coupled joints rest where those that they follow put them."""
@@ -177,8 +177,8 @@ def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.In
         return pin.Inertia(mass, centre, tensor)
     except RuntimeError as error:
         moments = ', '.join(f'{moment:.4g}' for moment in np.linalg.eigvalsh(tensor))
-        told = f'expected principal moments of inertia >= 0, got {moments} kg·m²'
-        raise ValueError(f'link {link}: {told}') from error
+        problem = f'expected principal moments of inertia >= 0, got {moments} kg·m²'
+        raise ValueError(f'link {link}: {problem}') from error
 
 
 def safe_name(text: str | None, fallback: str) -> str:
@@ -188,18 +188,18 @@ def safe_name(text: str | None, fallback: str) -> str:
 
 def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
     """Return names with underscores behind those that are given or taken before."""
-    result, seen = [], {*taken}
+    result, used = [], {*taken}
     for name in names:
-        while name in seen:
+        while name in used:
             name += '_'
-        seen.add(name)
+        used.add(name)
         result.append(name)
     return result
 
 
-def names_of_all(kind: str, given: Iterable[str]) -> list[str]:
+def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
     """Return safe and distinct names of all things of a kind; those that have none are numbered."""
-    safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(given))
+    safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
     return distinct(safe, ['universe'])  # which is pinocchio's own
 
 
@@ -243,8 +243,8 @@ def cut(
     free = [name for name in movable if name not in {*couplings, *source.fixed}]
     wanted = set(joints or free)
     if missing := sorted(wanted - set(free)):
-        told = 'coupled' if missing[0] in couplings else 'no such joint'
-        raise SourceError(f'--joints {missing[0]}: {told}; joints: {", ".join(free)}')
+        problem = 'coupled' if missing[0] in couplings else 'no such joint'
+        raise SourceError(f'--joints {missing[0]}: {problem}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
         # A joint whose coupled one is in the chain moves the chain as well.

@@ -29,7 +29,7 @@ from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, un
 from musculoskeletal_ae.learning.rest import RestCollector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
-from musculoskeletal_ae.learning.state import State
+from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.learning.training import Job, Training, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -100,16 +100,11 @@ class Learner:
         self._gate_time = 0.0  # [s] of the messages
         self.refused = 0  # updates that the gate did not let through
         self.last_refused = ''
-        self._state = None if directory is None else State(directory, robot)
-        saved = None if self._state is None else self._state.load(self.samples)
-        gated = self.training.preset.gated
-        if self._state is not None and saved is not None and gated and not self._passes(saved):
-            self._state.back_up(self.samples, checkpoint.to_bytes(saved), self.last_refused)
-            saved = None
-            self._keep()  # without it: else every start would make that backup
-        # Samples without their network (damaged, refused, or of the robot with a muscle less) bring
+        self._state = None if directory is None else StateStore(directory, robot)
+        saved = self._load()
+        # Samples without their network (damaged, refused, or of the robot with fewer muscles) bring
         # as many updates as when they came.
-        self._owed = len(self.samples) if saved is None else 0
+        self._updates_to_repeat = len(self.samples) if saved is None else 0
         if saved is not None:
             self._go_on_from(saved)
         elif mae is not None:
@@ -248,7 +243,8 @@ class Learner:
             and len(self.samples) >= self._least_samples
             and self.training.ready
         ):
-            self._news, self._begun, self._forgot = self.updates + 1 < self._owed, now, False
+            self._news = self.updates + 1 < self._updates_to_repeat
+            self._begun, self._forgot = now, False
             seen, healthy = self.samples.observations(), self._healthy.healthy()
             job = Job(seen, healthy, self._statistics_hold, self._steps, self.isolated)
             self.training.submit(job)
@@ -347,7 +343,7 @@ class Learner:
         self.training.close()
         self.samples.clear()
         self._healthy.clear()
-        self._spoiled[:], self._owed, self.last_update = False, 0, None
+        self._spoiled[:], self._updates_to_repeat, self.last_update = False, 0, None
         self.reset()
         self.gate.start()
         self._torque.start()
@@ -357,11 +353,22 @@ class Learner:
         else:
             self._go_on_from(successor)
 
+    def _load(self) -> Mae | None:
+        """Fill the store with the saved samples; return the saved network if it is usable."""
+        if self._state is None:
+            return None
+        saved = self._state.load(self.samples)
+        if saved is None or not self.training.preset.gated or self._passes(saved):
+            return saved
+        self._state.back_up(self.samples, checkpoint.to_bytes(saved), self.last_refused)
+        self._keep()  # without the network, or each start would make another backup
+        return None
+
     def save(self) -> Path:
-        """Bring the disk in line at once; returns where.
+        """Save samples and network at once; return where.
 
         Raises:
-            StateError: If nothing is to be kept, or the disk is full or gone.
+            StateError: If there is no directory, or it cannot be written.
         """
         if self._state is None:
             raise StateError("state_directory is '': nothing is kept; start with a directory")
@@ -389,7 +396,7 @@ class Learner:
     @property
     def trouble(self) -> str:
         """Why nothing is learned, or what is learned is not on disk; or ''."""
-        disk = '' if self._state is None else self._state.trouble
+        disk = '' if self._state is None else self._state.trouble(self.samples)
         return '; '.join(filter(None, (self.training.trouble, disk)))
 
     def report(self) -> Report:

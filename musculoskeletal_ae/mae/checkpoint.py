@@ -6,7 +6,6 @@ Nothing of a checkpoint is used before all of it has been checked, and every fau
 """
 
 import json
-import re
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,12 +20,13 @@ from safetensors.numpy import save as save_tensors
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
-from musculoskeletal_ae.mae.mae import ACTIVATIONS, Layer, Mae
+from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets import PRESETS, Activation
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.schema import Strict, convert
 
 FORMAT_VERSION = 1
 MAX_BYTES = 64 * 1024 * 1024  # a hundred times the shipped arms' networks
@@ -43,71 +43,61 @@ Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-#: what network and metadata call the same
-SHARED = ('joints', 'muscles', 'activation', 'preset', 'version', 'training')
+#: entries of the metadata that the network has under the same name
+SHARED = (
+    'joints', 'muscles', 'groups', 'isolated', 'activation', 'preset', 'version', 'training',
+)  # fmt: skip
 
 
-class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a checkpoint says of its network; safetensors holds each entry as JSON text.
-
-    Without anomaly statistics `anomaly_calibrated` is None.
-    """
+class Metadata(Strict, frozen=True):
+    """What a checkpoint says of its network; safetensors holds each entry as JSON text."""
 
     format_version: int
+    units: str
     joints: Names
     muscles: Names
     layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21_000)]
-    activation: str
-    units: str
+    groups: Annotated[tuple[Group, ...], Meta(min_length=1, max_length=1000)]
+    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)]  # places of muscles
+    activation: Activation
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]
-    anomaly_calibrated: bool | None
+    anomaly_calibrated: bool | None  # None: there are no anomaly statistics
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
-    anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)] = 0
-    groups: Annotated[tuple[Group, ...], Meta(max_length=1000)] = ()  # none: it is all one
-    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None = None  # none: no statistics
-    uncertain: bool = False  # whether it tells the covariance of its estimates
-    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()  # places of muscles
+    anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
+    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None  # None: no touch statistics
+    uncertain: bool  # whether it holds the covariance of its estimates
 
     def __post_init__(self) -> None:
-        """Check what types cannot say."""
-        for what, names in (('joints', self.joints), ('muscles', self.muscles)):
+        """Check what types cannot express."""
+        for key, names in (('joints', self.joints), ('muscles', self.muscles)):
             if len(set(names)) < len(names) or not all(n and n.isprintable() for n in names):
-                raise ValueError(f'{what} {names}; legal: different names, printable')
-        for what, word, legal in (
-            ('units', self.units, (UNITS,)),
-            ('activation', self.activation, ACTIVATIONS),
-            ('preset', self.preset, PRESETS),
-        ):
+                raise ValueError(f'{key} {names}; legal: different names, printable')
+        for key, word, legal in (('units', self.units, [UNITS]), ('preset', self.preset, PRESETS)):
             if word not in legal:
-                raise ValueError(f'{what} {word!r}; legal: {" or ".join(map(repr, legal))}')
-        for names, places in zip((self.joints, self.muscles), zip(*self.whole), strict=True):
+                raise ValueError(f'{key} {word!r}; legal: {", ".join(legal)}')
+        for names, places in zip((self.joints, self.muscles), zip(*self.groups), strict=True):
             if sorted(chain(*places)) != [*range(len(names))] or not all(places):
                 raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
-        if len(set(self.isolated)) < len(self.isolated) or max(self.isolated, default=0) >= len(
-            self.muscles
-        ):
+        known, muscles = set(self.isolated), range(len(self.muscles))
+        if len(known) < len(self.isolated) or not known <= {*muscles}:
             raise ValueError(f'isolated {self.isolated}; legal: different places of muscles')
-        # Encoder and decoder have the same hidden layers, so the latent one stands in the middle.
-        for (joints, muscles), sizes in zip(self.whole, self.sizes_by_group(), strict=True):
-            d, m = len(joints), len(muscles)
+        # Encoder and decoder have the same hidden layers, with the latent one in the middle.
+        depth, rest = divmod(len(self.layer_sizes), len(self.groups))
+        for group, sizes in zip(self.groups, self.sizes_by_group(), strict=True):
+            d, m = len(group.joints), len(group.muscles)
             ends = d + 2 * m + 3, d + m, d + 2 * m
-            uneven = len(sizes) % 2 == 0 or len(sizes) * len(self.whole) != len(self.layer_sizes)
-            if uneven or (sizes[0], sizes[len(sizes) // 2], sizes[-1]) != ends:
-                legal_sizes = '{}, …, {}, …, {}'.format(*ends)
-                raise ValueError(f'layer_sizes {sizes}; legal: {legal_sizes}')
-
-    @property
-    def whole(self) -> tuple[Group, ...]:
-        """The groups; one of all joints and muscles where none are given."""
-        return self.groups or (Group.whole(len(self.joints), len(self.muscles)),)
+            is_symmetric = rest == 0 and depth % 2 == 1
+            if not is_symmetric or (sizes[0], sizes[depth // 2], sizes[-1]) != ends:
+                expected = '{}, …, {}, …, {}'.format(*ends)
+                raise ValueError(f'layer_sizes {sizes}; legal: {expected}')
 
     def sizes_by_group(self) -> list[tuple[int, ...]]:
         """Return the layer sizes of each group."""
-        each = -(-len(self.layer_sizes) // len(self.whole))
-        return [self.layer_sizes[g * each :][:each] for g in range(len(self.whole))]
+        depth = len(self.layer_sizes) // len(self.groups)
+        return [self.layer_sizes[g * depth :][:depth] for g in range(len(self.groups))]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return name and shape of every tensor of such a network."""
@@ -141,23 +131,22 @@ def to_bytes(mae: Mae) -> bytes:
         tensors |= {'anomaly.mean': anomaly.mean, 'anomaly.covariance': anomaly.covariance}
         if len(anomaly.postures):
             tensors['anomaly.postures'] = anomaly.postures
-    entries = {name: getattr(mae, name) for name in (*SHARED, 'layer_sizes')} | {
+    touch = mae.touch
+    if touch is not None:
+        tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
+    if mae.covariance is not None:
+        tensors['covariance'] = mae.covariance
+    entries = {name: getattr(mae, name) for name in SHARED} | {
         'format_version': FORMAT_VERSION,
         'units': UNITS,
+        'layer_sizes': mae.layer_sizes,
         'anomaly_calibrated': None if anomaly is None else anomaly.calibrated,
         'anomaly_samples': 0 if anomaly is None else anomaly.samples,
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
+        'touch_time': None if touch is None else touch.time,
+        'uncertain': mae.covariance is not None,
     }
-    if len(mae.groups) > 1:
-        entries['groups'] = mae.groups
-    if mae.isolated:
-        entries['isolated'] = mae.isolated
-    if (touch := mae.touch) is not None:
-        tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
-        entries['touch_time'] = touch.time
-    if mae.covariance is not None:
-        tensors['covariance'], entries['uncertain'] = mae.covariance, True
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
         {key: json.dumps(value, allow_nan=False) for key, value in entries.items()},
@@ -172,8 +161,8 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
             muscles in the same order, or values that cannot be computed with.
     """
     try:
-        header, meta = _parsed(data)
-        mae = _mae(meta, _tensors(data, header, meta))
+        meta = _metadata(data)
+        mae = _mae(meta, _tensors(data, meta))
         if robot is not None:
             _check_fit(mae, robot)
     except CheckpointError as error:
@@ -185,8 +174,14 @@ def _refused(source: str | Path, problem: str) -> CheckpointError:
     return CheckpointError(f'{source}: {problem}; use another checkpoint, or make one with `train`')
 
 
-def _parsed(data: bytes) -> tuple[dict[str, Any], Metadata]:
-    """Return what the header says of each tensor, and the metadata."""
+class _Header(msgspec.Struct, frozen=True):
+    """What safetensors puts before the tensors; it checks what it says of these itself."""
+
+    metadata: dict[str, str] = msgspec.field(name='__metadata__')
+
+
+def _metadata(data: bytes) -> Metadata:
+    """Return the metadata of safetensors bytes."""
     if len(data) > MAX_BYTES:
         raise CheckpointError(f'{len(data)} bytes; at most {MAX_BYTES} are legal')
     size = int.from_bytes(data[:8], 'little')
@@ -195,56 +190,50 @@ def _parsed(data: bytes) -> tuple[dict[str, Any], Metadata]:
             f'{len(data)} bytes with a header of {size} bytes are not safetensors '
             f'(a header has 2 to {MAX_HEADER_BYTES} bytes and lies inside the file)'
         )
-    header = _json(data[8 : 8 + size], 'header')
-    entries = header.pop('__metadata__', None) if isinstance(header, dict) else None
-    if not isinstance(entries, dict):
-        raise CheckpointError('no metadata; this is not a checkpoint of musculoskeletal_ae')
-    # Before all else: a newer format may differ in everything that is checked below.
-    version = _json(entries.get('format_version'), 'format_version')
-    if version is True or version != FORMAT_VERSION:
-        told = f'format_version {version!r:.100}'
-        raise CheckpointError(f'{told}; this program reads {FORMAT_VERSION}')
-    values = {key: _json(text, key) for key, text in entries.items()}
     try:
-        return header, msgspec.convert(values, Metadata)
-    except msgspec.ValidationError as error:
-        place = re.search(r'`\$\.(\w+)', str(error))
-        value = f': {values[place[1]]!r:.100}' if place else ''
-        raise CheckpointError(f'metadata: {error}{value}') from error
+        entries = msgspec.json.decode(data[8 : 8 + size], type=_Header).metadata
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        problem = f'no metadata ({error}); this is not a checkpoint of musculoskeletal_ae'
+        raise CheckpointError(problem) from error
+    values = {key: _json(text, key) for key, text in entries.items()}
+    # First of all: another format may differ in everything that the schema checks.
+    version = values.get('format_version')
+    if version is True or version != FORMAT_VERSION:
+        problem = f'format_version {version!r:.100}; this program reads {FORMAT_VERSION}'
+        raise CheckpointError(problem)
+    return convert(values, Metadata, lambda problem: CheckpointError(f'metadata: {problem}'))
 
 
-def _json(text: Any, what: str) -> Any:
-    if not isinstance(text, str | bytes):
-        raise CheckpointError(f'{what} is missing or not text')
+def _json(text: str, key: str) -> Any:
     try:
         return msgspec.json.decode(text)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise CheckpointError(f'{what} is not valid JSON ({error}): {text!r:.100}') from error
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise CheckpointError(f'{key} is not valid JSON ({error}): {text!r:.100}') from error
 
 
-def _tensors(data: bytes, header: dict[str, Any], meta: Metadata) -> dict[str, Array]:
-    shapes = meta.tensor_shapes()
-    if odd := header.keys() ^ shapes.keys():
-        raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
-    for name, shape in shapes.items():
-        entry = header[name] if isinstance(header[name], dict) else {}
-        for what, legal in (('dtype', 'F64'), ('shape', list(shape))):
-            if (given := entry.get(what)) != legal:
-                raise CheckpointError(f'tensor {name} has {what} {given!r}; legal: {legal!r}')
+def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
+    """Return the tensors that the metadata announces, all finite and in range."""
     try:
         tensors: dict[str, Array] = load_tensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f'not valid safetensors ({error})') from error
+    shapes = meta.tensor_shapes()
+    if odd := tensors.keys() ^ shapes.keys():
+        raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
     for name, value in tensors.items():
+        if value.dtype != np.float64:
+            raise CheckpointError(f'tensor {name} is of {value.dtype}; legal: float64')
+        if value.shape != shapes[name]:
+            raise CheckpointError(f'tensor {name} has shape {value.shape}; legal: {shapes[name]}')
         if not (np.abs(value) <= LARGEST).all():
             raise CheckpointError(f'tensor {name} holds a value beyond ±{LARGEST:g}, or not finite')
     for name in ('std', 'touch.spread'):
         if name in tensors and (least := tensors[name].min()) < SMALLEST_STD:
-            told = f'tensor {name} holds {least:g}; at least {SMALLEST_STD:g} is legal'
-            raise CheckpointError(told)
+            problem = f'tensor {name} holds {least:g}; at least {SMALLEST_STD:g} is legal'
+            raise CheckpointError(problem)
     if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
-        told = f'tensor touch.friction holds ±{most:g}; at most {LARGEST_FRICTION:g} is legal'
-        raise CheckpointError(told)
+        problem = f'tensor touch.friction holds ±{most:g}; at most {LARGEST_FRICTION:g} is legal'
+        raise CheckpointError(problem)
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
@@ -293,8 +282,6 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         anomaly=anomaly,
         touch=touch,
         covariance=tensors.get('covariance'),
-        groups=meta.groups,
-        isolated=meta.isolated,
         **{name: getattr(meta, name) for name in SHARED},
     )
 

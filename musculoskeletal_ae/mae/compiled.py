@@ -8,9 +8,9 @@ computes for eight units at once.
 """
 
 import numpy as np
+from numba import njit
 
 from musculoskeletal_ae.arrays import Singles
-from musculoskeletal_ae.compiler import njit
 
 # numba would compute in double precision with Python's numbers.
 ONE, TWO, LARGEST = np.float32(1.0), np.float32(2.0), np.float32(7.9)

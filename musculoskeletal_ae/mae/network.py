@@ -8,12 +8,12 @@ enters the first layer.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import torch
+from msgspec import structs
 from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
@@ -137,7 +137,7 @@ def to_mae(
 
 def from_mae(mae: Mae) -> Network:
     """Return a torch network with the weights of a numpy one, to go on learning from."""
-    settings = replace(PRESETS[mae.preset].network, activation=mae.activation)
+    settings = structs.replace(PRESETS[mae.preset].network, activation=mae.activation)
     hidden = [len(bias) for _, bias in mae.encoder]
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}

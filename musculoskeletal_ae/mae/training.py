@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from msgspec import structs
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
@@ -234,7 +235,7 @@ def initial_mae(
     """
     chosen = preset_named(preset)
     count = chosen.steps(robot.groups) if steps is None else steps
-    settings = replace(chosen.training, steps=count)
+    settings = structs.replace(chosen.training, steps=count)
     rng = np.random.default_rng(seed)
     drawn = min(settings.samples, count * settings.batch)  # of a short training: in one epoch
     samples = training_states(robot, preset, drawn, rng).scaled()

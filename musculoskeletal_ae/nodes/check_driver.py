@@ -19,9 +19,9 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 if TYPE_CHECKING:  # what --help does not load
     from musculoskeletal_ae.driver.verdict import Verdict
@@ -59,7 +59,7 @@ class CheckDriver:
     def listen(self) -> Verdict:
         """Wait for a driver and listen to it."""
         chosen, node = self.options, self.node
-        kind: Any = load('musculoskeletal_ae.driver.listening').Listening
+        kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
         self.muscles = lambda message: listening.muscles(message, time.monotonic())
         self.joints = listening.joints
@@ -91,9 +91,9 @@ class CheckDriver:
     def wind(self, verdict: Verdict) -> None:
         """Wind each muscle in a little."""
         muscles = self.robot.muscle_indices(self.options.muscles or [])
-        kind = load('musculoskeletal_ae.driver.winding').Winding
+        kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
         winding = kind(verdict, muscles, self.options.tension)
-        read = load('musculoskeletal_ae.validity').read_array
+        read = import_heavy('musculoskeletal_ae.validity').read_muscle_states
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
@@ -105,7 +105,7 @@ class CheckDriver:
             nonlocal last, trying
             now = time.monotonic()
             try:
-                states = read(message, 3, self.robot.muscle_count)
+                states = read(message, self.robot.muscle_count)
             except MusculoskeletalError:
                 return
             last, target = now, winding.step(states, now)
@@ -127,7 +127,7 @@ class CheckDriver:
 
 
 def _check(options: Namespace, arguments: list[str]) -> int:
-    robot = load('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
+    robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
     if options.posture and len(options.posture) != robot.joint_count:
         raise MusculoskeletalError(f'--posture: {robot.joint_count} values are wanted, one a joint')
     start_ros(arguments)

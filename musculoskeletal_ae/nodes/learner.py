@@ -36,7 +36,7 @@ JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 class Learner(Shell):
     """Node shell of online learning."""
 
-    hurried = False
+    is_time_critical = False
 
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)
@@ -85,7 +85,7 @@ class Learner(Shell):
     def _directory(self, value: str) -> Path | None:
         if value != 'auto':
             return Path(value) if value else None
-        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `State` knows ~
+        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `StateStore` expands ~
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 

@@ -2,10 +2,10 @@
 """The tool `record`: the topics to an mcap bag that `ros2 bag` can read."""
 
 import math
-import signal
 import sys
 import time
 from argparse import ArgumentTypeError, Namespace
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,14 @@ from pathlib import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags.metadata import Qos, offered_qos
+from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 # What the recorder may lose when it is killed is what is younger than this.
 FLUSH_PERIOD = 0.5  # [s]
@@ -80,49 +82,45 @@ class Record(Node):
 
 
 def _record(options: Namespace, arguments: list[str]) -> None:
-    # The end is taken by hand, so that what waits in the queues is still written.
-    stop: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stop.append(received))
     start_ros(arguments)
     out = options.out or Path(f'{datetime.now():%Y_%m_%d-%H_%M_%S}_bag')  # noqa: DTZ005 - local
     with BagWriter(out, options.compression) as writer:
         node = Record(writer, options.topics)
-        spinner = Spinner(node)
-        with spinner:
+        with Spinner(node) as spinner:
             print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
-            spinner.spin_until(lambda: stop, options.duration or math.inf)
+            with suppress(KeyboardInterrupt):
+                spinner.spin_until(lambda: False, options.duration or math.inf)
             drained, before = time.monotonic() + DRAIN_TIME, -1
             while time.monotonic() < drained and node.received != before:
                 before = node.received
-                spinner.look(0.05)
+                spinner.spin_once(0.05)
         node.destroy_node()
     if node.timeless:
-        told = 'messages came before the first /clock, and are left out'
-        print(f'warning: {node.timeless} {told}', file=sys.stderr)
+        problem = 'messages came before the first /clock, and are left out'
+        print(f'warning: {node.timeless} {problem}', file=sys.stderr)
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
 
 
 def parse(arguments: list[str]) -> Namespace:
     """Return the options of `record`."""
-    told = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
-    parser = Parser('record', told + ROS_HELP)
+    what = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
+    parser = Parser('record', what + ROS_HELP)
     add = parser.add_argument
     add('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
     add('-o', '--out', type=Path, metavar='DIR', help='the same')
     add('--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)')
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     add('--compression', choices=COMPRESSIONS, default='zstd', help='of the messages')
-    mended = (
-        'make a finished bag of one whose recorder was killed: in place, the original kept as '
-        'BAG.unfinished, or in DIR'
+    recover_help = (
+        'copy what can be read of a bag, such as one whose recorder was killed, to a finished one '
+        'in DIR (default: BAG_recovered)'
     )
-    add('--recover', type=Path, metavar='BAG', help=mended)
+    add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
         parser.error('DIR is given twice')
     if options.recover and (options.topics or options.duration):
-        parser.error('--recover mends the whole recording: without --topics and --duration')
+        parser.error('--recover copies the whole recording: without --topics and --duration')
     options.out = options.out or options.directory
     options.topics = options.topics or list(TOPICS)
     return options
@@ -137,14 +135,16 @@ def _topics(text: str) -> list[str]:
 
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
-        bag, count, backup, left_out = recover(options.recover, options.out, options.compression)
-        kept = f'; the original is kept as {backup}' if backup else ''
-        print(f'{count} messages recovered to {bag}{kept}')
+        bag = options.recover
+        target = options.out or bag.with_name(f'{bag.stem}_recovered')
+        count, left_out = recover(bag, target, options.compression)
+        print(f'{count} messages recovered to {target}')
         if left_out:
-            told = f'left out, since they are not in CDR: {", ".join(left_out)}'
-            print(f'warning: {options.recover}: {told}', file=sys.stderr)
+            problem = f'left out, since they are not in CDR: {", ".join(left_out)}'
+            print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
-        _record(options, arguments)
+        with STOP.reacting(Reaction.REMEMBER):  # what waits in the queues is still written
+            _record(options, arguments)
     return 0
 
 

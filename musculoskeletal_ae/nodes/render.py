@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import SENSOR
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `replay`: plays a recorded mcap bag onto the topics, and says what is in one."""
+"""The node `replay`: plays a recorded bag onto the topics, or reports what is in it."""
 
 import sys
 import time
@@ -22,16 +22,24 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from musculoskeletal_ae.bags.playback import LEAD, SHOWN, Timeline, lap, shown, window
+from musculoskeletal_ae.bags.playback import (
+    LEAD_TIME,
+    TAUGHT_TOPIC,
+    Timeline,
+    lap,
+    taught_motion,
+    window,
+)
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
-from musculoskeletal_ae.nodes.running import ROS_HELP, Spinner, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 # Deep enough that a reader that is late by a second still gets everything.
 DEPTH = 1000
@@ -68,13 +76,16 @@ class Replay(Node):
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
         self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
         self._sought: int | None = None  # where to go on [ns]
-        told = ParameterDescriptor(description='go on from here, counted from the beginning [s]')
+        description = 'go on from here, counted from the beginning [s]'
+        descriptor = ParameterDescriptor(description=description)
         end = self._before + self.length
         legal = FloatingPointRange(from_value=self._before, to_value=end)
-        told.floating_point_range = [legal]
-        self.declare_parameter('position', self._before, told)
+        descriptor.floating_point_range = [legal]
+        self.declare_parameter('position', self._before, descriptor)
         self.add_post_set_parameters_callback(self._seek)
-        self._told = self.create_publisher(Float64MultiArray, 'replay/position', RELIABLE)
+        self._position_publisher = self.create_publisher(
+            Float64MultiArray, 'replay/position', RELIABLE
+        )
         reception = Reception(self.get_logger().warning)  # of nothing: it only sends
         self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
@@ -109,6 +120,7 @@ class Replay(Node):
                     break
                 self._timeline.catch_up(message.log_time, time.monotonic())
                 self._tick()
+                STOP.raise_if_received()
                 self._publisher[message.topic].publish(message.data)
 
     def acknowledge(self) -> None:
@@ -130,14 +142,15 @@ class Replay(Node):
                 wait = min(wait, max(self._next_tick - now, 0.0))
             if wait > SLEPT or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
-                self._spinner.look(wait)
+                self._spinner.spin_once(wait)
+                STOP.raise_if_received()
                 if now > self._next_report:
                     self._next_report = now + PERIOD
                     doing = 'paused' if self._timeline.paused else 'playing'
                     report = Report('ok', doing, {'position': self._position()})
                     self._diagnostics.tell(report)
                     seconds = self._before + np.array([self._done(), self.length])
-                    self._told.publish(array_message(seconds, ''))
+                    self._position_publisher.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
             else:
                 time.sleep(wait)
@@ -187,13 +200,13 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
 
 
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish what a hand showed as one trajectory, and say whether the controller took it."""
-    names = select(bag, [SHOWN], options.from_namespace, options.keep_names)
+    """Publish what a hand taught as one trajectory, and say whether the controller took it."""
+    names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
     if len(names) > 1:  # all arms' names are kept
         problem = f'has the motion of several arms: {", ".join(names)}'
         raise BagError(bag.path, problem, 'choose one with --from-namespace')
     ((recorded, name),) = names.items()
-    motion = shown(bag, recorded, *window(bag, options.start, options.duration))
+    motion = taught_motion(bag, recorded, *window(bag, options.start, options.duration))
     message = JointTrajectory(joint_names=motion.joints)
     for seconds, theta, velocity in zip(*motion[1:]):
         point = JointTrajectoryPoint(positions=theta.tolist(), velocities=velocity.tolist())
@@ -201,15 +214,15 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
         message.points.append(point)
     start_ros(arguments)
     node = Node('replay')
-    topic, spinner = name.removesuffix(SHOWN) + TRAJECTORY, Spinner(node)
+    topic, spinner = name.removesuffix(TAUGHT_TOPIC) + TRAJECTORY, Spinner(node)
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
     listeners, reports = set[str](), list[dict[str, str]]()
 
-    def hear(message: DiagnosticArray) -> None:
-        said = (status for status in message.status if status.name in listeners)
-        reports.extend({value.key: value.value for value in status.values} for status in said)
+    def on_diagnostics(message: DiagnosticArray) -> None:
+        statuses = (status for status in message.status if status.name in listeners)
+        reports.extend({value.key: value.value for value in status.values} for status in statuses)
 
-    node.create_subscription(DiagnosticArray, '/diagnostics', hear, RELIABLE)
+    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, RELIABLE)
     _await_subscribers(spinner, [publisher], options.wait)
     for each in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)):
         listeners.add(f'{each.node_namespace.rstrip("/")}/{each.node_name}: state')
@@ -228,13 +241,13 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
         reasons = [key.removeprefix(counted) for key in reports[-1] if key.startswith(counted)]
         why = last if last.startswith(TRAJECTORY) else ', '.join(reasons) or 'it does not say why'
         raise MusculoskeletalError(f'the controller did not take it: {why}')
-    told = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
-    print(f'{topic}: {told}, the first {LEAD:g} s of it to where it begins')
+    length = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
+    print(f'{topic}: {length}, the first {LEAD_TIME:g} s of it to where it begins')
     return 0
 
 
 def _replay(options: Namespace, arguments: list[str]) -> int:
-    bag = Bag.open(options.bag, unfinished=True)
+    bag = Bag.open(options.bag)
     for reason in bag.unfinished:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
     if options.as_trajectory:
@@ -243,13 +256,14 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     if options.loop and not options.clock:
         problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
         print(f'warning: --loop: {problem}', file=sys.stderr)
-    start_ros(arguments)
-    node = Replay(bag, names, options)
-    bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
-    with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
-        node.get_ready(options.wait)
-        node.play(progress, options.loop)
-    node.acknowledge()
+    with STOP.reacting(Reaction.REMEMBER):
+        start_ros(arguments)
+        node = Replay(bag, names, options)
+        bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
+        with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
+            node.get_ready(options.wait)
+            node.play(progress, options.loop)
+        node.acknowledge()
     return 0
 
 
@@ -263,7 +277,7 @@ def parse(arguments: list[str]) -> Namespace:
         'parameter `position` [s] goes there.',
     )
     add = parser.add_argument
-    add('bag', type=Path, metavar='BAG', help='a bag directory or an mcap file')
+    add('bag', type=Path, metavar='BAG', help='a bag directory, or one mcap or sqlite3 file')
     add('--check', action='store_true', help='play nothing; say what is in it (exit status 1: bad)')
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
     topics = (
@@ -280,8 +294,8 @@ def parse(arguments: list[str]) -> Namespace:
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
-    taught = f'send the motion of {SHOWN} as one smooth joint_trajectory, and end'
-    add('--as-trajectory', action='store_true', help=taught)
+    teach = f'send the motion of {TAUGHT_TOPIC} as one smooth joint_trajectory, and end'
+    add('--as-trajectory', action='store_true', help=teach)
     add('--paused', action='store_true', help='wait for replay/resume or replay/step')
     wait = 'longest wait for subscribers [s]'
     add('--wait', type=not_negative, default=2.0, metavar='S', help=wait)
@@ -294,14 +308,18 @@ def parse(arguments: list[str]) -> Namespace:
     if options.robot and not options.check:
         parser.error('--robot is for --check')
     if options.check:
-        given = {name for name, value in vars(options).items() if value != parser.get_default(name)}
-        if ignored := sorted(given - {'bag', 'check', 'robot', 'from_namespace'}):
+        changed = {
+            name for name, value in vars(options).items() if value != parser.get_default(name)
+        }
+        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
             parser.error(f'--check plays nothing: without --{ignored[0].replace("_", "-")}')
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
     if options.as_trajectory and options.topics != [DEFAULT]:
-        told = ','.join(options.topics)
-        parser.error(f'--as-trajectory sends the motion of {SHOWN}: without --topics {told}')
+        listed = ','.join(options.topics)
+        parser.error(
+            f'--as-trajectory sends the motion of {TAUGHT_TOPIC}: without --topics {listed}'
+        )
     return options
 
 

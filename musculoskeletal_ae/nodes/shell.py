@@ -9,7 +9,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import wraps
 from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
@@ -34,28 +35,37 @@ from musculoskeletal_ae.estimation.gate import Gate
 from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
-    GateError,
     MessageError,
     MusculoskeletalError,
     printable,
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.checkpoint_validation import (
+    CHECKPOINT_TOPIC,
+    CheckpointValidation,
+)
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
-from musculoskeletal_ae.nodes.running import give_way
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.validity import (
+    QUANTITIES,
+    read_array,
+    read_muscle_states,
+    read_names,
+    read_posture,
+)
 
 if TYPE_CHECKING:  # it needs what writes bags
     from musculoskeletal_ae.nodes.stop_recording import StopRecording
 
 #: for ages and watchdogs; never stands still, whatever /clock does
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+TIMER = 'Timer'  # source of an exception that escaped a timer's callback
 MOST_ZERO = 10.0  # [m] of a length sensor
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
 LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
@@ -65,7 +75,7 @@ class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
 
     core: Any = None  # what computes
-    hurried = True  # whether commands wait for it
+    is_time_critical = True  # whether commands wait for it
     recording: StopRecording | None = None  # told of every message that is new, before it is used
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -80,7 +90,6 @@ class Shell(Node):
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
-        self._take_old_names()
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
@@ -93,7 +102,6 @@ class Shell(Node):
         self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
-        self.add_post_set_parameters_callback(self._keep_old_names)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.create_timer(PERIOD, self._report, clock=STEADY)
@@ -119,23 +127,63 @@ class Shell(Node):
 
     # -- what must not end the node -------------------------------------------------------------
 
-    def survive(self, source: str, error: Exception) -> None:
-        """Count what a callback let out, by topic or service, and go on."""
-        if source == 'Timer':  # no message did it
+    def on_callback_error(self, source: str, error: Exception) -> None:
+        """Count and log an exception that escaped a callback, by topic or service."""
+        if source == TIMER:  # no message caused it
             self._fault = f'fault of its own: {type(error).__name__}: {error}'
         if self._reception.reject_error(source, error):
             self.get_logger().error(printable(traceback.format_exc()))
 
+    def create_subscription(  # type: ignore[override]
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Any:
+        """Subscribe; an exception that escapes the callback is counted.
+
+        rclpy subscribes to /clock by this method as well.
+        """
+        guarded = self._guarded(self.resolve_topic_name(topic), callback)
+        return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+
+    def create_timer(  # type: ignore[override]
+        self, timer_period_sec: float, callback: Any, **options: Any
+    ) -> Any:
+        """Create a timer; an exception that escapes the callback is counted as a fault."""
+        return super().create_timer(timer_period_sec, self._guarded(TIMER, callback), **options)
+
+    def _guarded(self, source: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a callback that counts what escapes `callback`; rclpy sees the same signature."""
+
+        @wraps(callback)
+        def call(*arguments: Any) -> None:
+            with self._counting_errors(source):
+                callback(*arguments)
+
+        @wraps(callback)
+        async def call_asynchronously(*arguments: Any) -> None:
+            with self._counting_errors(source):
+                await callback(*arguments)
+
+        return call_asynchronously if iscoroutinefunction(callback) else call
+
+    @contextmanager
+    def _counting_errors(self, source: str) -> Iterator[None]:
+        try:
+            yield
+        except ExternalShutdownException:  # asks for the end of the node
+            raise
+        except Exception as error:  # noqa: BLE001
+            self.on_callback_error(source, error)
+
     def create_service(  # type: ignore[override]
         self, srv_type: Any, srv_name: str, callback: Any, **options: Any
     ) -> Any:
-        """Offer a service that answers, whatever its callback lets out."""
+        """Offer a service that answers even if an exception escapes its callback."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
                 response = callback(request, response)
             except Exception as error:  # noqa: BLE001
-                self.survive(srv_name, error)
+                self.on_callback_error(srv_name, error)
                 refuse(request, response, printable(error))
             if hasattr(response, 'message'):
                 response.message = printable(response.message)
@@ -199,20 +247,8 @@ class Shell(Node):
                 self._setters[name](self.parameter(name))
             raise
 
-    def _take_old_names(self) -> None:
-        """Read parameters by the names that they had a version ago, and say so."""
-        given: dict[str, RosParameter] = getattr(self, '_parameter_overrides', {})
-        for old, new in RENAMED.items():
-            if new not in self._table:
-                continue
-            if old in given and new not in given:
-                self.get_logger().warning(f'parameter {old} is called {new} now')
-                self.set_parameters([RosParameter(new, value=given[old].value)])
-            told = _descriptor(replace(self._table[new], meaning=f'old name of {new}'))
-            self.declare_parameter(old, self.get_parameter(new).value, told)
-
     def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        self._proposed = {RENAMED.get(p.name, p.name): p.value for p in parameters}
+        self._proposed = {p.name: p.value for p in parameters}
         try:
             self._take(self._proposed)
         except MusculoskeletalError as error:
@@ -221,14 +257,6 @@ class Shell(Node):
             self._proposed = {}
         return SetParametersResult(successful=True)
 
-    def _keep_old_names(self, parameters: list[RosParameter]) -> None:
-        """Let a parameter be the same by its old name and by its new one."""
-        others = RENAMED | {new: old for old, new in RENAMED.items()}
-        for parameter in parameters:
-            other = others.get(parameter.name, '')
-            if self.has_parameter(other) and self.get_parameter(other).value != parameter.value:
-                self.set_parameters([RosParameter(other, value=parameter.value)])
-
     # -- checkpoints ----------------------------------------------------------------------------
 
     def follow_checkpoints(
@@ -236,13 +264,10 @@ class Shell(Node):
     ) -> None:
         """Use checkpoints from the parameter and the topic that pass the gate.
 
-        `unfit` is told why one that came by topic cannot be used; the one in use stays. It is tried
-        in pieces, between which messages are answered; of those that come meanwhile the last is
-        tried next. A trial is given up if a file is chosen, or an anomaly is detected.
+        `unfit` is told why one that came by topic cannot be used; the one in use stays. Validation
+        is given up if a file is chosen, or an anomaly is detected.
         """
         gate = self.gate = Gate(self.robot)
-        given_up = 0  # how often trials were
-        waiting: tuple[UInt8MultiArray, int] | None = None  # to be tried next, and given_up before
 
         def take(mae: Mae) -> None:
             try:
@@ -254,37 +279,23 @@ class Shell(Node):
         def load(path: str) -> Mae | None:
             return checkpoint.load(path, self.robot) if path else None
 
+        def validate(message: UInt8MultiArray) -> Iterator[None]:
+            mae = checkpoint.from_bytes(bytes(message.data), self.robot)
+            yield
+            yield from gate.trial(mae)
+            take(mae)
+
+        self.validation = CheckpointValidation(self, self._reception, validate, unfit)
+
         def from_file(mae: Mae) -> None:
-            nonlocal given_up
             gate.check(mae)
             take(mae)
-            given_up += 1
+            self.validation.give_up()
             self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
 
-        async def from_topic(message: UInt8MultiArray) -> None:
-            nonlocal waiting
-            one_waits, waiting = waiting is not None, (message, given_up)
-            if one_waits:  # its callback tries this one
-                return
-            await give_way()
-            (message, before), waiting = waiting, None
-            try:
-                if before == given_up:
-                    mae = checkpoint.from_bytes(bytes(message.data), self.robot)
-                    for _ in gate.trial(mae):
-                        await give_way()
-                        if before != given_up:
-                            return
-                    take(mae)
-            except GateError:  # the one in use goes on
-                raise
-            except CheckpointError as error:
-                unfit(str(error))
-                raise
-
         def anomaly(detected: bool) -> None:
-            nonlocal given_up
-            given_up += detected and gate.mae is not None
+            if detected and gate.mae is not None:
+                self.validation.give_up()
             before = gate.anomaly(detected, time.monotonic())
             if before is not None:
                 self.get_logger().warning(f'back to checkpoint version {before.version}')
@@ -293,7 +304,7 @@ class Shell(Node):
         self.take_anomaly = anomaly
         self.needed.append('mae_checkpoint')
         self.follow_parameter('checkpoint', from_file, load)
-        self.listen(UInt8MultiArray, 'mae_checkpoint', from_topic, LATCHED)
+        self.listen(UInt8MultiArray, CHECKPOINT_TOPIC, self.validation.propose, LATCHED)
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -308,7 +319,12 @@ class Shell(Node):
         full, recording = self.resolve_topic_name(topic), self.recording
         if recording is not None:
             callback = _recorded(recording, topic, kind, callback)
-        receive = self._reception.of(topic, callback, lambda: self.count_publishers(full))
+        receive = self._reception.of(
+            topic,
+            callback,
+            lambda: self.count_publishers(full),
+            is_used_at_once=topic != CHECKPOINT_TOPIC,
+        )
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
         raw = recording is not None
         self.create_subscription(kind, topic, receive, qos, raw=raw)  # type: ignore[arg-type]
@@ -349,7 +365,7 @@ class Shell(Node):
 
         def from_one(message: Float64MultiArray) -> None:
             try:
-                states = read_array(message, *shape, self.left_out, unknown)
+                states = read_muscle_states(message, shape[1], self.left_out, unknown)
             except MessageError:
                 if unread and not intruders and len(message.data) == math.prod(shape):
                     unread(np.reshape(message.data, shape))
@@ -442,7 +458,7 @@ class Shell(Node):
         try:
             report = self.report()
         except Exception as error:  # noqa: BLE001 - who reports nothing seems well
-            self.survive('Timer', error)
+            self.on_callback_error(TIMER, error)
             report = Report('error', self._fault, {})
         if self._fault:
             report, self._fault = Report('error', self._fault, report.values), ''
@@ -460,10 +476,7 @@ def _recorded(
         recording.heard(topic, data)
         return message
 
-    async def take_in_pieces(data: bytes) -> None:
-        await callback(read(data))
-
-    return take_in_pieces if iscoroutinefunction(callback) else lambda data: callback(read(data))
+    return lambda data: callback(read(data))
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_joints
+from musculoskeletal_ae.validity import read_target
 
 TEMPERATURE = 25.0  # [°C]
 
@@ -33,7 +33,7 @@ class Sim(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)
         Markers(self, 'sim', self._lines)
-        self.hurried = self.as_robot = self.parameter('as_robot')
+        self.is_time_critical = self.as_robot = self.parameter('as_robot')
         prefix = '' if self.as_robot else 'sim/'
         self.advertise(prefix, joint_sensors=True, description=self.as_robot)
         self.arm: Simulation | None = None
@@ -80,7 +80,7 @@ class Sim(Arm):
         fixed = np.full(self.robot.joint_count, np.nan)
         if message.name or message.position or message.velocity or message.effort:
             joints = self.robot.joints
-            for name, (angle, _) in read_joints(message, joints, foreign_allowed=False).items():
+            for name, (angle, _) in read_target(message, joints).items():
                 fixed[joints.index(name)] = angle
         self.fixed = fixed
 

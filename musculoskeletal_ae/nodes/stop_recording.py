@@ -23,6 +23,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # that are kept
 MOST = 50_000  # messages, however fast they come
+MOST_BYTES = 64 << 20  # of messages, however large they are
 FILE = 'cause.txt'  # why the node stopped, in the bag's directory; written last
 #: of the bags' directories, also of those that a kill cut off
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
@@ -41,6 +42,7 @@ class StopRecording:
         self._resolve = resolve
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
+        self._recent_size = 0  # [bytes]
         self._latched: dict[str, Heard] = {}  # the last ones before those
         self._writing: threading.Thread | None = None
         self.problem = ''  # why the last recording could not be written
@@ -50,8 +52,14 @@ class StopRecording:
         """Remember a message of one of `bags.topics.TOPICS`, in CDR."""
         now = time.time_ns()
         self._recent.append((now, topic, data))
-        while len(self._recent) > MOST or self._recent[0][0] < now - int(SECONDS * 1e9):
+        self._recent_size += len(data)
+        while self._recent and (
+            len(self._recent) > MOST
+            or self._recent_size > MOST_BYTES
+            or self._recent[0][0] < now - int(SECONDS * 1e9)
+        ):
             left = self._recent.popleft()
+            self._recent_size -= len(left[2])
             if TOPICS[left[1]].latched:
                 self._latched[left[1]] = left
 

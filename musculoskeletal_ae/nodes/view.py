@@ -32,20 +32,21 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.running import ROS_HELP, raise_interrupt, run_tool, start_ros
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.start import load
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.stop_signals import STOP, Reaction, import_heavy
+from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
 PATIENCE = 10.0  # [s] with a service
+STOP_LOOK_PERIOD = 0.1  # [s]
 ARM_TOPICS = {
     'measured': 'joint_states',
     'estimated': 'estimated_joint_states',
@@ -64,11 +65,10 @@ class View(Node):
     def __init__(self, robot: Robot, options: Namespace) -> None:
         super().__init__('view', start_parameter_services=False)
         try:
-            page = load('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
+            page = import_heavy('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
         except ImportError as error:
             raise MusculoskeletalError(
-                'the page needs viser: ./bringup.sh --view installs it, or '
-                'pip install -r .ci/requirements-view.txt'
+                'the page needs viser: pip install -r requirements.txt installs it'
             ) from error
         self.robot = robot
         self.asked: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
@@ -103,8 +103,7 @@ class View(Node):
         robot, joints = self.robot, self.robot.joints
 
         def muscles(message: Any) -> Array:
-            size = len(QUANTITIES), robot.muscle_count
-            return read_array(message, *size, self._isolated(), math.nan)
+            return read_muscle_states(message, robot.muscle_count, self._isolated(), math.nan)
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
@@ -151,8 +150,8 @@ class View(Node):
 
     def run(self) -> None:
         """Show what comes until the process is asked to end."""
-        while rclpy.ok():
-            looked_at = self.page.looked_at.wait(timeout=1.0)
+        while rclpy.ok() and not STOP.received:
+            looked_at = self.page.looked_at.wait(timeout=STOP_LOOK_PERIOD)
             if (now := time.monotonic()) >= self.reported + diagnostics.PERIOD:
                 self.reported = now
                 self.diagnostics.tell(Report('ok', 'shown' if looked_at else 'nobody looks', {}))
@@ -161,7 +160,6 @@ class View(Node):
                 try:
                     self._do(what, *value)
                 except Exception as error:  # noqa: BLE001 - a page may send anything
-                    raise_interrupt(error)
                     self.page.notify(printable(f'{what}: {error}'), False)
             if not looked_at:
                 for subscription in self.taken:
@@ -174,7 +172,6 @@ class View(Node):
             try:
                 self._show(begun)
             except Exception as error:  # noqa: BLE001 - topics and services may bring anything
-                raise_interrupt(error)
                 if self.reception.reject_error('what is shown', error):
                     self.get_logger().error(printable(traceback.format_exc()))
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
@@ -302,9 +299,11 @@ def _view(options: Namespace, arguments: list[str]) -> int:
     name = 'localhost' if options.host == '127.0.0.1' else host
     print(f'http://{name}:{options.port}', flush=True)
     try:
-        view.run()
+        with STOP.reacting(Reaction.REMEMBER):
+            view.run()
     finally:
         view.page.close()
+    STOP.raise_if_received()
     return 0
 
 

@@ -27,13 +27,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
-from musculoskeletal_ae.robot.description import RobotDescription, Wrap, shown
-from musculoskeletal_ae.robot.entries import refusal
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.schema import Strict
 
 DESIRED_SHARE = 0.3  # of T_limit: 60 N where that is 200 N
 REQUIRED_SHARE = 0.95
@@ -51,8 +51,17 @@ LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
 WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
-#: message and remedy by kind; what stands after a comma tells variants of one kind apart
-FINDINGS = read_table(__file__, 'findings.yaml', dict[str, tuple[str, str]])
+
+
+class FindingTexts(Strict, frozen=True, array_like=True):
+    """An entry of findings.yaml."""
+
+    message: str
+    remedy: str
+
+
+#: texts by kind; what stands after a comma distinguishes variants of one kind
+FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
 class Finding(NamedTuple):
@@ -232,8 +241,9 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
 
 def _finding(key: str, **seen: object) -> Finding:
     """Return one of the FINDINGS, with what its texts name."""
-    message, remedy = (text.format(**seen) for text in FINDINGS[key])
-    return Finding(key.partition(',')[0], message, remedy)
+    texts = FINDINGS[key]
+    kind = key.partition(',')[0]
+    return Finding(kind, texts.message.format(**seen), texts.remedy.format(**seen))
 
 
 def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:

@@ -6,25 +6,35 @@ legal values in the message, so that no later code needs to check again.
 """
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from msgspec import UNSET, to_builtins
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.entries import Entry, refusal
 from musculoskeletal_ae.robot.kinematics import Coupling, body_frames, resolved
+from musculoskeletal_ae.robot.muscle_file import (
+    MuscleEntry,
+    MuscleFile,
+    RouteEntry,
+    TensionEntry,
+)
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
+from musculoskeletal_ae.schema import Strict, convert
 
-STIFFNESS_DEFAULT = 10000.0  # [N/m]
+#: makes the error of what is wrong in muscles.yaml
+Fail = Callable[[str], RobotDescriptionError]
+
 #: what URDF calls joints that are neither revolute nor prismatic, by their degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
@@ -116,6 +126,12 @@ class RobotDescription:
         return lines
 
 
+def refusal(file: Path, problem: str) -> RobotDescriptionError:
+    """Return the error that says why a file of a robot directory cannot be read."""
+    remedy = 'a robot directory holds robot.urdf and muscles.yaml'
+    return RobotDescriptionError(f'{file}: {problem}; {remedy}')
+
+
 def load_description(robot: str | Path) -> RobotDescription:
     """Read and check a robot description, by a shipped name such as 'arm26' or a directory.
 
@@ -124,213 +140,195 @@ def load_description(robot: str | Path) -> RobotDescription:
     """
     directory = find_robot(robot)
     urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
+
     urdf = read_text(urdf_file, refusal)
-    model = read_urdf(urdf_file, urdf)
-    top = Entry(muscle_file, read_yaml(muscle_file, refusal), 'top level', '').mapping(
-        'joints', 'muscles', 'series_elastic', 'stiffness', 'tension', 'end_effector',
-        'end_effectors', 'couplings',
-    )  # fmt: skip
-    joints, parsed = _read_joints(top['joints'], model), parse_xml(urdf_file, urdf)
-    couplings = _read_couplings(top, read_mimics(parsed), joints, model)
-    order = [link.get('name', '') for link in parsed.iter('link')]
-    default = _read_elastic(top.get('series_elastic'), series_elastic.DEFAULT)
+    model, tree = read_urdf(urdf_file, urdf), parse_xml(urdf_file, urdf)
+    document = read_yaml(muscle_file, refusal)
+
+    def fail(problem: str) -> RobotDescriptionError:
+        return RobotDescriptionError(f'{muscle_file}: {_with_muscle_name(problem, document)}')
+
+    content = convert(document, MuscleFile, fail)
+    _check_joints(content.joints, model, fail)
+    couplings = _read_couplings(content, read_mimics(tree), model, urdf_file, fail)
     links = [str(frame.name) for frame in body_frames(model)]
-    stiffness = top.get('stiffness', STIFFNESS_DEFAULT).number(above=0.0)
-    tension = _read_tension(top.get('tension', {}), TENSION_DEFAULT)
-    names, routes, elastic, module, warnings = [], [], [], [], list[str]()
-    for item in top['muscles'].items(1, 'muscles'):
-        entry = item.mapping('name', 'route', 'series_elastic', 'stiffness', 'tension')
-        names.append(entry['name'].name())
-        for wrong, legal in (
-            (',' in names[-1], 'a comma, which lists of muscles have between names'),
-            (names[-1] != names[-1].strip(), 'spaces around it, which lists of muscles may have'),
-        ):
-            if wrong:
-                raise entry['name'].fail(f'expected a name without {legal}, got {names[-1]!r}')
-        muscle = entry.called(f'muscle {names[-1]!r}')
-        routes.append(_read_route(muscle['route'], links, warnings))
-        elastic.append(_read_elastic(muscle.get('series_elastic'), default))
-        own = _read_tension(muscle.get('tension', {}), tension)
-        module.append(own | {'K': muscle.get('stiffness', stiffness).number(above=0.0)})
+    elastic_default = series_elastic.DEFAULT | _entries(content.series_elastic)
+    tension_default = _read_tension('$.tension', content.tension, TENSION_DEFAULT, fail)
+    routes, elastic, tension, stiffness, warnings = [], [], [], [], list[str]()
+    for i, muscle in enumerate(content.muscles):
+        place = f'$.muscles[{i}]'
+        routes.append(_read_route(f'{place}.route', muscle, links, fail, warnings))
+        elastic.append(elastic_default | _entries(muscle.series_elastic))
+        tension.append(_read_tension(f'{place}.tension', muscle.tension, tension_default, fail))
+        own = muscle.stiffness
+        stiffness.append(content.stiffness if own is UNSET else own)
+    order = [link.get('name', '') for link in tree.iter('link')]
     return RobotDescription(
         directory=directory,
         urdf=urdf,
         model=model,
-        joints=joints,
-        muscles=top['muscles'].unique(names),
+        joints=content.joints,
+        muscles=tuple(muscle.name for muscle in content.muscles),
         routes=tuple(routes),
-        series_elastic=SeriesElastic(**_columns(elastic, default)),
-        stiffness=_columns(module, 'K')['K'],
-        tension=TensionRange(**_columns(module, TENSION_DEFAULT)),
-        end_effectors=_read_end_effectors(top, model, joints, couplings, order),
+        series_elastic=SeriesElastic(**_columns(elastic)),
+        stiffness=np.array(stiffness),
+        tension=TensionRange(**_columns(tension)),
+        end_effectors=_read_end_effectors(content, model, couplings, order, fail),
         couplings=couplings,
         warnings=tuple(warnings),
     )
 
 
-def _columns(rows: list[dict[str, float]], keys: Iterable[str]) -> dict[str, Array]:
-    return {key: np.array([row[key] for row in rows]) for key in keys}
+def _with_muscle_name(problem: str, document: Any) -> str:
+    """Return a problem with the name of the muscle behind the index, where it has both."""
+    match = re.match(r'\$\.muscles\[(\d+)\]', problem)
+    muscle = document['muscles'][int(match[1])] if match else None
+    name = muscle.get('name') if isinstance(muscle, dict) else None
+    return f'muscle {name!r}: {problem}' if isinstance(name, str) else problem
 
 
-def _read_joints(entry: Entry, model: pin.Model) -> tuple[str, ...]:
-    names = [item.name() for item in entry.items(1, 'names')]
-    for name in entry.unique(names):
-        joint = _one_axis_joint(entry, name, model)
+def _entries(entry: Strict | None) -> dict[str, float]:
+    """Return what an entry of the file sets; keys that were left out are left out."""
+    entries: dict[str, float] = {} if entry is None else to_builtins(entry)
+    return entries
+
+
+def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+
+def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None:
+    """Refuse joints that cannot be in θ."""
+    for i, name in enumerate(joints):
+        if problem := _joint_problem(name, model):
+            raise fail(f'$.joints[{i}]: {problem}')
         limits = model.lowerPositionLimit, model.upperPositionLimit
-        lower, upper = (limit[joint.idx_q] for limit in limits)
+        index = model.joints[model.getJointId(name)].idx_q
+        lower, upper = (limit[index] for limit in limits)
         if not -math.inf < lower < upper < math.inf:
-            told = f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf'
-            raise entry.fail(f'{told}; expected finite lower < upper')
-    return tuple(names)
+            found = f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf'
+            raise fail(f'$.joints[{i}]: {found}; expected finite lower < upper')
 
 
-def _one_axis_joint(entry: Entry, name: str, model: pin.Model) -> pin.JointModel:
-    if name not in list(model.names)[1:]:
-        legal = ', '.join(list(model.names)[1:])
-        raise entry.fail(f'unknown joint {name!r}; movable joints of robot.urdf: {legal}')
+def _joint_problem(name: str, model: pin.Model) -> str:
+    """Return why a joint can neither be in θ nor follow one that is, or '' if it can."""
+    movable = list(model.names)[1:]
+    if name not in movable:
+        return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'
     joint = model.joints[model.getJointId(name)]
-    if joint.shortname() not in kinematics.REVOLUTE + kinematics.PRISMATIC:
-        kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
-        raise entry.fail(
-            f'joint {name!r} is {kind}; legal: revolute or prismatic joints '
-            'with one degree of freedom and limits (continuous has none)'
-        )
-    return joint
+    if joint.shortname() in kinematics.REVOLUTE + kinematics.PRISMATIC:
+        return ''
+    kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
+    legal = 'revolute or prismatic joints with one degree of freedom and limits'
+    return f'joint {name!r} is {kind}; legal: {legal} (continuous has none)'
 
 
 def _read_couplings(
-    top: Entry, mimics: dict[str, Coupling], joints: tuple[str, ...], model: pin.Model
+    content: MuscleFile, mimics: dict[str, Coupling], model: pin.Model, urdf: Path, fail: Fail
 ) -> dict[str, Coupling]:
     """Return what each coupled joint follows, a joint that follows none itself."""
-    entry, links, names = top.get('couplings', []), dict(mimics), list[str]()
-    for item in entry.items(0, 'couplings'):
-        given = item.mapping('joint', 'master', 'ratio', 'offset')
-        names.append(given['joint'].name())
-        ratio, offset = given.get('ratio', 1.0).number(), given.get('offset', 0.0).number()
-        links[names[-1]] = Coupling(given['master'].name(), ratio, offset)
-    entry.unique(names)
-    for slave in links:
-        if slave in joints:
-            source = 'couplings' if slave in names else 'its <mimic> in robot.urdf'
-            raise entry.fail(
-                f'joint {slave!r} follows {links[slave].master!r} by {source}; '
+    listed = {c.joint: Coupling(c.master, c.ratio, c.offset) for c in content.couplings}
+    links = mimics | listed
+    for slave, coupling in links.items():
+        if slave in content.joints:
+            source = 'couplings' if slave in listed else 'its <mimic> in robot.urdf'
+            raise fail(
+                f'$.joints: joint {slave!r} follows {coupling.master!r} by {source}; '
                 'list only joints that follow none under joints'
             )
+
+    def refused(slave: str, problem: str) -> RobotDescriptionError:
+        if slave in listed:
+            return fail(f'$.couplings: {problem}')
+        return RobotDescriptionError(f'{urdf}: joint {slave!r}: mimic: {problem}')
+
     try:
         couplings = resolved(links)
     except ValueError as error:
-        raise entry.fail(str(error)) from error
+        raise refused(next(iter(listed or mimics)), str(error)) from error
     for slave, coupling in list(couplings.items()):
-        elsewhere = slave not in names and coupling.master not in joints
-        try:
-            for name in (slave, coupling.master):
-                _one_axis_joint(entry, name, model)
-        except RobotDescriptionError:
-            if not (elsewhere and model.existJointName(coupling.master)):
-                raise
-            del couplings[slave]  # of wheels that the URDF has elsewhere: held as well
+        problem = _joint_problem(slave, model) or _joint_problem(coupling.master, model)
+        if not problem:
+            continue
+        is_elsewhere = coupling.master not in content.joints and model.existJointName(
+            coupling.master
+        )
+        if slave in listed or not is_elsewhere:
+            raise refused(slave, problem)
+        del couplings[slave]  # such as wheels; like all joints that are not listed it is held fixed
     return couplings
 
 
-def _read_elastic(entry: Entry, default: dict[str, float]) -> dict[str, float]:
-    if entry.value is None:
-        return default
-    given = entry.mapping(*default)
-    force, rate, stretch = (given.get(key, value) for key, value in default.items())
-    return {
-        'force': force.number(above=0.0),
-        'rate': rate.number(above=0.0),
-        'wire_stretch': stretch.number(least=0.0),
-    }
+def _read_tension(
+    place: str, entry: TensionEntry, default: dict[str, float], fail: Fail
+) -> dict[str, float]:
+    tension = default | _entries(entry)
+    bias, limit, most = (tension[key] for key in ('bias', 'limit', 'max'))
+    if not bias < limit <= most:
+        raise fail(f'{place}: expected bias < limit <= max, got {bias:g}, {limit:g}, {most:g}')
+    return tension
 
 
-def _read_route(entry: Entry, links: list[str], warnings: list[str]) -> Route:
+def _read_route(
+    place: str, muscle: MuscleEntry, links: list[str], fail: Fail, warnings: list[str]
+) -> Route:
+    """Return the route of a muscle, without points that repeat the one before."""
     route: list[RoutePoint | Wrap] = []
-    for item in entry.items(2, 'points'):
-        if isinstance(item.value, dict) and 'wrap' in item.value:
-            route.append(_read_wrap(item, links))
-            if len(route) < 2 or isinstance(route[-2], Wrap):
-                raise item.fail('a wrap stands between two points')
+    for i, entry in enumerate(muscle.route):
+        _check_link(f'{place}[{i}].link', entry.link, links, fail)
+        if entry.wrap is not None:
+            route.append(_read_wrap(entry))
             continue
-        given = item.mapping('link', 'xyz')
-        point = RoutePoint(_read_link(given['link'], links), _read_vector(given['xyz']))
+        point = RoutePoint(entry.link, np.array(entry.xyz))
         last = route[-1] if route and isinstance(route[-1], RoutePoint) else None
         if last and last.link == point.link and np.array_equal(last.xyz, point.xyz):
-            warnings.append(f'{item.where} is the same point as the one before it, and left out')
+            warnings.append(
+                f'muscle {muscle.name!r}: route[{i}] is the same point as the one before it, '
+                'and left out'
+            )
             continue
         route.append(point)
-    if isinstance(route[-1], Wrap):
-        raise entry.fail('a wrap stands between two points')
     if len(route) < 2:
-        raise entry.fail(f'expected at least 2 different points, {len(route)} given')
+        raise fail(f'{place}: expected at least 2 different points, got {len(route)}')
     return tuple(route)
 
 
-def _read_wrap(item: Entry, links: list[str]) -> Wrap:
-    kinds = {'sphere': (), 'cylinder': ('axis',)}
-    if (kind := item['wrap'].name()) not in kinds:
-        raise item['wrap'].fail(f'expected {" or ".join(kinds)}, got {kind!r}')
-    given = item.mapping('wrap', 'link', 'xyz', *kinds[kind], 'radius', 'side')
-    axis = side = None
-    if kind == 'cylinder':
-        axis = _read_vector(given['axis'])
-        if (size := float(np.linalg.norm(axis))) < 1e-6:
-            raise given['axis'].fail(f'expected a direction, got {axis.tolist()}')
-        axis = axis / size
-    xyz = _read_vector(given['xyz'])
-    if given.get('side').value is not None:
-        side = _read_vector(given['side'])
-    radius = given['radius'].number(above=0.0)
-    if axis is not None and side is not None:
-        out = side - xyz
-        if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-            raise given['side'].fail('expected a point beside the axis, got one on it')
-    return Wrap(_read_link(given['link'], links), xyz, radius, axis, side)
+def _read_wrap(entry: RouteEntry) -> Wrap:
+    axis = None if entry.axis is None else np.array(entry.axis)
+    side = None if entry.side is None else np.array(entry.side)
+    if axis is not None:
+        axis = axis / float(np.linalg.norm(axis))
+    assert entry.radius is not None  # the format requires it of wraps
+    return Wrap(entry.link, np.array(entry.xyz), entry.radius, axis, side)
 
 
-def _read_vector(entry: Entry) -> Array:
-    xyz = entry.items(3, 'numbers')
-    if len(xyz) != 3:
-        raise entry.fail(f'expected 3 numbers, got {len(xyz)}')
-    return np.array([coordinate.number() for coordinate in xyz])
-
-
-def _read_link(entry: Entry, links: list[str]) -> str:
-    name = entry.name()
+def _check_link(place: str, name: str, links: Iterable[str], fail: Fail) -> None:
     if name not in links:
-        raise entry.fail(f'unknown link {name!r}; links of robot.urdf: {", ".join(links)}')
-    return name
-
-
-def _read_tension(entry: Entry, default: dict[str, float]) -> dict[str, float]:
-    given = entry.mapping(*default)
-    bias, limit, most = (given.get(key, default[key]).number(above=0.0) for key in default)
-    if not bias < limit <= most:
-        raise entry.fail(f'expected bias < limit <= max, got {bias:g}, {limit:g}, {most:g}')
-    return {'bias': bias, 'limit': limit, 'max': most}
+        raise fail(f'{place}: unknown link {name!r}; links of robot.urdf: {", ".join(links)}')
 
 
 def _read_end_effectors(
-    top: Entry, model: pin.Model, joints: Iterable[str], couplings: Iterable[str], order: list[str]
+    content: MuscleFile,
+    model: pin.Model,
+    couplings: Iterable[str],
+    order: list[str],
+    fail: Fail,
 ) -> tuple[str, ...]:
-    one, several = top.get('end_effector'), top.get('end_effectors')
-    moved, links = _joints_above(model, {*joints, *couplings}), _joints_above(model, {*joints})
-    if one.value is not None and several.value is not None:
-        raise several.fail('expected end_effector or end_effectors, both are given')
-
-    def read(item: Entry) -> str:
-        name = _read_link(item, list(links))
+    """Return the links that the file names or, if it names none, the last link of the chain."""
+    links = _joints_above(model, {*content.joints})
+    moved = _joints_above(model, {*content.joints, *couplings})
+    places = {f'$.end_effectors[{i}]': n for i, n in enumerate(content.end_effectors or ())}
+    if content.end_effector is not None:
+        places = {'$.end_effector': content.end_effector}
+    for place, name in places.items():
+        _check_link(place, name, links, fail)
         if not moved[name]:
             legal = ', '.join(link for link in links if moved[link])
-            raise item.fail(f'expected a link that the joints move, {legal}; got {name!r}')
-        return name
-
-    if one.value is not None:
-        return (read(one),)
-    if several.value is not None:
-        return several.unique([read(item) for item in several.items(1, 'links')])
-    # The last link of the chain: of several that so many joints move the tip of what is fixed to
-    # them, then the one listed last, as the file has them.
+            raise fail(f'{place}: expected a link that the joints move, {legal}; got {name!r}')
+    if places:
+        return tuple(places.values())
+    # Of several links that so many joints move: the tip of what is fixed to them, then the one
+    # listed last, in the order of the file.
     tips, last = _fixed_above(model), {link: i for i, link in enumerate(order)}
     return (max(links, key=lambda link: (links[link], tips[link], last[link])),)
 

@@ -18,9 +18,8 @@ from tqdm import tqdm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.robot import checks
-from musculoskeletal_ae.robot.description import RoutePoint, written
+from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
-from musculoskeletal_ae.robot.entries import refusal
 from musculoskeletal_ae.robot.robot import Robot
 
 FORGIVEN = 0.02  # of the postures; the check, which draws others, tolerates 0.05

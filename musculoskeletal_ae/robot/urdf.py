@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading robot.urdf by pinocchio, after a check of every number in it.
 
-The check is ours because the URDF parser only warns about a mass or an inertia that is no number
-or missing, drops the whole inertial element and goes on with a link that weighs nothing.
+The check is ours because the URDF parser drops in silence what it does not understand. It only
+warns about a mass or an inertia that is no number or missing, and goes on with a link without mass.
+Of a xacro that was not expanded it ignores the macros and reads the rest.
 """
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -19,6 +21,8 @@ from musculoskeletal_ae.robot.kinematics import Coupling
 # A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
 # MuJoCo's and pinocchio's parser goes down 500 levels.
 MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
+#: elements of a robot that only a preprocessor understands, beside those with xacro's namespace
+PREPROCESSED = 'include', 'macro', 'property'
 LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
@@ -46,6 +50,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         RobotDescriptionError: Naming the file, the link or joint, and what is expected.
     """
     root = parse_xml(file, text)
+    _check_expanded(file, root)
     parts = [part for part in root if part.tag in ('link', 'joint')]
     if len(parts) > MOST_PARTS:
         raise RobotDescriptionError(f'{file}: more than {MOST_PARTS} links and joints')
@@ -59,6 +64,8 @@ def read_urdf(file: Path, text: str) -> pin.Model:
             _check(where, element)
     if parts:
         _check_tree(file, parts)
+        if _limit_mimics(parts):
+            text = ET.tostring(root, encoding='unicode')
     try:
         return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
@@ -99,6 +106,49 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
     return mimics
 
 
+def _check_expanded(file: Path, root: ET.Element) -> None:
+    """Refuse what only a preprocessor understands: the URDF parser ignores it without a warning."""
+    for problem in _preprocessor_parts(root):
+        remedy = 'expand it first, by xacro FILE > robot.urdf'
+        raise RobotDescriptionError(f'{file}: it is a xacro, not a URDF ({problem}): {remedy}')
+
+
+def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
+    """Yield descriptions of elements and attributes that a preprocessor has to replace."""
+    for element in root.iter():
+        namespace, _, name = element.tag.rpartition('}')
+        if 'xacro' in namespace or 'XInclude' in namespace:
+            yield f'element {name!r} of {namespace.strip("{")}'
+    for part in root:
+        if part.tag in PREPROCESSED:
+            yield f'element {part.tag!r}'
+        if part.tag in ('link', 'joint'):
+            for element in part.iter():
+                for attribute, value in element.items():
+                    if '${' in value or '$(' in value:
+                        yield f'{element.tag} {attribute} {value!r:.100}'
+
+
+def _limit_mimics(parts: list[ET.Element]) -> bool:
+    """Make continuous joints that follow others revolute; return whether there are any.
+
+    A joint that follows another needs no limits of its own, and pinocchio describes a continuous
+    joint by two coordinates, which cannot follow one.
+    """
+    followers = [
+        part
+        for part in parts
+        if part.get('type') == 'continuous' and part.find('mimic') is not None
+    ]
+    for joint in followers:
+        joint.set('type', 'revolute')
+        for limit in joint.findall('limit'):
+            joint.remove(limit)
+        span = {'lower': f'{-LARGEST:g}', 'upper': f'{LARGEST:g}'}
+        ET.SubElement(joint, 'limit', span, effort='0', velocity='0')
+    return bool(followers)
+
+
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Refuse what is no tree; the parser says why on stderr only, and takes a link's last joint."""
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
@@ -113,13 +163,13 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
             for end in ('parent', 'child'):
                 link = '' if (found := part.find(end)) is None else found.get('link', '')
                 if link not in links or (end == 'child' and link in held):
-                    told = f'{link!r} has a joint above it already' if link in held else repr(link)
+                    got = f'{link!r} has a joint above it already' if link in held else repr(link)
                     expected = 'expected a link of this file, each below one joint'
-                    raise RobotDescriptionError(f'{where}: {end}: {expected}, got {told}')
+                    raise RobotDescriptionError(f'{where}: {end}: {expected}, got {got}')
             held.add(link)
     if len(roots := sorted(map(str, links - held))) != 1:
-        told = ', '.join(roots) or 'none'
-        raise RobotDescriptionError(f'{file}: expected one link that is below no joint, got {told}')
+        got = ', '.join(roots) or 'none'
+        raise RobotDescriptionError(f'{file}: expected one link that is below no joint, got {got}')
 
 
 def _check_joint(where: str, joint: ET.Element) -> None:
@@ -129,10 +179,10 @@ def _check_joint(where: str, joint: ET.Element) -> None:
         raise RobotDescriptionError(f'{where}: type: expected one of {legal}, got {kind!r}')
     if kind in ONE_AXIS and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
         raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
-    given = set() if limit is None else set(limit.keys())
-    if kind in LIMITED and (lacking := {'effort', 'velocity'} - given):
-        told = f'{", ".join(sorted(lacking))}, which a {kind} joint needs'
-        raise RobotDescriptionError(f'{where}: limit: expected {told}')
+    present = set() if limit is None else set(limit.keys())
+    if kind in LIMITED and (missing := {'effort', 'velocity'} - present):
+        expected = f'{", ".join(sorted(missing))}, which a {kind} joint needs'
+        raise RobotDescriptionError(f'{where}: limit: expected {expected}')
 
 
 def _check(part: str, element: ET.Element) -> None:
@@ -152,18 +202,19 @@ def _check(part: str, element: ET.Element) -> None:
         if right and element.tag == 'mass':
             expected, right = 'a mass >= 0 kg', values[0] >= 0.0
         if not right:
-            told = f'expected {expected}, got {text!r}'
-            raise RobotDescriptionError(f'{part}: {element.tag} {attribute}: {told}')
+            problem = f'expected {expected}, got {text!r}'
+            raise RobotDescriptionError(f'{part}: {element.tag} {attribute}: {problem}')
     if element.tag == 'inertial':
         for tag in ('mass', 'inertia'):
-            given = set() if (found := element.find(tag)) is None else set(found.keys())
-            if lacking := NUMBERS[tag].keys() - given:
-                told = f'{", ".join(sorted(lacking))}; links without mass have no <inertial>'
-                raise RobotDescriptionError(f'{part}: {tag}: expected {told}')
+            found = element.find(tag)
+            present = set() if found is None else set(found.keys())
+            if missing := NUMBERS[tag].keys() - present:
+                expected = f'{", ".join(sorted(missing))}; links without mass have no <inertial>'
+                raise RobotDescriptionError(f'{part}: {tag}: expected {expected}')
     if element.tag == 'inertia':
         names = [['ixx', 'ixy', 'ixz'], ['ixy', 'iyy', 'iyz'], ['ixz', 'iyz', 'izz']]
         inertia = [[float(element.get(name, 0.0)) for name in row] for row in names]
         least, *_, most = np.linalg.eigvalsh(inertia)
         if least < -1e-9 * max(most, 1e-9):
-            told = f'expected principal moments >= 0, got {least:g} kg·m²'
-            raise RobotDescriptionError(f'{part}: inertia: {told}')
+            problem = f'expected principal moments >= 0, got {least:g} kg·m²'
+            raise RobotDescriptionError(f'{part}: inertia: {problem}')

@@ -21,9 +21,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 

@@ -32,7 +32,7 @@ from musculoskeletal_ae.signals.limits import (
     Persistence,
     longest_lengths,
 )
-from musculoskeletal_ae.validity import QUANTITIES, read_array
+from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states
 
 
 class RejectionError(MessageError):
@@ -211,7 +211,7 @@ class MuscleStream:
         """
         muscle_count = self._robot.muscle_count
         try:
-            states = read_array(message, len(QUANTITIES), muscle_count, self.body.isolated)
+            states = read_muscle_states(message, muscle_count, self.body.isolated)
         except MessageError as error:
             raw = None
             if len(message.data) == len(QUANTITIES) * muscle_count:

@@ -23,9 +23,9 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.mae.mae import Mae

@@ -18,9 +18,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.compiler import njit
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 

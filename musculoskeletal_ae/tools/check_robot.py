@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 REACH = 0.02  # [m]
 
@@ -33,4 +33,4 @@ def main(argv: list[str] | None = None) -> int:
     if args.reach and not args.suggest:
         parser.error('--reach goes with --suggest')
     args.reach = args.reach or REACH
-    return exit_status(lambda: load('musculoskeletal_ae.tools.robot_report').check(args))
+    return exit_status(lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args))

@@ -2,13 +2,12 @@
 """`experiment`: the paper's experiments on emulated arms, with numbers, plots and a report."""
 
 import os
-import signal
 from argparse import ArgumentTypeError
 from pathlib import Path
 
 from musculoskeletal_ae.experiments import NAMES
 from musculoskeletal_ae.options import Parser, exit_status, whole
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 # In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
@@ -39,9 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
-    # Ended by whoever started it, it clears up as on Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return exit_status(lambda: load('musculoskeletal_ae.experiments.results').measure(args))
+    return exit_status(lambda: import_heavy('musculoskeletal_ae.experiments.results').measure(args))
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, names
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -12,17 +12,17 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         'import_robot',
         'Makes a robot directory out of a MuJoCo model (MJCF), a cardsflow.xml beside its '
-        'model.urdf or model.sdf, an OpenSim model (.osim, version 4) or a URDF (a skeleton to '
-        'fill in). Says what it chose, dropped, renamed or approximated, and how far lengths are '
-        "from the source's own. Exit status 0: the directory loads.",
+        'model.urdf or model.sdf, or a URDF (a skeleton to fill in). Says what it chose, dropped, '
+        "renamed or approximated, and how far lengths are from the source's own. An OpenSim model "
+        'becomes MJCF by MyoConverter. Exit status 0: the directory loads.',
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')
     for kind in ('joints', 'muscles'):
-        told = f'{kind} to keep'
-        parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=told)
+        text = f'{kind} to keep'
+        parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=text)
     parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-    told = 'end effector; joints beside the way to it are held'
-    parser.add_argument('--end', metavar='LINK', help=told)
+    text = 'end effector; joints beside the way to it are held'
+    parser.add_argument('--end', metavar='LINK', help=text)
     args = parser.parse_args(argv)
-    return exit_status(lambda: load('musculoskeletal_ae.importing.convert').run(args))
+    return exit_status(lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args))

@@ -122,7 +122,7 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
 
     `namespace` is the arm's own where the bag has several.
     """
-    bag = Bag.open(path, unfinished=True)
+    bag = Bag.open(path)
     for reason in bag.unfinished:
         print(f'warning: {path}: unfinished: {reason}', file=sys.stderr)
     streams = read_streams(bag, robot, namespace)

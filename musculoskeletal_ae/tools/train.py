@@ -5,7 +5,7 @@ from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.presets import DEVICES
-from musculoskeletal_ae.start import load
+from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -48,4 +48,6 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f'--plot {args.plot} would replace the checkpoint: name another file')
     if args.from_bag and args.plot:
         parser.error('--plot shows the initial training: not with --from-bag')
-    return exit_status(lambda: load('musculoskeletal_ae.tools.initial_training').train(args))
+    return exit_status(
+        lambda: import_heavy('musculoskeletal_ae.tools.initial_training').train(args)
+    )

@@ -7,7 +7,6 @@ What a visitor asks for goes to `act`, called in viser's threads with a name and
     position s · or the name of a service
 """
 
-import asyncio
 import contextlib
 import io
 import logging
@@ -15,17 +14,14 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import trimesh
 import viser
 from jinja2 import Environment, FileSystemLoader
 from scipy.spatial.transform import Rotation
-from viser._messages import GuiUpdateMessage
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -33,6 +29,7 @@ from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, Kind
+from musculoskeletal_ae.view.visits import checked_visits
 
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 HISTORY = 60.0  # [s] that curves show
@@ -43,7 +40,6 @@ CURVES: dict[str, tuple[list[Any], list[int]]] = {  # lines, and columns of what
     'A': ([BLUE], [2]),
     'd (dashed: what is an anomaly)': ([DASHED, BLUE], [4, 3]),
 }
-LOCAL = ('localhost', '127.0.0.1', '::1')
 PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
 MOST_PAYLOAD = 5.0  # [kg]
 HOT = 80.0  # [°C] at the right end of a bar
@@ -58,7 +54,7 @@ class Page:
         self, robot: Robot, host: str, port: int, read_only: bool, act: Callable[..., None]
     ) -> None:
         """Serve the page on a free port; without `read_only`, `act` hears what visitors ask for."""
-        self._robot, self._act, self._host = robot, act, host
+        self._robot, self._act = robot, act
         self._visitors: set[int] = set()
         self.looked_at = threading.Event()
         # A browser opens connections that it never uses; no traceback of each.
@@ -69,19 +65,14 @@ class Page:
         except (OSError, UnicodeError) as error:
             told = f'no page at port {port} of {host}: {getattr(error, "strerror", error)}'
             raise MusculoskeletalError(f'{told}; choose another --port or --host') from error
-        with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
+        # viser announces itself.
+        with contextlib.redirect_stdout(io.StringIO()), checked_visits(host):
             server = self._server = viser.ViserServer(host, port, verbose=False)
         if server.get_port() != port:  # somebody was faster
             server.stop()
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
         # A tunnel to the world is nothing that a visitor may ask for.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        sockets = server._websock_server
-        sockets.on_client_connect(self._check_origin)
-        handlers = sockets._incoming_handlers[GuiUpdateMessage]
-        handlers[:] = [partial(_take_value, handler) for handler in handlers]
-        for early in [*sockets._live_connections.values()]:  # a browser comes again by itself
-            asyncio.run_coroutine_threadsafe(early.close(), server.get_event_loop())
         server.on_client_connect(lambda client: self._count(client.client_id, True))
         server.on_client_disconnect(lambda client: self._count(client.client_id, False))
         self._curves: deque[list[float]] = deque()
@@ -94,23 +85,6 @@ class Page:
         if not read_only:
             self._build_controls()
         self.offer(())
-
-    async def _check_origin(self, connection: Any) -> None:
-        """Turn away pages of other sites, which a browser lets connect to localhost."""
-        sockets, visitor = self._server._websock_server, connection.client_id
-        opened = sockets._live_connections[visitor]
-        asked, origin = (opened.request.headers.get(key, '') for key in ('Host', 'Origin'))
-        try:
-            came = urlsplit(origin)
-        except ValueError:
-            came = urlsplit('')
-        foreign = self._host in LOCAL and came.hostname not in LOCAL
-        if origin and (came.netloc != asked or foreign):
-            # viser forgets only whom it let in.
-            del sockets._live_connections[visitor]
-            sockets._client_state_from_id.pop(visitor).message_buffer.set_done()
-            await opened.close(1008, 'another site')
-            raise ConnectionError(f'a page of {origin} was turned away')
 
     def _count(self, visitor: int, here: bool) -> None:
         (self._visitors.add if here else self._visitors.discard)(visitor)
@@ -369,9 +343,3 @@ class Page:
         self._force.points = ends[None].astype(np.float32)
         size = float(np.linalg.norm(force))
         return force * min(1.0, MOST_PUSH / max(size, 1e-9)) * self._pushing
-
-
-async def _take_value(handler: Callable[..., Any], visitor: int, message: Any) -> None:
-    """Let a browser change the value of a control, and none of the control's own attributes."""
-    if message.updates.keys() <= {'value'}:
-        await handler(visitor, message)

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from bench import bag_samples as samples
-from bench.bag_samples import encode, message_class
+from bags import bag_samples as samples
+from bags.bag_samples import encode, message_class
 
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 JOINTS = 'sensor_msgs/msg/JointState'

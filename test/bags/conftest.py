@@ -11,7 +11,7 @@ import pytest
 from graph import DEADLINE
 from nodes.conftest import graph
 
-from bench import bag_samples as samples
+from bags import bag_samples as samples
 
 __all__ = ['graph']
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import bag_samples as samples
+from bags import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import (
     SENT,

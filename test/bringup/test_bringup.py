@@ -13,6 +13,7 @@ import bodies
 import numpy as np
 import pytest
 from graph import DEADLINE, Graph, Process
+from rcl_interfaces.srv import GetParameters
 from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8MultiArray
@@ -76,29 +77,30 @@ def ports_in_shared_memory(run):
     return [name for name in names if re.match(r'dds\.shm\.\d', name)]
 
 
+def read_until(run, text):
+    """Return what a bring-up prints up to and including a line with this text."""
+    lines = []
+    for line in run.lines():
+        lines.append(line)
+        if text in line:
+            return ''.join(lines)
+    raise AssertionError(f'it never printed {text!r}: {"".join(lines)}')
+
+
 def statuses(output):
     return [match for line in output.splitlines() if (match := STATUS.match(line))]
 
 
 def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(environment, tmp_path):
     robot = write_robot(tmp_path / '.other')
-    with (robot / 'recording.bin').open('wb') as file:
-        file.truncate(2**42)  # to read it would take an hour
     # The paper's network is trained in a few seconds.
     chosen = ['--robot', str(robot), '--preset', 'paper', '--seed', '3']
     run = bringup(environment, *chosen)
-    told = []
-    for line in iter(run.process.stdout.readline, ''):
-        told.append(line)
-        if 'starting estimator' in line:
-            break
-    assert 'training the MAE' in ''.join(told), told
+    assert 'training the MAE' in read_until(run, 'starting estimator')
     run.end(signal.SIGINT)
     assert left_behind(run) == ''
-    # Only the description of a robot says which network it needs.
-    (robot / 'README.md').write_text('an arm')
     run = bringup(environment, *chosen, '--duration', '5')
-    output, _ = run.process.communicate(timeout=600)
+    _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     lines = statuses(output)
     assert lines, output  # on a busy machine the sensors are heard late
@@ -169,7 +171,7 @@ def test_a_cut_muscle_is_detected_and_a_dead_node_named(environment):
         graph.close()
     victim = next(line for line in running(run).splitlines() if '/estimator ' in line)
     os.kill(int(victim.split()[0]), signal.SIGKILL)
-    output, _ = run.process.communicate(timeout=DEADLINE)
+    _, output = run.ended()
     assert run.process.returncode == 1
     assert 'ANOMALY: brachialis' in output
     assert '(to go on: mend it, estimator/reset' in output
@@ -181,30 +183,24 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     recording = tmp_path / 'run'
     options = ['--no-controller', '--no-learner', '--duration', '5', '--record', str(recording)]
     live = bringup(environment, '--robot', 'arm26', *options)
-    output, _ = live.process.communicate(timeout=600)
+    _, output = live.ended()
     assert live.process.returncode == 0, output
     assert 'starting hardware_emulator' in output and 'starting controller' not in output
     played = bringup(environment, '--robot', 'arm26', '--bag', str(recording))
-    output, _ = played.process.communicate(timeout=600)
+    _, output = played.ended()
     assert played.process.returncode == 0, output
     assert len(statuses(output)) >= 3, output
     assert 'hardware_emulator' not in output and 'controller' not in output
     assert left_behind(live) == left_behind(played) == ''
 
 
-def test_that_a_reality_is_another_robot_is_told_where_it_was_started(environment, tmp_path):
+def test_a_reality_that_is_another_robot_is_reported_on_the_terminal(environment, tmp_path):
     file = tmp_path / 'own.xml'
     file.write_text(bodies.MJCF, encoding='utf-8')
     import_robot(file, tmp_path / 'own')
     file.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
     run = bringup(environment, '--robot', str(tmp_path / 'own'), '--reality', str(file))
-    told = []
-    for line in iter(run.process.stdout.readline, ''):
-        told.append(line)
-        if line.startswith(f"-- reality {file}: joint 'elbow' moves from -1.5 to 0.2 there"):
-            break
-    else:
-        raise AssertionError(''.join(told))
+    read_until(run, f"-- reality {file}: joint 'elbow' moves from -1.5 to 0.2 there")
     run.end(signal.SIGINT)
     assert left_behind(run) == ''
 
@@ -213,40 +209,68 @@ def test_that_a_reality_is_another_robot_is_told_where_it_was_started(environmen
     ('arguments', 'expected'),
     [
         (['--robot', 'no_such_robot'], 'musashi_left_arm'),
-        (['--robot', 'testbed'], 'arm26'),
         (['--duration', 'soon'], 'soon'),
-        (['--view', '--port', '65536'], '65536'),
-        (['--read-only'], 'go with --view'),
-        (['--hardware', '--reality', 'foreign'], 'of the emulator'),
-        (['--explore', '--no-controller'], 'moves the arm'),
-        (['--joint-source', 'none', '--no-learner'], 'for the learner'),
-        (['--seed', '-1'], '-1'),
-        (['--preset', 'best'], 'default or paper'),
-        (['--reality', 'dream'], 'kin, foreign or an MJCF file'),
-        (['--namespace', '1st'], '1st'),
-        (['--checkpoint', '/no/such/file'], '/no/such/file'),
-        (['--fly'], '--robot'),
-        (['--robot'], 'needs a value'),
+        (['--read-only'], 'goes with --view'),
+        (['--explore', '--no-controller'], 'exclude each other'),
+        (['-p', 'arm:rate:=50.0'], 'hardware_emulator'),
+        (['--fly'], '--help'),
+        (['--robot'], 'requires an argument'),
     ],
 )
 def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments, expected):
     run = bringup(environment, *arguments)
-    output, _ = run.process.communicate(timeout=DEADLINE)
+    _, output = run.ended()
     assert run.process.returncode == 2
     assert expected in output
 
 
-def test_it_finds_itself_and_robots_whatever_cd_would_print(environment):
-    command = [f'{REPOSITORY.name}/bringup.sh', '--robot', 'no_such_robot']
-    done = subprocess.run(
-        command,
-        cwd=REPOSITORY.parent,
-        env={**environment, 'CDPATH': '.'},
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE,
-    )
-    assert done.returncode == 2 and 'musashi_left_arm' in done.stderr and 'cd:' not in done.stderr
+def test_a_wrong_value_ends_it_with_what_the_node_says_of_it(environment):
+    run = bringup(environment, '--robot', 'arm26', '--reality', 'dream')
+    _, output = run.ended()
+    assert run.process.returncode == 1
+    assert 'hardware_emulator ended with status' in output and "'dream'" in output
+    assert left_behind(run) == ''
+
+
+@pytest.mark.parametrize(('arguments', 'expected'), [([], 'LOCALHOST'), (['--network'], 'SUBNET')])
+def test_an_emulated_arm_stays_on_this_machine_unless_asked_otherwise(
+    environment, arguments, expected
+):
+    # A sourced Jazzy exports SUBNET.
+    environment = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
+    run = bringup(environment, '--robot', 'arm26', *arguments)
+    read_until(run, 'starting controller')
+    nodes = [line.split()[0] for line in running(run).splitlines() if '--ros-args' in line]
+    variables = [Path(f'/proc/{pid}/environ').read_text().split('\0') for pid in nodes]
+    assert len(nodes) > 3
+    assert all(f'ROS_AUTOMATIC_DISCOVERY_RANGE={expected}' in each for each in variables)
+    run.end(signal.SIGKILL)
+    assert left_behind(run) == ''
+
+
+def test_parameters_of_a_file_and_of_the_command_line_win(environment, tmp_path):
+    file = tmp_path / 'my.yaml'
+    # An option of bringup.sh sets max_age too.
+    file.write_text('/**: {ros__parameters: {max_age: 3.0, hold_time: 3.0}}')
+    options = ['--params-file', str(file), '-p', 'controller:hold_time:=4.0']
+    run = bringup(environment, '--robot', 'arm26', '--namespace', 'chosen', *options)
+    graph = Graph('/chosen')
+    graph.processes.append(run)
+    try:
+        names = ['max_age', 'hold_time', 'explore']
+        request = GetParameters.Request(names=names)
+        values = graph.call(GetParameters, 'controller/get_parameters', request).values
+    finally:
+        status, output = run.end(signal.SIGINT)
+        graph.processes.clear()
+        graph.close()
+    assert [values[0].double_value, values[1].double_value, values[2].bool_value] == [
+        3.0,
+        4.0,
+        True,
+    ]
+    assert status == 130, output
+    assert left_behind(run) == ''
 
 
 def driver(namespace):
@@ -258,28 +282,19 @@ def driver(namespace):
 def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
     options = ['--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own']
     run = bringup(environment, *options)
-    lines = iter(run.process.stdout.readline, '')
-    told = []
-    for line in lines:
-        told.append(line)
-        if 'waiting for /own/muscle_states' in line:
-            break
-    assert not any('starting' in line for line in told), told
+    told = read_until(run, 'waiting for /own/muscle_states')
+    assert 'starting' not in told
     graph = Graph('/own')
     graph.processes += [run, driver('own')]
     try:
-        for line in lines:
-            told.append(line)
-            if 'starting controller' in line:
-                break
+        told += read_until(run, 'starting controller')
         explore_fast(graph, 'controller')
         learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         graph.wait(lambda: len(learned) > 2, 'two updates of the network', 8 * DEADLINE)
     finally:
         status, output = run.end(signal.SIGINT)
         graph.close()
-    told = ''.join(told) + output
-    assert 'the driver keeps its contract' in told
+    assert 'the driver keeps its contract' in told + output
     assert status == 130 and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
     assert kept.is_dir()  # for the next time
@@ -287,11 +302,9 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
 
 def test_a_namespace_that_is_in_use_is_refused_by_name(environment):
     first = bringup(environment, '--robot', 'arm26', '--hardware', '--namespace', 'taken')
-    for line in iter(first.process.stdout.readline, ''):
-        if 'logs in' in line:
-            break
+    read_until(first, 'logs in')
     second = bringup(environment, '--robot', 'arm26', '--namespace', 'taken')
-    output, _ = second.process.communicate(timeout=600)
+    _, output = second.ended()
     assert second.process.returncode == 2
     assert "'/taken' is in use" in output and '--namespace' in output
     first.end(signal.SIGINT)

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values
+from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +13,6 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.posture import REPLAN
 from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import METHODS, Settings
-from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -42,7 +41,7 @@ def shifted():
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 150)), max_size=8))
-def test_whatever_happens_lengths_are_finite_and_never_faster_than_the_rate_limit(events):
+def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_of_events(events):
     bench = Bench(first_duration=1.0, second_duration=0.5)
     bench.target(REST)
     sent = bench.step()
@@ -66,7 +65,7 @@ def test_every_method_arrives_at_its_command_and_stays_there(method):
     assert bench.report().message == 'holding'
 
 
-def test_the_first_command_pulls_as_the_muscles_do_at_that_moment():
+def test_the_first_command_demands_the_tension_that_the_muscles_have():
     bench = Bench()
     bench.tension = np.linspace(35.0, 90.0, ROBOT.muscle_count)
     bench.target(OTHER)
@@ -89,14 +88,14 @@ def test_second_runs_after_first_and_reads_the_tension_once():
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
 
 
-def test_constant_tension_is_that_of_first():
+def test_method_first_plans_with_the_constant_tension():
     bench = Bench(method='first', first_duration=1.0, constant_tension=70.0)
     bench.target(REST)
     wanted = ROBOT.muscle_lengths(REST, np.full(ROBOT.muscle_count, 70.0)) - 40.0 / ROBOT.stiffness
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted, atol=1e-9)
 
 
-def test_going_over_to_tensions_and_back_changes_no_pull_by_a_step():
+def test_changing_between_length_and_tension_commands_causes_no_step_in_tension():
     bench = Bench(first_duration=1.0)
     bench.tension = np.linspace(40.0, 80.0, ROBOT.muscle_count)
     bench.target(REST)
@@ -112,7 +111,7 @@ def test_going_over_to_tensions_and_back_changes_no_pull_by_a_step():
     np.testing.assert_allclose(pull, bench.tension, atol=most)
 
 
-def test_effort_is_exerted_by_proposed_and_said_to_be_ignored_where_it_is():
+def test_an_effort_is_exerted_by_proposed_and_reported_as_ignored_by_first():
     bench = Bench(first_duration=1.0)
     bench.target(REST)
     plain = bench.step(200)[-1].value
@@ -123,7 +122,7 @@ def test_effort_is_exerted_by_proposed_and_said_to_be_ignored_where_it_is():
     assert 'exerts no effort' in bench.report().message
 
 
-def test_a_target_beyond_the_limits_is_clamped_and_said_and_a_subset_keeps_the_others():
+def test_a_target_beyond_the_limits_is_clamped_and_joints_not_named_keep_theirs():
     bench = Bench()
     bench.target([-0.2, -0.7])
     bench.core.target({ROBOT.joints[1]: (-9.0, 0.0)})
@@ -135,7 +134,7 @@ def test_a_target_beyond_the_limits_is_clamped_and_said_and_a_subset_keeps_the_o
 
 
 @pytest.mark.parametrize('what', ['muscles', 'estimate'])
-def test_old_sensor_data_stops_it_and_reset_is_refused_while_it_lasts(what):
+def test_stale_sensor_data_stop_the_arm_and_a_reset_is_refused_while_they_are_stale(what):
     bench = Bench(max_age=0.2)
     bench.target(REST)
     bench.step(50)
@@ -152,7 +151,7 @@ def test_old_sensor_data_stops_it_and_reset_is_refused_while_it_lasts(what):
     assert not bench.core.safety.cause
 
 
-def test_an_anomaly_stops_it_even_before_the_first_command():
+def test_an_anomaly_stops_the_arm_even_before_the_first_command():
     bench = Bench()
     bench.core.anomaly(True)
     bench.target(REST)
@@ -164,7 +163,7 @@ def test_an_anomaly_stops_it_even_before_the_first_command():
 
 
 @pytest.mark.parametrize('fault', [ValueError('broken'), ZeroDivisionError(), MemoryError()])
-def test_a_fault_of_its_own_stops_it_and_it_lives_on(fault):
+def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on(fault):
     mae = ExactMae(ROBOT)
     bench = Bench(mae, first_duration=0.5)
     bench.target(REST)
@@ -180,7 +179,7 @@ def test_a_fault_of_its_own_stops_it_and_it_lives_on(fault):
     assert bench.report().message == 'holding'
 
 
-def test_a_network_that_says_nan_stops_it_and_no_nan_leaves():
+def test_a_network_that_answers_nan_stops_the_arm_and_no_command_is_nan():
     bench = Bench(first_duration=0.5)
     bench.target(REST)
     bench.step(100)
@@ -220,17 +219,17 @@ def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
     assert bench.core.posture.theta is None  # exploration is not resumed
 
 
-def test_exploration_goes_on_with_its_stream_instead_of_repeating_it():
+def test_exploration_started_again_continues_its_stream_of_postures():
     bench = Bench()
-    seen = []
+    observed = []
     for _ in range(3):
         bench.core.explore(True)
         bench.core.explore(True)  # asking twice starts nothing anew
         bench.step(5)
-        seen.append(bench.core.posture.theta)
+        observed.append(bench.core.posture.theta)
         bench.core.explore(False)
         bench.step(5)
-    assert len({tuple(theta) for theta in seen}) == 3
+    assert len({tuple(theta) for theta in observed}) == 3
 
 
 @pytest.mark.parametrize(('preset', 'sends'), [('default', True), ('paper', False)])
@@ -254,7 +253,7 @@ def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
     np.testing.assert_allclose(bench.core.posture.theta, [0.1, REST[1]])
 
 
-def test_heat_moves_the_load_to_other_muscles_and_is_said():
+def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     robot = Robot.load('musashi_left_arm')
     theta = np.array([0.2, -0.6, 0.1, -1.2, 0.0])
     core = Controller(robot, Settings(first_duration=1.0))
@@ -274,32 +273,12 @@ def test_heat_moves_the_load_to_other_muscles_and_is_said():
     limit = core.watch.limit[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
-    said = status.report(core, 12.0)
-    assert said.level == 'warn'
-    assert robot.muscles[strongest] in said.values['tension limited by heat']
+    reported = status.report(core, 12.0)
+    assert reported.level == 'warn'
+    assert robot.muscles[strongest] in reported.values['tension limited by heat']
 
 
-@pytest.mark.parametrize('target_duration', [0.0, 1.2])
-def test_a_muscle_that_warms_but_hardly_pulls_disturbs_no_rest(target_duration):
-    bench = Bench(first_duration=1.0, target_duration=target_duration)
-    bench.target(OTHER)
-    bench.theta = OTHER
-    bench.step(300)
-    core = bench.core
-    held, planned = (
-        (core.motion._resting, core.motion._motor)
-        if core.follows
-        else (core.posture.solution, core.posture.solution.tension)
-    )
-    weakest = int(np.argmin(planned))
-    bench.temperature = COLD + 45.0 * (np.arange(ROBOT.muscle_count) == weakest)
-    bench.step(100)
-    limit = core.watch.limit[weakest]
-    assert planned[weakest] + REPLAN < limit < ROBOT.tension.limit[weakest] - REPLAN
-    assert (core.motion._resting if core.follows else core.posture.solution) is held
-
-
-def test_the_correction_is_bounded_and_waits_until_the_arm_rests():
+def test_rest_feedback_is_bounded_and_begins_only_at_rest():
     bench = Bench(first_duration=1.0, feedback_gain=2.0)
     bench.target(OTHER)  # the made-up arm never moves there
     moving = bench.step(60)
@@ -312,7 +291,7 @@ def test_the_correction_is_bounded_and_waits_until_the_arm_rests():
     assert not bench.core.posture.feedback.correction.any()
 
 
-def test_a_new_network_keeps_the_correction_so_that_the_arm_does_not_sway():
+def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench = Bench(first_duration=0.5)
     bench.target(OTHER)
     before = bench.step(1500)[-1].value
@@ -322,7 +301,7 @@ def test_a_new_network_keeps_the_correction_so_that_the_arm_does_not_sway():
 
 
 @pytest.mark.parametrize('chosen', [{'method': 'stiffness'}, {'method': 'second'}])
-def test_a_push_is_not_worked_against_where_stiffness_or_the_paper_rules(chosen):
+def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
     bench.target(REST)
     still = bench.step(400)[-1].value
@@ -331,7 +310,7 @@ def test_a_push_is_not_worked_against_where_stiffness_or_the_paper_rules(chosen)
     np.testing.assert_allclose(bench.step(300)[-1].value, still, atol=1e-9)
 
 
-def test_another_desired_stiffness_is_ramped_to_and_one_that_fits_no_joint_is_refused():
+def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused():
     bench = Bench(method='stiffness', first_duration=0.5)
     bench.target(REST)
     before = bench.step(100)[-1].value
@@ -351,7 +330,7 @@ def test_another_desired_stiffness_is_ramped_to_and_one_that_fits_no_joint_is_re
     assert 'clamped' in bench.report().values[f'joint stiffness {ROBOT.joints[0]}']
 
 
-def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm():
+def test_a_hot_muscle_limited_to_the_tension_bias_does_not_stop_the_arm():
     for method in set(METHODS) - {'float'}:
         bench = Bench(method=method, first_duration=0.5)
         bench.target(REST)
@@ -363,7 +342,7 @@ def test_a_muscle_so_hot_that_it_pulls_with_the_bias_only_does_not_stop_the_arm(
         assert bench.core.watch.limit.min() == ROBOT.tension.bias[0]
 
 
-def test_a_floating_arm_follows_the_hand_takes_no_target_and_is_held_where_it_was_left():
+def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_the_arm_is():
     bench = Bench(first_duration=1.0)
     bench.target(REST)
     bench.step(150)
@@ -383,7 +362,7 @@ def test_a_floating_arm_follows_the_hand_takes_no_target_and_is_held_where_it_wa
     np.testing.assert_allclose(bench.core.posture.theta, OTHER, atol=0.06)
 
 
-def test_a_floating_arm_stops_as_any_other_and_floats_again():
+def test_a_stop_ends_gravity_compensation_and_a_reset_resumes_it():
     bench = Bench(method='float')
     bench.step(50)
     bench.core.stop('asked')
@@ -393,17 +372,7 @@ def test_a_floating_arm_stops_as_any_other_and_floats_again():
     assert bench.step(200)[-1].value.max() > bias[0]
 
 
-def test_of_a_long_trajectory_the_network_is_asked_once_only(monkeypatch):
-    bench, asked = Bench(), []
-    bench.step(5)
-    lengths = bench.mae.lengths
-    monkeypatch.setattr(bench.mae, 'lengths', lambda *at: asked.append(len(at[0])) or lengths(*at))
-    time = 0.1 * np.arange(1.0, 10_001.0)
-    bench.core.trajectory(Points(np.array([0]), time, REST[0] + 1e-4 * time[:, None], None, None))
-    assert [count for count in asked if count > 100] == [10_001]
-
-
-def test_a_reset_ends_the_wait_for_fresh_data():
+def test_a_reset_ends_a_stop_by_late_data_at_once():
     bench = Bench()
     bench.target(REST)
     bench.step(10)

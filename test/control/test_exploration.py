@@ -37,7 +37,7 @@ def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
 
 
 @pytest.mark.parametrize('to_limits', [0.0, 0.5])
-def test_every_posture_can_be_held_and_lies_within_the_joint_limits(to_limits):
+def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(to_limits):
     for step in steps(1, 90, to_limits)[1::3]:
         assert ((step.theta >= ROBOT.lower) & (step.theta <= ROBOT.upper)).all()
         assert ((step.tension >= BIAS - 1e-6) & (step.tension <= LIMIT + 1e-6)).all()
@@ -45,7 +45,7 @@ def test_every_posture_can_be_held_and_lies_within_the_joint_limits(to_limits):
         np.testing.assert_allclose(held, ROBOT.kinematics.holding_torque(step.theta), atol=1e-6)
 
 
-def test_joints_are_sent_to_their_limits_as_often_as_asked_and_pressed_there():
+def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
     asked = steps(2, 300, 0.25)[2::3]
     way = np.array([(s.theta == ROBOT.upper) * 1.0 - (s.theta == ROBOT.lower) for s in asked])
     # Fewer of those at limits can be held; there are 200 targets of single joints.
@@ -61,7 +61,7 @@ def test_joints_are_sent_to_their_limits_as_often_as_asked_and_pressed_there():
     assert not any(((s.theta == ROBOT.upper) | (s.theta == ROBOT.lower)).any() for s in never)
 
 
-def test_holdable_postures_are_held_by_their_tensions_on_another_body_too():
+def test_holdable_postures_are_held_by_their_tensions_on_an_individual_too():
     individual = Individual(ROBOT, 1)
     postures = ROBOT.random_postures(50, np.random.default_rng(0))
     for theta, tension in holdable_postures(ROBOT, postures, 5, individual.muscle_jacobian):
@@ -71,7 +71,7 @@ def test_holdable_postures_are_held_by_their_tensions_on_another_body_too():
         holding_tension(ROBOT, theta)  # the nominal body holds it as well
 
 
-def test_a_seed_gives_its_own_stream_again():
+def test_a_seed_determines_the_stream_of_exploration():
     one, again, other = (steps(seed, 9) for seed in (3, 3, 4))
     for a, b in zip(one, again):
         np.testing.assert_array_equal(a.theta, b.theta)

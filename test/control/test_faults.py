@@ -14,7 +14,7 @@ from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]
@@ -58,7 +58,7 @@ class Loop:
         try:
             data = np.concatenate(reading[1:])
             message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
-            states = read_array(message, 3, ROBOT.muscle_count)
+            states = read_muscle_states(message, ROBOT.muscle_count)
             self.controller.muscles(Muscles(*states), self.now)
             estimate = self.estimator.step(reading.tension, reading.length, self.now, self.now)
             if estimate is not None:
@@ -118,7 +118,7 @@ PROMISES = {
 
 
 @pytest.mark.parametrize('fault', PROMISES)
-def test_under_a_fault_no_command_jumps_and_once_mended_the_arm_goes_on(loop, fault):
+def test_under_each_fault_no_command_jumps_and_the_arm_goes_on_once_it_is_mended(loop, fault):
     held = loop.arm.theta
     loop.arm.faults.set([fault])
     loop.run(4.0)
@@ -136,5 +136,5 @@ def test_under_a_fault_no_command_jumps_and_once_mended_the_arm_goes_on(loop, fa
     assert np.linalg.norm(loop.arm.theta - held) < 0.35
 
 
-def test_every_kind_of_fault_has_its_promise():
+def test_every_kind_of_fault_has_a_promise():
     assert {fault.split(':')[0] for fault in PROMISES} == set(KINDS)

@@ -47,7 +47,7 @@ def step(feedback, robot, error, tension, gain=GAIN, motor=None):
     return feedback.step(error, jacobian(robot), pull, limit, gain, DT)
 
 
-def test_it_waits_until_the_arm_has_settled(robot):
+def test_feedback_waits_until_the_arm_has_settled(robot):
     feedback = RestFeedback(robot)
     error = np.full(robot.joint_count, 0.1)
     steps = 1
@@ -57,13 +57,13 @@ def test_it_waits_until_the_arm_has_settled(robot):
     assert steps * DT == pytest.approx(SETTLING, abs=2 * DT)
 
 
-def test_least_tension_is_left_alone(robot):
+def test_the_least_tension_is_not_relieved(robot):
     feedback = rested(robot)
     step(feedback, robot, np.zeros(robot.joint_count), holding(robot))
     assert feedback.relief == pytest.approx(np.zeros(robot.muscle_count), abs=1e-9)
 
 
-def test_relief_pays_out_what_pulls_against_each_other_and_exerts_no_torque(robot):
+def test_relief_pays_out_antagonists_and_exerts_no_torque(robot):
     feedback = rested(robot)
     needless = holding(robot, desired=90.0)
     before, steps = feedback.relief, 0
@@ -80,7 +80,7 @@ def test_relief_pays_out_what_pulls_against_each_other_and_exerts_no_torque(robo
 
 
 @pytest.mark.parametrize('wound', [0.2, -0.2])
-def test_what_friction_keeps_of_a_wire_that_was_wound_in_is_paid_out(robot, wound):
+def test_tension_that_friction_keeps_in_a_tendon_after_winding_in_is_paid_out(robot, wound):
     feedback = rested(robot)
     least = holding(robot)
     motor = least * np.exp(wound)
@@ -94,7 +94,7 @@ def test_what_friction_keeps_of_a_wire_that_was_wound_in_is_paid_out(robot, woun
         assert shares == pytest.approx(np.full(robot.muscle_count, shares[0]))
 
 
-def test_both_are_bounded(robot):
+def test_correction_and_relief_are_bounded_and_a_reset_clears_them(robot):
     feedback = rested(robot)
     error = np.full(robot.joint_count, 1.0)
     for _ in range(3000):
@@ -106,7 +106,7 @@ def test_both_are_bounded(robot):
     assert not feedback.relief.any()
 
 
-def test_errors_within_the_estimates_own_are_left_alone(robot):
+def test_errors_within_the_dead_band_are_not_corrected(robot):
     feedback = rested(robot)
     error = np.full(robot.joint_count, 0.9 * DEADBAND)
     step(feedback, robot, error, holding(robot))
@@ -115,7 +115,7 @@ def test_errors_within_the_estimates_own_are_left_alone(robot):
     assert feedback.correction == pytest.approx(GAIN * DT * 2.0 * error)
 
 
-def test_of_what_slides_60_mm_count_as_a_radian(tmp_path):
+def test_60_mm_of_a_prismatic_joint_count_as_one_radian(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     feedback, slides = rested(robot), robot.kinematics.slides
     step(feedback, robot, 0.9 * DEADBAND * robot.kinematics.radian, holding(robot))

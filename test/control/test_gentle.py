@@ -44,7 +44,7 @@ def loop(trained):
     return Loop(Robot.load('arm26'), trained['default'])
 
 
-def test_a_target_waits_for_the_zeros(loop):
+def test_a_target_waits_until_the_length_offsets_are_known(loop):
     loop.run(0.1)
     loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
     loop.run(0.5)
@@ -55,28 +55,28 @@ def test_a_target_waits_for_the_zeros(loop):
     assert loop.commands
 
 
-def test_exploring_is_slow_moves_the_arm_and_spares_it(loop):
+def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_tension(loop):
     loop.offset[:] = [0.1, -0.13, 0.08, -0.06, 0.12, 0.05]
     loop.core.explore(True)
-    seen = []
+    observed = []
     for _ in range(200):
         loop.run(0.1)
-        seen.append(loop.arm.theta)
+        observed.append(loop.arm.theta)
     assert not loop.core.safety.cause
-    assert np.ptp(seen, axis=0).min() > 0.3
+    assert np.ptp(observed, axis=0).min() > 0.3
     speed = np.abs(np.diff(loop.commands, axis=0)) / DT
     # What is faster pays out, so that no tension passes its limit.
     assert np.quantile(speed, 0.99) < 1.2 * SPEED
     assert max(loop.pulls) < gentle_limit(loop.arm.robot)[0] + 30.0
 
 
-def test_other_zeros_move_nothing(loop):
+def test_new_length_offsets_do_not_move_the_arm(loop):
     loop.core.explore(True)
     loop.run(1.0)
-    less = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
+    reduced = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
     before = loop.commands[-1]
-    loop.offset = loop.offset - less
-    loop.core.zeros(True, less)
+    loop.offset = loop.offset - reduced
+    loop.core.zeros(True, reduced)
     # An estimate may come before the next lengths.
     assert np.abs(loop.core.step(loop.now).value - loop.offset - before).max() < 0.002
     loop.run(DT)

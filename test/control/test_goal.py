@@ -48,10 +48,10 @@ class Followed:
         return None, steps
 
 
-def test_a_goal_that_is_reached_succeeds_when_its_time_is_over():
+def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
     followed = Followed(path=TIGHT, goal=TIGHT)
-    (code, told), steps = followed.run()
-    assert (code, told) == (SUCCESSFUL, '')
+    (code, reported), steps = followed.run()
+    assert (code, reported) == (SUCCESSFUL, '')
     duration = followed.bench.core.motion.trajectory.duration
     assert 100.0 * duration - 1.5 <= steps <= 100.0 * duration + 5.0
 
@@ -63,14 +63,14 @@ def test_a_goal_in_the_future_is_waited_for():
     assert steps >= 150
 
 
-def test_an_arm_that_does_not_come_along_is_off_the_path_and_its_joint_named():
-    (code, told), steps = Followed(path=TIGHT).run(moves=False)
+def test_an_arm_that_does_not_follow_violates_the_path_tolerance_and_the_joint_is_named():
+    (code, reported), steps = Followed(path=TIGHT).run(moves=False)
     assert code == BEYOND_PATH
-    assert ROBOT.joints[0] in told
+    assert ROBOT.joints[0] in reported
     assert steps < 100
 
 
-def test_an_arm_that_does_not_arrive_is_waited_for_as_long_as_asked():
+def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
     assert Followed(goal=TIGHT).run(400, moves=False) == (None, 400)
     followed = Followed(goal=TIGHT, patience=0.5)
     (code, _), steps = followed.run(moves=False)
@@ -78,7 +78,7 @@ def test_an_arm_that_does_not_arrive_is_waited_for_as_long_as_asked():
     assert steps > 100.0 * (followed.bench.core.motion.trajectory.duration + 0.5) - 2.0
 
 
-def test_new_networks_make_nobody_wait_longer(monkeypatch):
+def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
     followed = Followed(goal=TIGHT, patience=3.0)
     step, bench = followed.bench.step, followed.bench
 
@@ -106,12 +106,12 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
         core.stop('asked')
     else:
         followed.bench.configure(method='tension')
-    (code, told), steps = followed.run()
+    (code, reported), steps = followed.run()
     assert (code, steps) == (INVALID, 0)
-    assert ('stopped: asked' if event == 'stop' else 'replaced') in told
+    assert ('stopped: asked' if event == 'stop' else 'replaced') in reported
 
 
-def test_tolerances_of_unknown_joints_are_refused_and_none_is_no_bound():
+def test_tolerances_of_unknown_joints_or_not_finite_are_refused_and_zero_means_no_bound():
     def one(position, name=ROBOT.joints[1]):
         return SimpleNamespace(name=name, position=position, velocity=0.0, acceleration=0.0)
 

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from nominal_body import posture_table
 
-from bench.control_nominal import posture_table
 from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.exploration import holdable_postures
@@ -63,7 +63,7 @@ def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
         assert np.linalg.norm(solution.tension) <= np.linalg.norm(other) + 0.1
 
 
-def test_torque_beyond_the_muscles_is_told_and_tensions_stay_within_their_limits(robot):
+def test_torque_beyond_the_muscles_is_reported_and_tensions_stay_within_their_limits(robot):
     theta, torque, _ = holdable(robot, 1)
     limit = np.linspace(60.0, 120.0, robot.muscle_count)
     solution = methods.proposed(robot, ExactMae(robot), theta, torque + 500.0, limit, limit)
@@ -72,7 +72,7 @@ def test_torque_beyond_the_muscles_is_told_and_tensions_stay_within_their_limits
     assert np.linalg.norm(solution.missing_torque) > 100.0
 
 
-def test_an_image_that_is_not_finite_is_refused_and_never_commanded(robot):
+def test_a_torque_that_is_not_finite_is_refused(robot):
     theta, torque, _ = holdable(robot, 1)
     torque[0] = np.nan
     bias = np.full(robot.muscle_count, 30.0)
@@ -80,7 +80,7 @@ def test_an_image_that_is_not_finite_is_refused_and_never_commanded(robot):
         methods.proposed(robot, ExactMae(robot), theta, torque, bias, 200.0)
 
 
-def test_the_command_lies_below_the_length_by_what_the_module_needs_to_pull(robot):
+def test_the_length_command_makes_the_module_pull_with_the_planned_tension(robot):
     theta, _, least = holdable(robot, 2)
     mae = ExactMae(robot)
     short = mae.lengths(theta, least) - first_command(robot, mae, theta, least)
@@ -98,15 +98,15 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
     solution = methods.proposed_paper(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
-    less = copy.copy(robot)
-    less.isolate((2, 4))
-    *_, balance = methods.paper_terms(less, mae, theta, torque, tension)
+    reduced = copy.copy(robot)
+    reduced.isolate((2, 4))
+    *_, balance = methods.paper_terms(reduced, mae, theta, torque, tension)
     pulls = balance.matrix[:, robot.joint_count :][:, : robot.muscle_count]
-    np.testing.assert_array_equal(np.abs(pulls).max(axis=0) > 0.0, less.used)
+    np.testing.assert_array_equal(np.abs(pulls).max(axis=0) > 0.0, reduced.used)
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_torch_and_its_autograd_solve_for_the_same_lengths(trained, seed):
+def test_the_methods_agree_with_an_implementation_by_autograd(trained, seed):
     robot = Robot.load('arm26')
     theta, torque, _ = holdable(robot, seed)
     tension = np.full(6, 40.0)
@@ -121,7 +121,7 @@ def test_torch_and_its_autograd_solve_for_the_same_lengths(trained, seed):
         np.testing.assert_allclose(solution.length, plain, atol=1e-5)
 
 
-def test_on_a_network_proposed_settles_nearer_than_first_and_near_the_least_tension(trained):
+def test_with_a_network_proposed_settles_nearer_than_first_and_near_the_least_tension(trained):
     robot = Robot.load('arm26')
     table = posture_table(robot, trained['default'], trained['paper'], 4)
     error, tension, bound = {name: rows.mean(axis=0) for name, rows in table.items()}['proposed']

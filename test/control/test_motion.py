@@ -9,13 +9,12 @@ import pinocchio as pin
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
+from nominal_body import nominal_arm
 
-from bench.control_nominal import nominal_arm
-from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.controller import FED_BACK, Controller
 from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.methods import Solution, StiffnessModel, first_command
-from musculoskeletal_ae.control.motion import SETTLING, SHARE, Winches, slowness
+from musculoskeletal_ae.control.methods import StiffnessModel
+from musculoskeletal_ae.control.motion import SHARE, Winches, slowness
 from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
@@ -60,35 +59,7 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
 
 
-@pytest.mark.parametrize(('dt', 'ramp'), [(DT, False), (0.002, False), (DT, True)])
-def test_at_rest_neither_network_nor_programme_is_asked_at_every_message(
-    bench, dt, ramp, monkeypatch
-):
-    bench.dt = dt
-    if ramp:
-        bench.configure(first_duration=1.0)
-        bench.target(OTHER)
-    else:
-        bench.core.trajectory(points(OTHER))
-    moved(bench, round((1.6 + SETTLING) / dt))
-    solved = []
-
-    def refused(*_):
-        raise AssertionError('the network was asked')
-
-    monkeypatch.setattr(bench.mae, 'lengths', refused, raising=False)
-    monkeypatch.setattr(bench.mae, 'muscle_jacobian', refused, raising=False)
-    monkeypatch.setattr(bench.core.motion.winches, 'step', refused)  # noise would be taken for λ
-    from musculoskeletal_ae.control import posture
-
-    real = posture.least_tension
-    monkeypatch.setattr(posture, 'least_tension', lambda *a: solved.append(1) or real(*a))
-    bench.step(round(1.0 / dt))
-    assert not bench.core.safety.cause
-    assert 5 <= len(solved) <= 12
-
-
-def test_what_winches_cannot_follow_is_slowed_as_a_whole_and_said(bench):
+def test_a_trajectory_too_fast_for_the_winches_is_slowed_as_a_whole_and_reported(bench):
     bench.configure(rate_limit=0.05)
     bench.core.trajectory(points(OTHER, 0.5))
     trajectory = bench.core.motion.trajectory
@@ -101,7 +72,7 @@ def test_what_winches_cannot_follow_is_slowed_as_a_whole_and_said(bench):
     np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
 
 
-def test_what_is_to_be_there_at_once_is_there_as_soon_as_winches_can(bench):
+def test_a_trajectory_of_zero_duration_takes_as_long_as_the_winches_need(bench):
     bench.core.trajectory(points(OTHER, 0.0))
     sent = values(moved(bench, 300))
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.3 * DT + 1e-9
@@ -109,7 +80,7 @@ def test_what_is_to_be_there_at_once_is_there_as_soon_as_winches_can(bench):
     assert not bench.core.motion.moving
 
 
-def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
+def test_a_new_trajectory_replaces_the_old_from_its_start_time_and_an_empty_one_holds(bench):
     bench.core.trajectory(points(OTHER, 2.0))
     moved(bench, 100)
     bench.core.trajectory(points(REST, 2.0), delay=0.5)
@@ -128,7 +99,7 @@ def test_a_new_one_replaces_from_its_start_on_and_an_empty_one_holds(bench):
     assert np.abs(bench.core.motion.desired.theta - REST).max() > 0.1
 
 
-def test_refusals_change_nothing(bench):
+def test_a_refused_trajectory_changes_nothing(bench):
     with pytest.raises(MessageError, match='beyond the joint limits'):
         bench.core.trajectory(points(ROBOT.upper + 0.1))
     with pytest.raises(MessageError, match='all points have passed'):
@@ -151,7 +122,7 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
     np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
 
 
-def test_after_a_pause_of_the_controller_it_goes_on_from_where_it_was(bench):
+def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
     bench.now += 2.0
@@ -161,7 +132,7 @@ def test_after_a_pause_of_the_controller_it_goes_on_from_where_it_was(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * 0.1 + 1e-9
 
 
-def test_after_a_pause_what_is_held_is_held_by_the_same_tensions(bench):
+def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(bench):
     bench.configure(target_duration=0.5)
     bench.target(OTHER, (2.0, 0.0))
     moved(bench, 500)
@@ -173,7 +144,7 @@ def test_after_a_pause_what_is_held_is_held_by_the_same_tensions(bench):
 
 
 @pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
-def test_an_arm_in_motion_is_not_carried_beyond_its_limits_by_a_slow_target(bench, duration):
+def test_a_slow_target_does_not_carry_a_moving_arm_beyond_its_limits(bench, duration):
     bench.configure(target_duration=duration)
     bench.core.trajectory(points(OTHER, 0.6))
     moved(bench, 15)
@@ -184,7 +155,7 @@ def test_an_arm_in_motion_is_not_carried_beyond_its_limits_by_a_slow_target(benc
     assert bench.core.motion.trajectory.duration < duration + 1.0
 
 
-def test_a_slow_hand_in_motion_stays_within_the_limits(bench):
+def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
     bench.configure(hand_speed=0.02, target_duration=1.2, unreachable='nearest')
     rng = np.random.default_rng(0)
     for theta in ROBOT.random_postures(6, rng):
@@ -206,7 +177,7 @@ def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
     assert bench.report().message == 'holding'
 
 
-def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench):
+def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effort(bench):
     bench.configure(target_duration=1.0)
     bench.target(OTHER)
     moved(bench, 400)
@@ -223,7 +194,7 @@ def test_a_target_of_proposed_is_gone_to_like_a_trajectory_with_its_effort(bench
 
 
 @pytest.mark.parametrize('dt', [DT, 0.002])
-def test_the_lag_of_winches_is_found_from_lengths_tensions_and_commands(dt):
+def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(dt):
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
     for n in range(round(3.0 / dt)):
@@ -265,7 +236,7 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     return np.array(off)
 
 
-def test_a_motion_is_followed_as_well_by_500_messages_a_second_and_by_irregular_ones():
+def test_tracking_is_as_good_at_500_hz_and_at_irregular_times():
     arms = [EmulatedArm(ROBOT, seed) for seed in range(2)]
 
     def error(*intervals):
@@ -276,7 +247,7 @@ def test_a_motion_is_followed_as_well_by_500_messages_a_second_and_by_irregular_
         assert error(*intervals).mean() < usual.mean() + usual.std()
 
 
-def test_with_method_stiffness_the_arm_gives_way_in_motion_and_comes_along():
+def test_with_method_stiffness_a_moving_arm_yields_to_a_push_and_still_follows():
     arm, turned = nominal_arm(ROBOT), {}
     for method in ('proposed', 'stiffness'):
         free, pushed = (driven(arm, push=push, method=method) for push in (0.0, 6.0))
@@ -285,7 +256,7 @@ def test_with_method_stiffness_the_arm_gives_way_in_motion_and_comes_along():
     assert turned['stiffness'] > 1.5 * turned['proposed']
 
 
-def test_a_desired_stiffness_is_kept_on_the_way_and_at_its_end(bench):
+def test_a_desired_stiffness_is_kept_during_a_trajectory_and_at_its_end(bench):
     motion, sent = bench.core.motion, []
     bench.configure(method='stiffness', joint_stiffness=(1000.0, 0.0))
     bench.core.trajectory(points(OTHER))
@@ -301,7 +272,7 @@ def test_a_desired_stiffness_is_kept_on_the_way_and_at_its_end(bench):
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
 
 
-def test_sudden_changes_of_tension_slow_little():
+def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
     # Near postures that are hard to hold tensions change suddenly, however slowly the arm moves.
     mae, chosen, slowed = Bench().mae, Settings(), []
     postures = ROBOT.random_postures(60, np.random.default_rng(0))
@@ -316,7 +287,7 @@ def test_sudden_changes_of_tension_slow_little():
     assert 0.9 < min(slowed) <= max(slowed) < 1.5
 
 
-def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_arm(bench):
+def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench):
     bench.core.trajectory(points(OTHER))
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
     demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
@@ -325,7 +296,7 @@ def test_an_estimate_that_does_not_come_along_demands_no_tension_that_stops_the_
 
 
 @pytest.mark.parametrize('trajectory', [True, False])
-def test_an_arm_that_is_stuck_is_not_stopped_for_what_feedback_demands(bench, trajectory):
+def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
     bench.core.trajectory(points(OTHER)) if trajectory else bench.target(OTHER)
     pull, highest = ROBOT.tension.bias, 0.0
     for _ in range(4000):
@@ -338,7 +309,7 @@ def test_an_arm_that_is_stuck_is_not_stopped_for_what_feedback_demands(bench, tr
     assert bench.core.safety.cause == ''
 
 
-def test_a_trajectory_is_judged_as_it_is_followed(monkeypatch):
+def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
     # It starts in motion: slowed for slow winches it takes another way, beyond the joint limits.
     bench = Bench(rate_limit=0.05)
     start = Setpoint(np.array([0.5, -0.5]), np.array([-1.4, 1.8]), np.zeros(2))
@@ -349,7 +320,7 @@ def test_a_trajectory_is_judged_as_it_is_followed(monkeypatch):
     assert not bench.core.follows
 
 
-def test_a_muscle_that_is_left_out_slows_nothing():
+def test_an_isolated_muscle_does_not_slow_a_trajectory():
     bench, trajectory = Bench(), Trajectory.to(Setpoint.resting(REST), OTHER, 0.2)
     robot = bench.core.robot
     theta = trajectory.sample(np.linspace(0.0, trajectory.duration, 200)).theta
@@ -358,24 +329,6 @@ def test_a_muscle_that_is_left_out_slows_nothing():
     before = slowness(robot, bench.mae, trajectory, Settings())
     robot.isolate([fastest])
     assert 1.0 < slowness(robot, bench.mae, trajectory, Settings()) < 0.99 * before
-
-
-def test_a_muscle_that_is_left_out_says_nothing_of_the_winches():
-    lags = []
-    for noise in (0.0, 0.3):
-        robot = Bench().core.robot
-        robot.isolate([0])
-        winches, length, rng = Winches(robot), np.zeros(6), np.random.default_rng(0)
-        for n in range(400):
-            if n % 10 == 0:
-                speed, tension = rng.uniform(-0.2, 0.2, 6), rng.uniform(60.0, 120.0, 6)
-            length = length + 0.01 * speed
-            command = length - (tension - robot.tension.bias) / robot.stiffness + 0.03 * speed
-            read = length + noise * (n // 50 % 2) * (np.arange(6) == 0)
-            winches.step(read, tension, command, 0.01)
-        lags.append(winches.lag)
-    assert lags[1] == pytest.approx(lags[0], rel=1e-9)
-    assert 0.02 < lags[0] < 0.04
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
@@ -387,7 +340,7 @@ def hand(bench, theta, whole=False):
     bench.core.pose(ROBOT.kinematics.end_effector_pose(theta), whole, bench.now)
 
 
-def test_a_pose_of_the_hand_is_reached_and_one_out_of_reach_refused_or_approached(bench):
+def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(bench):
     hand(bench, OTHER)
     moved(bench, 300)
     at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta)
@@ -404,7 +357,7 @@ def test_a_pose_of_the_hand_is_reached_and_one_out_of_reach_refused_or_approache
     assert 'nearest approached' in bench.report().message
 
 
-def test_what_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
+def test_a_hand_pose_that_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
     strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
 
     def weak(theta, tension):  # beyond half of the way
@@ -421,7 +374,7 @@ def test_what_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
     np.testing.assert_allclose(share, 0.5, atol=0.1)
 
 
-def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
+def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
     start, speed = REST, np.array([0.2, 0.3])
     hand(bench, start)
     moved(bench, 200)
@@ -439,7 +392,7 @@ def test_poses_that_follow_each_other_are_a_path_without_lag(bench):
 
 
 @pytest.mark.parametrize('every', [10, 20])
-def test_a_pose_that_comes_again_and_again_is_gone_to_at_hand_speed(bench, every):
+def test_a_repeated_hand_pose_is_approached_at_hand_speed(bench, every):
     bench.configure(hand_speed=0.1)
     place, fastest, where = ROBOT.kinematics.end_effector_pose, 0.0, None
     for n in range(600):
@@ -453,7 +406,7 @@ def test_a_pose_that_comes_again_and_again_is_gone_to_at_hand_speed(bench, every
     np.testing.assert_allclose(where, place(OTHER).translation, atol=5e-3)
 
 
-def test_the_nearest_to_a_pose_is_gone_to_as_fast_however_far_that_lies(bench):
+def test_the_duration_to_the_nearest_posture_does_not_grow_with_an_unreachable_distance(bench):
     bench.configure(unreachable='nearest')
     at, taken = ROBOT.kinematics.end_effector_pose(REST), []
     for far in (3.0, 1e3, 1e9):
@@ -475,20 +428,7 @@ def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
     assert slowed[1] == pytest.approx(slowed[0], rel=0.05)
 
 
-def test_another_preset_starts_anew_and_stops_nothing(bench, monkeypatch):
-    def stand_in(robot, mae, theta, _, tension):  # `ExactMae` has no decoder to descend through
-        return Solution(first_command(robot, mae, theta, tension), tension, np.zeros(2))
-
-    monkeypatch.setattr(methods, 'proposed_paper', stand_in)
-    bench.configure(preset='paper')
-    bench.target(OTHER)
-    bench.step(600)
-    bench.configure(preset='default')
-    bench.step(5)
-    assert bench.core.safety.cause == ''
-
-
-def test_a_twist_moves_the_hand_until_its_time_is_out(bench):
+def test_a_twist_moves_the_hand_until_it_times_out(bench):
     begun = ROBOT.kinematics.end_effector_pose(REST).translation
     along = ROBOT.kinematics.end_effector_jacobian(REST)[:3] @ np.array([0.3, 0.3])
     twist = np.concatenate([0.1 * along / np.linalg.norm(along), np.zeros(3)])

@@ -11,7 +11,7 @@ values = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
 
 
 @given(values, values, st.floats(0.0, 3.0), st.floats(0.01, 1.0))
-def test_it_ends_at_the_goal_and_is_never_faster_than_the_limit(start, goal, duration, limit):
+def test_a_ramp_ends_at_the_goal_and_is_never_faster_than_the_limit(start, goal, duration, limit):
     ramp, before, steps = Ramp(start, goal, duration, limit), start, 0
     while not ramp.done:
         after = ramp.step(0.02)
@@ -20,7 +20,7 @@ def test_it_ends_at_the_goal_and_is_never_faster_than_the_limit(start, goal, dur
     np.testing.assert_allclose(before if steps else goal, goal, atol=1e-12)
 
 
-def test_it_starts_and_ends_at_rest():
+def test_a_ramp_starts_and_ends_at_rest():
     ramp = Ramp(np.zeros(1), np.ones(1), 1.0, 100.0)
     sent = np.array([ramp.step(0.01)[0] for _ in range(100)])
     speed = np.diff(sent, prepend=0.0) / 0.01

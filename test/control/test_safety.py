@@ -30,7 +30,7 @@ VALUES = st.floats(-1e3, 1e3) | st.sampled_from([np.nan, -np.inf])
 
 @given(st.integers(1, 6).flatmap(lambda rows: arrays(float, (rows, 3), elements=VALUES)))
 @pytest.mark.filterwarnings('ignore:invalid value')
-def test_the_median_of_rows_is_that_of_numpy(rows):
+def test_median_of_rows_agrees_with_numpy(rows):
     np.testing.assert_array_equal(median_of_rows(rows), np.median(rows, axis=0))
 
 
@@ -52,7 +52,7 @@ def vectors(low, high):
     st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
     st.floats(0.001, 1.0),
 )
-def test_lengths_move_at_the_rate_limit_at_most_but_where_a_muscle_pulls_too_hard(commands, rate):
+def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_hard(commands, rate):
     guard, before = SafetyFilter(ROBOT, Settings(rate_limit=rate)), None
     for desired, length, limit in commands:
         pull = np.full(COUNT, BIAS)
@@ -74,7 +74,7 @@ def test_lengths_move_at_the_rate_limit_at_most_but_where_a_muscle_pulls_too_har
         assert ((sent - last)[slow] <= rate * DT + 1e-12).all()
 
 
-def test_lengths_that_lie_pay_out_at_the_rate_limit_while_no_tension_agrees():
+def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
     guard = SafetyFilter(ROBOT, Settings())
     held = unchanging(ROBOT, LENGTH, muscles())
     before = [step(guard, held).value for _ in range(3)][-1]
@@ -85,7 +85,7 @@ def test_lengths_that_lie_pay_out_at_the_rate_limit_while_no_tension_agrees():
 
 
 @pytest.mark.parametrize('glitch', [2.0, 1e308, -1e308])
-def test_one_wrong_reading_lets_no_muscle_go(glitch):
+def test_one_wrong_reading_does_not_pay_a_muscle_out(glitch):
     settings = Settings()
     guard = SafetyFilter(ROBOT, settings)
     desired = Command(LENGTH, np.full(COUNT, -0.01))
@@ -96,7 +96,7 @@ def test_one_wrong_reading_lets_no_muscle_go(glitch):
         before = sent
 
 
-def test_a_sensor_that_stays_wrong_pays_out_to_the_longest_the_muscle_can_be_at_most():
+def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_most():
     guard = SafetyFilter(ROBOT, Settings())
     for _ in range(10):
         sent = step(guard, unchanging(ROBOT, LENGTH, muscles()), muscles(5.0)).value
@@ -144,7 +144,7 @@ def test_a_stop_holds_then_pays_out_to_the_measured_length_and_keeps_commanding(
     assert sent[-1] == 0.0  # MSC pulls with T_bias where command and length are equal
 
 
-def test_without_fresh_lengths_a_stop_pays_out_to_the_longest_the_muscle_can_be():
+def test_a_stop_with_stale_lengths_pays_out_to_the_longest_length_of_the_muscle():
     guard = SafetyFilter(ROBOT, Settings(hold_time=0.0))
     guard.command = Command(LENGTH, np.full(COUNT, -0.05))
     guard.stop('muscle_states are old')
@@ -154,7 +154,7 @@ def test_without_fresh_lengths_a_stop_pays_out_to_the_longest_the_muscle_can_be(
     assert (sent > ROBOT.routes.relative_lengths(theta).max(axis=0) - 0.01).all()
 
 
-def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
+def test_a_stop_under_tension_commands_holds_and_then_lowers_tension_to_the_bias():
     guard = SafetyFilter(ROBOT, Settings(hold_time=0.1))
     guard.command = Command(TENSION, np.full(COUNT, 120.0))
     guard.stop('asked')
@@ -165,7 +165,7 @@ def test_a_stop_under_tension_commands_holds_and_then_lets_go_to_the_bias():
 
 
 @given(vectors(0.0, MAX), vectors(-0.2, 0.2))
-def test_the_unchanging_command_makes_msc_pull_as_the_muscles_do(tension, length):
+def test_the_unchanging_command_demands_the_present_tension(tension, length):
     now = Muscles(length, tension, COLD)
     sent = unchanging(ROBOT, LENGTH, now).value
     pull = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))

@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import FrozenInstanceError
-
 import numpy as np
 import pytest
 
@@ -10,24 +8,19 @@ from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.robot.kinematics import RACK
 
 
-def test_settings_cannot_be_changed_in_place():
-    with pytest.raises(FrozenInstanceError):
-        Settings().method = 'first'
-
-
 @pytest.mark.parametrize('given', [(), (0.0,)])
-def test_no_joint_stiffness_is_as_it_comes_for_every_joint(given):
+def test_joint_stiffness_left_empty_demands_nothing_of_any_joint(given):
     assert Settings(joint_stiffness=given).desired_stiffness((1.0, 1.0, 1.0)) == (0.0, 0.0, 0.0)
     assert Settings(joint_stiffness=(5.0, 0.0)).desired_stiffness((1.0, 1.0)) == (5.0, 0.0)
 
 
-@pytest.mark.parametrize('given', [(1.0,), (1.0, 2.0, 3.0), (1.0, -1), (np.nan, 1), (np.inf, 1)])
-def test_joint_stiffness_that_is_not_one_number_a_joint_is_refused(given):
+@pytest.mark.parametrize('given', [(1.0, 2.0, 3.0), (1.0, -1.0), (np.nan, 1.0)])
+def test_joint_stiffness_needs_one_number_of_at_least_0_for_each_joint(given):
     with pytest.raises(MusculoskeletalError, match='legal: 2 numbers of at least 0'):
         Settings(joint_stiffness=given).desired_stiffness((1.0, 1.0))
 
 
-def test_a_joint_that_slides_may_be_as_stiff_as_one_that_a_pinion_turns():
+def test_the_limit_of_joint_stiffness_of_a_prismatic_joint_is_that_of_a_pinion():
     """At most 1000 N·m/rad, over the square of the pinion's radius."""
     parameter, radian = parameters_of(Settings)['joint_stiffness'], (1.0, RACK)
     given = parameter.checked([1000.0, 1000.0 / RACK**2])

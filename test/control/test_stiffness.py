@@ -4,9 +4,8 @@
 import numpy as np
 import pytest
 from exact_mae import ExactMae
-from robots import write_robot
+from nominal_body import stiffness_ratios
 
-from bench.control_nominal import stiffness_ratios
 from musculoskeletal_ae.control.methods import MARGINS, StiffnessModel, stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
@@ -41,20 +40,7 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
 
 
-def test_what_slides_is_asked_for_where_it_can_be(tmp_path):
-    robot = Robot.load(write_robot(tmp_path, slider=True))
-    theta, asked = 0.5 * (robot.lower + robot.upper), list[np.ndarray]()
-
-    class Asked(ExactMae):
-        def muscle_jacobian(self, theta, tension):
-            asked.extend(np.atleast_2d(theta))
-            return super().muscle_jacobian(theta, tension)
-
-    StiffnessModel.read(robot, Asked(robot), theta, robot.tension.bias)
-    assert ((np.array(asked) >= robot.lower) & (np.array(asked) <= robot.upper)).all()
-
-
-def test_its_slope_by_the_tension_is_the_difference_quotient(robot, mae):
+def test_the_slope_of_joint_stiffness_by_tension_is_the_difference_quotient(robot, mae):
     tension = np.full(robot.muscle_count, 90.0)
     model = StiffnessModel.read(robot, mae, THETA, tension)
     for i, step in enumerate(1e-3 * np.eye(robot.muscle_count)):
@@ -97,7 +83,7 @@ def test_a_stiffness_beyond_the_range_gives_the_end_of_the_range(robot, mae):
         assert stiffness.expected[4, 4] == pytest.approx(end[4], rel=0.02)
 
 
-def test_a_torque_beyond_the_muscles_leaves_no_choice_and_is_told(robot, mae):
+def test_torque_beyond_the_muscles_leaves_no_range_and_is_reported(robot, mae):
     solution = stiffness_command(robot, mae, THETA, np.full(5, 300.0), np.full(5, 20.0), 200.0)
     assert np.linalg.norm(solution.missing_torque) > 100.0
     np.testing.assert_array_equal(solution.stiffness.lowest, solution.stiffness.highest)
@@ -110,7 +96,7 @@ def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
     assert predicted.max() > 1.2  # and not because both are one
 
 
-def test_bodies_with_friction_are_turned_less_where_they_are_to_be_stiffer(robot, mae):
+def test_a_push_turns_bodies_with_friction_by_about_the_predicted_ratio(robot, mae):
     # A push that is large against friction; single arms scatter by 0.1 about the prediction.
     arms = [EmulatedArm(robot, seed) for seed in range(4)]
     ratios = [stiffness_ratios(robot, mae, 2, arm, push=3.0)[1] for arm in arms]

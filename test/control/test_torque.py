@@ -38,13 +38,13 @@ def test_weight_and_effort_appear_at_the_joints(effort):
     np.testing.assert_allclose(torque_of(tension), wanted, atol=0.1 * np.linalg.norm(wanted))
 
 
-def test_with_gains_of_zero_the_target_does_not_matter():
+def test_the_target_has_no_influence_with_gains_of_zero():
     control = TorqueControl(ROBOT, Settings(position_gain=0.0, velocity_gain=0.0))
     tension = settled(control, target=THETA + 0.3)
     np.testing.assert_allclose(torque_of(tension), ROBOT.kinematics.holding_torque(THETA), atol=0.1)
 
 
-def test_the_gain_pulls_towards_the_target():
+def test_the_position_gain_exerts_torque_towards_the_target():
     control = TorqueControl(ROBOT, Settings(position_gain=4.0))
     offset = np.array([0.1, -0.1, 0.1, 0.1, -0.1])
     extra = torque_of(settled(control, THETA + offset)) - ROBOT.kinematics.holding_torque(THETA)
@@ -52,17 +52,26 @@ def test_the_gain_pulls_towards_the_target():
 
 
 @pytest.mark.parametrize('control', [TorqueControl, FloatControl])
-def test_what_slides_is_held_as_by_a_pinion(control, tmp_path):
+def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
-    middle = 0.5 * (robot.lower + robot.upper)
-    off, at = 0.02 * robot.kinematics.radian, control(robot, Settings())
-    at.start_from(robot.tension.bias)
-    torque = at._feedback(middle - off, off, middle)
-    np.testing.assert_allclose(torque * robot.kinematics.radian, torque[0])
-    assert torque[0] > 0.1
+    mae, middle = ExactMae(robot), 0.5 * (robot.lower + robot.upper)
+    limit, nothing = robot.tension.limit, np.zeros(robot.joint_count)
+
+    def torque(theta):
+        held = control(robot, Settings())
+        held.start_from(robot.tension.bias)
+        held.step(mae, middle, middle, nothing, limit, DT)
+        for _ in range(300):
+            tension = held.step(mae, theta, middle, nothing, limit, DT)
+        return -mae.muscle_jacobian(theta, tension).T @ tension
+
+    theta = middle - 0.02 * robot.kinematics.radian
+    extra = torque(theta) - robot.kinematics.holding_torque(theta)
+    np.testing.assert_allclose(extra * robot.kinematics.radian, extra[0], atol=0.1)
+    assert extra[0] > 0.1
 
 
-def test_tensions_change_by_the_same_share_no_faster_than_the_limit():
+def test_tensions_change_no_faster_than_the_rate_limit_allows():
     control = TorqueControl(ROBOT, Settings(rate_limit=0.05))
     control.start_from(np.full(ROBOT.muscle_count, 150.0))
     before = np.full(ROBOT.muscle_count, 150.0)
@@ -72,7 +81,7 @@ def test_tensions_change_by_the_same_share_no_faster_than_the_limit():
         before = tension
 
 
-def test_torque_beyond_the_muscles_is_told():
+def test_torque_beyond_the_muscles_is_reported():
     control = TorqueControl(ROBOT, Settings())
     tension = settled(control, effort=np.array([0.0, 90.0, 0.0, 0.0, 0.0]))
     assert (tension <= 200.0 + 1e-6).all()
@@ -87,12 +96,12 @@ def carried(control, theta):
     return pulled - ROBOT.kinematics.holding_torque(theta)
 
 
-def test_a_floating_arm_carries_its_weight_and_no_more():
+def test_gravity_compensation_carries_the_weight_and_no_more():
     np.testing.assert_allclose(carried(FloatControl(ROBOT, Settings()), THETA), 0.0, atol=0.1)
 
 
 @pytest.mark.parametrize('way', [1.0, -1.0])
-def test_a_floating_arm_comes_along_and_pulls_back_no_harder_than_its_band(way):
+def test_gravity_compensation_resists_a_motion_by_its_band_at_most(way):
     control = FloatControl(ROBOT, Settings())
     carried(control, THETA)
     little = carried(control, THETA + way * 0.5 * BAND)
@@ -102,7 +111,7 @@ def test_a_floating_arm_comes_along_and_pulls_back_no_harder_than_its_band(way):
     np.testing.assert_allclose(control.held, THETA + way * (0.2 - BAND), atol=1e-3)
 
 
-def test_a_floating_arm_is_pushed_back_from_its_limits():
+def test_gravity_compensation_pushes_back_from_the_joint_limits():
     theta = THETA.copy()
     theta[3] = ROBOT.lower[3]
     pushed = carried(FloatControl(ROBOT, Settings()), theta)

@@ -35,7 +35,7 @@ def made(rows, order):
 
 
 @given(rows, st.integers(0, 2), st.floats(1.0, 5.0))
-def test_points_are_passed_as_given_however_slowed(rows, order, slower):
+def test_a_slowed_trajectory_passes_its_points_with_scaled_derivatives(rows, order, slower):
     points, trajectory = made(rows, order)
     trajectory = trajectory.scaled(slower)
     assert trajectory.duration == pytest.approx(slower * points.time[-1])
@@ -52,7 +52,7 @@ def test_points_are_passed_as_given_however_slowed(rows, order, slower):
     np.testing.assert_allclose(theta, trajectory.sample(time).theta, atol=1e-9)
 
 
-def test_points_that_are_as_good_as_simultaneous_are_refused():
+def test_points_at_nearly_the_same_time_are_refused():
     time = np.array([0.001, 3e5, 3e5 + 1e-9])  # [s] between moments of the last piece: none
     points = Points(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
     with pytest.raises(MessageError, match='points too close in time'):
@@ -73,7 +73,7 @@ def test_velocity_and_acceleration_are_the_derivatives(rows, order, share):
 
 
 @given(rows, st.integers(0, 2))
-def test_as_many_derivatives_are_continuous_as_are_given(rows, order):
+def test_as_many_derivatives_are_continuous_as_the_points_have(rows, order):
     _, trajectory = made(rows, order)
     for time in trajectory.time[1:-1]:
         before, after = trajectory.sample(time - 1e-9), trajectory.sample(time + 1e-9)
@@ -88,7 +88,7 @@ def test_from_rest_to_rest_is_the_motion_of_least_jerk():
     np.testing.assert_allclose(trajectory.sample(2.0 * u[:, 0]).theta, expected, atol=1e-12)
 
 
-def test_other_joints_stay_and_points_that_have_passed_are_left_out():
+def test_joints_not_named_stay_and_points_in_the_past_are_left_out():
     points = Points(
         np.array([1]),
         np.array([0.0, 1.0, 2.0]),
@@ -104,7 +104,7 @@ def test_other_joints_stay_and_points_that_have_passed_are_left_out():
         Trajectory.through(Setpoint.resting(MIDDLE), points, passed=2.0)
 
 
-def test_a_point_at_time_zero_is_gone_to_at_once():
+def test_a_point_at_time_zero_is_approached_at_once():
     points = Points(BOTH, np.array([0.0]), MIDDLE[None] + 0.1, None, None)
     trajectory = Trajectory.through(Setpoint.resting(MIDDLE), points)
     assert 0.0 < trajectory.duration < 0.02
@@ -121,7 +121,7 @@ def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
 
 
 @pytest.mark.parametrize('late', [0.0, 500.0])
-def test_a_curve_that_leaves_the_limits_for_a_moment_of_a_long_time_is_refused(late):
+def test_a_curve_that_leaves_the_joint_limits_briefly_in_a_long_trajectory_is_refused(late):
     time, rates = late + np.array([0.6, 1.6, 2.0, 5.0]), np.zeros((4, 2))
     rates[1] = 8.0
     points = Points(BOTH, time, np.tile(MIDDLE, (4, 1)), rates, None)
@@ -130,21 +130,21 @@ def test_a_curve_that_leaves_the_limits_for_a_moment_of_a_long_time_is_refused(l
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-def test_a_curve_beyond_all_numbers_is_refused():
+def test_a_curve_whose_values_overflow_is_refused():
     rates = np.array([[1e308, 0.0], [0.0, 0.0]])
     points = Points(BOTH, np.array([10.0, 20.0]), np.array([MIDDLE, MIDDLE]), rates, None)
     with pytest.raises(MessageError, match='too steep'):
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
 
 
-def test_a_curve_that_leaves_the_limits_of_what_slides_is_told_in_metres(tmp_path):
+def test_a_refusal_for_a_prismatic_joint_is_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
-    for off, told in ((0.001, None), (0.01, 'wrist by 0.01 m')):
+    for off, reported in ((0.001, None), (0.01, 'wrist by 0.01 m')):
         end = np.append(start[:3], robot.upper[3] + off)
         points = Points(np.arange(4), np.ones(1), end[None], still, None)
         trajectory = Trajectory.through(Setpoint.resting(start), points)
-        with pytest.raises(MessageError, match=told) if told else nullcontext():
+        with pytest.raises(MessageError, match=reported) if reported else nullcontext():
             trajectory.check(robot)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver of the emulated arm, stepped without ROS, that errs as it is told to."""
+"""A driver of the emulated arm, stepped without ROS, with faults that a test chooses."""
 
 from collections import deque
 from collections.abc import Callable
@@ -29,9 +29,8 @@ class Driver:
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
         self._commands: deque = deque()
-        self.in_tension: Callable | None = (
-            None  # (l_target, rows) → T, instead of the arm's own law
-        )
+        # (l_target, rows) → T, instead of the arm's own law.
+        self.in_tension: Callable | None = None
         self._target = None
         self._sent = -1.0
 

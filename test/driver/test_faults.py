@@ -75,8 +75,8 @@ def test_a_sound_driver_is_found_sound(seed):
         assert not verdict.faults, str(verdict)
     verdict = settled(seed).wind()
     assert not verdict.faults, str(verdict)
-    told = str(verdict).splitlines()
-    for name, line in zip(ROBOT.muscles, told[1:]):
+    reported = str(verdict).splitlines()
+    for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)
         assert line.count('ok') == 4 and 'WRONG' not in line  # all but rate, order, zero, clip
 
@@ -105,16 +105,16 @@ HEARD = {
 
 
 @pytest.mark.parametrize('name', HEARD)
-def test_what_is_wrong_is_heard(name):
-    publish, how, check, told = HEARD[name]
+def test_a_fault_is_found_by_listening(name):
+    publish, how, check, reported = HEARD[name]
     driver = Driver(ROBOT)
     driver.publish = publish
     verdict = driver.listen(8.0 if how == 'moved' else 5.0, moved=how == 'moved')
     assert verdict.wrong == {check}, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)
 
 
-def test_winches_that_forget_their_zeros_are_no_fault_where_that_is_said():
+def test_unknown_length_offsets_are_no_fault_if_the_user_says_so():
     driver = Driver(ROBOT)
     driver.publish = lambda rows: rows + [np.linspace(-0.13, 0.13, M), np.zeros(M), np.zeros(M)]
     assert driver.listen(2.0).wrong & {'zero', 'unit'}
@@ -124,7 +124,7 @@ def test_winches_that_forget_their_zeros_are_no_fault_where_that_is_said():
     assert driver.listen(8.0, moved=True, zeroed=False).wrong == {'sign'}
 
 
-def test_a_slow_a_halting_and_a_repeating_driver_are_heard():
+def test_slow_repeated_and_frozen_messages_are_found():
     slow = Driver(ROBOT)
     slow.period = 0.05
     verdict = slow.listen()
@@ -146,7 +146,7 @@ def test_a_slow_a_halting_and_a_repeating_driver_are_heard():
     assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
 
 
-def test_a_driver_that_falls_silent_is_heard():
+def test_a_driver_that_falls_silent_is_found():
     driver = Driver(ROBOT)
     listening = Listening(ROBOT, 100.0)
     for _ in range(50):
@@ -169,7 +169,7 @@ def test_sensors_with_hardly_any_noise_are_no_fault(share):
     assert not verdict.faults, str(verdict)
 
 
-def test_joints_of_a_hand_and_joints_in_several_messages_are_no_fault():
+def test_additional_joints_and_joints_in_several_messages_are_no_fault():
     driver = settled()
     listening = Listening(ROBOT, 100.0)
     for _ in range(200):
@@ -183,14 +183,14 @@ def test_joints_of_a_hand_and_joints_in_several_messages_are_no_fault():
     assert 'missing joint' in str(verdict) and 'not judged without' not in str(verdict)
 
 
-def test_joints_of_other_names_are_heard():
+def test_unknown_joint_names_are_found():
     driver = Driver(ROBOT)
     driver.names = ('joint_1', 'joint_2')
     verdict = driver.listen()
     assert 'missing joint' in str(verdict) and ROBOT.joints[0] in str(verdict)
 
 
-def test_some_joint_sensors_are_no_fault():
+def test_missing_joint_sensors_are_no_fault():
     driver = Driver(ROBOT)
     driver.names = 'other', ROBOT.joints[1]
     verdict = driver.listen()
@@ -241,14 +241,14 @@ WOUND = {
 
 
 @pytest.mark.parametrize('name', WOUND)
-def test_what_is_wrong_shows_when_a_muscle_is_wound_in(name):
-    changes, check, told = WOUND[name]
+def test_a_fault_is_found_by_winding_in(name):
+    changes, check, reported = WOUND[name]
     driver = settled()
     for attribute, value in changes.items():
         setattr(driver, attribute, value)
     verdict = driver.wind((0, BICEPS))
     assert check in verdict.wrong, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
@@ -291,11 +291,11 @@ def test_noise_of_length_is_no_fault_of_a_stiff_robot(seed):
 
 
 @pytest.mark.parametrize('wrong', [{'stiffness': 5.0e4}, {'bias': 0.0}, {'gain': 1.0 / 9.81}])
-def test_what_is_wrong_shows_on_a_stiff_robot_too(wrong):
+def test_a_fault_of_a_stiff_robot_is_found(wrong):
     assert 'law' in wound_in_stiff(1.0e5, of_law=wrong).wrong
 
 
-def test_a_stiff_robot_that_hums_is_told_so():
+def test_oscillation_of_a_stiff_robot_is_reported():
     verdict = wound_in_stiff(7.0e5)  # with each of 8 seeds by 1.27 times what is tolerated, or more
     assert 'N (standard deviation) while it is held' in str(verdict)
     assert 'latency' not in verdict.wrong, str(verdict)
@@ -306,21 +306,21 @@ def with_tension(limit, most, bias=BIAS):
     return Robot(replace(ROBOT.description, tension=tension))
 
 
-def test_a_sound_driver_may_be_asked_for_more_than_the_limit():
+def test_a_sound_driver_is_found_sound_above_the_tension_limit():
     verdict = Driver(ROBOT).wind((BICEPS,), 400.0)
     assert not verdict.faults, str(verdict)
 
 
 @pytest.mark.parametrize(
-    ('robot', 'highest', 'told'),
+    ('robot', 'highest', 'reported'),
     [
         (ROBOT, 35.0, 'is asked for 50 N at least to be judged, not 35 N'),
         (with_tension(35.0, 45.0), None, 'its tension.max is 45 N: it is not wound'),
         (with_tension(35.0, 45.0), 60.0, 'its tension.max is 45 N: it is not wound'),
     ],
 )
-def test_no_muscle_is_asked_for_more_than_was_said_or_may_be(robot, highest, told):
-    with pytest.raises(MusculoskeletalError, match=told):
+def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reported):
+    with pytest.raises(MusculoskeletalError, match=reported):
         Winding(Verdict(robot), (1,), highest)
 
 
@@ -336,7 +336,7 @@ def unclipped(robot):
 @pytest.mark.parametrize(
     ('wrong', 'check'), [({'bias': 0.0}, 'law'), ({'clip': False}, 'clip'), ({'gain': 3.0}, 'law')]
 )
-def test_weak_muscles_are_not_pulled_far_beyond_what_they_bear(wrong, check):
+def test_weak_muscles_are_not_pulled_far_beyond_their_maximum(wrong, check):
     driver = unclipped(with_tension(20.0, 26.0, bias=5.0))
     driver.in_tension = law(**{'bias': 5.0, 'most': 26.0, **wrong})
     most = []
@@ -346,7 +346,7 @@ def test_weak_muscles_are_not_pulled_far_beyond_what_they_bear(wrong, check):
 
 
 @pytest.mark.parametrize('clip', [True, False])
-def test_the_clip_is_tried_where_it_is_low_enough(clip):
+def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
     driver = unclipped(with_tension(55.0, 60.0))
     driver.in_tension = law(most=60.0, clip=clip)
     verdict = driver.wind((0, BICEPS))
@@ -354,7 +354,7 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
 
 
 @pytest.mark.parametrize(
-    ('fault', 'checks', 'told'),
+    ('fault', 'checks', 'reported'),
     [
         ('drop:0.4', {'rate'}, 'rate of all muscles'),
         ('delay:0.2', {'latency'}, 'latency of biceps_long'),
@@ -366,9 +366,9 @@ def test_the_clip_is_tried_where_it_is_low_enough(clip):
         ('stuck_motor:biceps_long', {'law'}, 'does not respond'),
     ],
 )
-def test_faults_of_the_emulated_arm_are_found(fault, checks, told):
+def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
     driver = settled()
     driver.arm.faults.set([fault])
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
-    assert told in str(verdict)
+    assert reported in str(verdict)

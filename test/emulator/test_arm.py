@@ -123,7 +123,7 @@ def test_tension_commands_are_followed_up_to_the_highest_tension(robot, nominal)
     np.testing.assert_allclose(arm.tension, np.minimum(wished, robot.tension.max), rtol=0.02)
 
 
-def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot, reality):
+def test_a_ruptured_muscle_has_no_tension_and_winds_in_at_the_speed_limit(robot, reality):
     arm = make_arm(robot, 2, reality)
     command = to_mid_range(robot, 80.0)
     drive(arm, command, 2.0)
@@ -141,7 +141,7 @@ def test_a_cut_muscle_reads_no_tension_and_winds_in_at_the_speed_limit(robot, re
     assert arm.sense().tension[1] > 0.5 * robot.tension.bias[1]
 
 
-def test_a_length_offset_shifts_the_reading_and_with_it_the_arm(robot, nominal):
+def test_a_length_offset_shifts_the_controlled_posture(robot, nominal):
     arm = nominal()
     command = to_mid_range(robot, 80.0)
     drive(arm, command, 3.0)
@@ -151,7 +151,7 @@ def test_a_length_offset_shifts_the_reading_and_with_it_the_arm(robot, nominal):
     assert np.abs(arm.theta - before).max() > 0.01
 
 
-def test_heat_settles_where_the_two_resistors_of_each_module_say(robot):
+def test_temperatures_settle_at_the_steady_state_of_the_thermal_model(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     muscle, module = arm._muscle, arm._wound
     assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # no two modules are the same
@@ -168,7 +168,7 @@ def test_heat_settles_where_the_two_resistors_of_each_module_say(robot):
     np.testing.assert_allclose(arm.winding, housing + heat * module.winding_resistance, rtol=0.03)
 
 
-def test_same_seed_same_life(robot, reality):
+def test_the_same_seed_gives_the_same_motion(robot, reality):
     command = to_mid_range(robot, 80.0)
     lives = []
     for _ in range(2):
@@ -191,14 +191,14 @@ def test_reset_brings_the_arm_back_to_rest(robot, reality):
 
 def test_the_marker_is_seen_where_the_hand_is(robot, reality):
     arm = make_arm(robot, 0, reality)
-    seen = np.array([arm.marker_pose().translation for _ in range(200)])
+    observed = np.array([arm.marker_pose().translation for _ in range(200)])
     true = robot.kinematics.end_effector_pose(arm.theta).translation
-    np.testing.assert_allclose(seen.mean(axis=0), true, atol=1e-3)
-    assert 5e-4 < seen.std(axis=0).max() < 1e-2
+    np.testing.assert_allclose(observed.mean(axis=0), true, atol=1e-3)
+    assert 5e-4 < observed.std(axis=0).max() < 1e-2
 
 
 @pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
-def test_no_wrench_that_is_taken_breaks_it_and_reset_mends_one_that_does(name, reality):
+def test_no_legal_wrench_breaks_the_emulator_and_a_reset_mends_it(name, reality):
     robot, rng = Robot.load(name), np.random.default_rng(0)
     arm = make_arm(robot, 1, reality)
     for payload in (0.0, 20.0):
@@ -217,7 +217,7 @@ def test_no_wrench_that_is_taken_breaks_it_and_reset_mends_one_that_does(name, r
     assert np.abs(arm.velocity).max() < 10.0
 
 
-def test_the_sensor_of_a_joint_that_slides_is_off_by_millimetres(tmp_path, reality):
+def test_the_sensor_of_a_prismatic_joint_errs_by_millimetres(tmp_path, reality):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     arms = [make_arm(robot, seed, reality) for seed in range(3)]
     off = np.array([[arm.sense().theta[-1] - arm.theta[-1] for _ in range(30)] for arm in arms])
@@ -225,7 +225,7 @@ def test_the_sensor_of_a_joint_that_slides_is_off_by_millimetres(tmp_path, reali
     assert 1e-5 < off.std(axis=1).max() < 2e-4
 
 
-def test_a_joint_that_slides_stops_at_its_limits(tmp_path, reality):
+def test_a_prismatic_joint_stops_at_its_limits(tmp_path, reality):
     """As firmly as a joint that turns, driven by a pinion: 200 N go some millimetres beyond."""
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
     urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # the tool

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults on request: each does what it is named after, and only that, until it is mended."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.robot import Robot
 
 MUSCLE = 2
 
@@ -33,7 +30,7 @@ def delivered(robot, line, count=400, period=0.0078125):
     return [[int(one.length[0]) for one in readings] for readings in arrived]
 
 
-def test_readings_get_lost_come_late_twice_or_after_the_next(robot):
+def test_messages_are_dropped_delayed_duplicated_and_reordered(robot):
     assert delivered(robot, 'drop:0') == [[i] for i in range(400)]
     lost = delivered(robot, 'drop:0.25')
     assert 40 < sum(one == [] for one in lost) < 160
@@ -49,7 +46,7 @@ def test_readings_get_lost_come_late_twice_or_after_the_next(robot):
     np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
 
 
-def test_what_is_on_the_way_is_gone_once_it_is_late_no_more(robot):
+def test_ending_a_delay_discards_the_delayed_messages(robot):
     faults = Faults(robot, np.random.default_rng(0))
     for i, lines in enumerate(['delay:0.25'] * 50 + [''] * 50):
         faults.set([lines] if lines else [])
@@ -61,7 +58,7 @@ def test_what_is_on_the_way_is_gone_once_it_is_late_no_more(robot):
     assert len(faults.delivered(numbered(robot, 101), 1.1)) == 1
 
 
-def test_a_frozen_sensor_stays_frozen_whatever_else_breaks(arm, robot):
+def test_a_frozen_sensor_stays_frozen_when_another_fault_is_added(arm, robot):
     frozen, other = robot.muscles[MUSCLE], robot.muscles[MUSCLE + 1]
     lines = [f'freeze:tension:{frozen}']
     arm.faults.set(lines)
@@ -75,7 +72,7 @@ def sensed(arm, line, count=300):
     return [np.stack(arm.sense()[1:]) for _ in range(count)]
 
 
-def test_sensors_are_off_repeat_themselves_or_die(arm, robot):
+def test_sensors_are_offset_frozen_dead_or_spiky(arm, robot):
     healthy = np.mean(sensed(arm, 'drop:0'), axis=0)
     others = np.arange(robot.muscle_count) != MUSCLE
     name = robot.muscles[MUSCLE]
@@ -99,7 +96,7 @@ def test_sensors_are_off_repeat_themselves_or_die(arm, robot):
     assert np.all(np.sum(spikes > 90.0, axis=1) <= 1)
 
 
-def test_a_joint_s_sensor_errs_alone(arm, robot):
+def test_a_fault_of_one_joint_sensor_leaves_the_others(arm, robot):
     angles = np.array([arm.sense().theta for _ in range(300)])
     for line, expected in (('dead_sensor', 0.0), ('bias', 0.1 + angles[:, 1].mean())):
         arm.faults.set([f'{line}:{robot.joints[1]}'])
@@ -116,7 +113,7 @@ def hold(arm, robot, lines, seconds=1.5, tension=80.0):
     return arm.sense()
 
 
-def test_a_stuck_motor_stands_and_goes_on(arm, robot):
+def test_a_jammed_motor_stands_until_it_is_mended(arm, robot):
     before = arm.sense().length
     after = hold(arm, robot, [f'stuck_motor:{robot.muscles[MUSCLE]}']).length
     assert after[MUSCLE] == pytest.approx(before[MUSCLE], abs=1e-3)
@@ -124,7 +121,7 @@ def test_a_stuck_motor_stands_and_goes_on(arm, robot):
     assert abs(hold(arm, robot, []).length[MUSCLE] - before[MUSCLE]) > 0.005
 
 
-def test_a_slack_wire_is_wound_in(robot):
+def test_a_slack_tendon_is_wound_in(robot):
     healthy, slack = (EmulatedArm(robot, 1) for _ in range(2))
     before = hold(healthy, robot, []).length
     slack.faults.set([f'slack:{robot.muscles[MUSCLE]}'])
@@ -135,7 +132,7 @@ def test_a_slack_wire_is_wound_in(robot):
 
 
 @pytest.mark.parametrize('reality', ['kin', 'foreign'])
-def test_a_wire_that_is_slack_no_more_takes_up_the_bias(robot, reality):
+def test_ending_slack_causes_no_peak_of_tension(robot, reality):
     arm, name = make_arm(robot, 1, reality), robot.muscles[MUSCLE]
     command = to_mid_range(robot, 80.0)
     for slack in ([f'slack:{name}:0.1'], []):
@@ -153,21 +150,21 @@ def test_a_wire_that_is_slack_no_more_takes_up_the_bias(robot, reality):
     assert arm.tension[MUSCLE] > 0.5 * robot.tension.bias[MUSCLE]
 
 
-def test_a_slow_winch_takes_its_time(robot):
+def test_a_slow_winch_keeps_its_speed(robot):
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     lines = [f'slack:{name}', f'winch_speed:{name}:0.009']
     wound = hold(arm, robot, lines, 0.5).length - hold(arm, robot, lines, 2.5).length
     assert wound[MUSCLE] == pytest.approx(0.0225, abs=0.002)
 
 
-def test_winches_forget_their_zeros(arm):
+def test_unzeroed_winches_have_length_offsets(arm):
     before = arm.sense().length
     arm.faults.set(['unzeroed:0.1'])
     off = arm.sense().length - before
     assert (np.abs(off) > 0.038).all() and (np.abs(off) < 0.102).all() and np.ptp(off) > 0.05
 
 
-def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
+def test_an_overheated_module_is_hot_until_a_reset(arm, robot):
     name = robot.muscles[MUSCLE]
     hot = hold(arm, robot, [f'overheat:{name}:95'], 0.1).temperature
     assert hot[MUSCLE] > 90.0 and np.delete(hot, MUSCLE).max() < 40.0
@@ -180,39 +177,17 @@ def test_an_overheating_module_is_hot_and_cools_with_reset(arm, robot):
 
 @pytest.mark.parametrize(
     'line',
-    ['', 'melt', 'drop:2', 'drop:-0.1', 'drop:nan', 'delay:11', 'drop:arm26', 'stuck_motor:nobody',
-     'stuck_motor:3', 'bias:pressure', 'spike:length:inf', 'freeze:length:1', 'slack:1e308'],
-)  # fmt: skip
-def test_what_is_no_fault_is_refused_with_what_is_legal(line, arm):
+    ['melt', 'drop:2', 'spike:length:inf', 'stuck_motor:nobody', 'bias:pressure'],
+)
+def test_an_illegal_fault_is_refused_with_the_legal_ones(line, arm):
     arm.faults.set(['stuck_motor'])
     with pytest.raises(MusculoskeletalError, match='legal'):
         arm.faults.set(['drop', line])
     assert arm.faults.stuck.all()
 
 
-@pytest.mark.parametrize(
-    ('line', 'legal'),
-    [
-        ('drop:-1', 'sizes from 0 to 1 share'),
-        ('overheat:-300', 'sizes from 0 to 1000 °C'),
-        ('bias:40', 'sizes from -1 to 1 m of length'),
-        ('spike:tension:1e5', 'sizes from -10000 to 10000 N of tension'),
-    ],
-)
-def test_the_legal_sizes_are_told_with_their_unit(line, legal, robot):
-    with pytest.raises(MusculoskeletalError, match=f'{line}.*legal: {legal}'):
-        read_fault(line, robot)
-
-
-def test_a_muscle_may_be_called_like_a_number(robot):
-    names = tuple(map(str, range(robot.muscle_count)))
-    numbers = Robot(replace(robot.description, muscles=names))
-    assert read_fault('slack:1', numbers)[2:] == (1, 0.05)
-    assert read_fault('slack:1:0.2', numbers)[2:] == (1, 0.2)
-
-
 @pytest.mark.parametrize('name', KINDS)
-def test_every_kind_is_legal_by_its_name_alone_and_mended(name, arm, robot):
+def test_every_kind_of_fault_can_be_set_by_name_and_mended(name, arm, robot):
     assert read_fault(name, robot).kind == name
     arm.faults.set([name])
     hold(arm, robot, [name], 0.2)

@@ -34,7 +34,7 @@ def test_the_nominal_body_is_the_geometric_model():
     )
 
 
-def test_a_seed_is_one_individual_and_another_seed_is_another():
+def test_a_seed_determines_the_individual():
     robot = Robot.load('arm26')
     theta = robot.random_postures(5, np.random.default_rng(0))
     one, same, other = (Individual(robot, s).absolute_lengths(theta) for s in (4, 4, 5))
@@ -43,7 +43,7 @@ def test_a_seed_is_one_individual_and_another_seed_is_another():
     assert np.abs(one - robot.routes.absolute_lengths(theta)).max() > 1e-3
 
 
-def test_a_thicker_or_thinner_drum_is_no_ring_and_a_ring_no_drum(tmp_path):
+def test_individuals_keep_drums_drums_and_rings_rings(tmp_path):
     document = read_muscles(write_robot(tmp_path))
     for m, share in ((6, 1.02), (7, 0.98)):
         side = {'side': [-0.03 * share, 0.0, -0.3]}

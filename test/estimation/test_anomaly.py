@@ -60,14 +60,14 @@ def test_without_statistics_there_is_no_distance(mae, judge, wound):
     assert np.isnan(verdict.distance) and np.isfinite(verdict.anomaly) and not verdict.cause
 
 
-def test_statistics_of_the_geometric_model_decide_nothing(mae, judge, wound):
+def test_statistics_of_the_geometric_model_detect_no_anomaly(mae, judge, wound):
     detector, verdicts = judge(mae)
     assert not detector.calibrated
     assert not any(verdict.cause for verdict in verdicts(wound, 3 * IN_A_ROW))
 
 
 @pytest.mark.parametrize(('threshold', 'named'), [(0.0, 'd = '), (0.2, 'A = ')])
-def test_a_decision_takes_five_messages_running(
+def test_an_anomaly_takes_five_messages_in_a_row(
     calibrated, judge, healthy, wound, threshold, named
 ):
     _, verdicts = judge(calibrated, threshold)
@@ -88,7 +88,7 @@ def test_a_reset_starts_the_count_anew(calibrated, judge, wound):
 
 
 @pytest.mark.parametrize('by_length', [True, False])
-def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack, by_length):
+def test_a_muscle_without_its_commanded_tension_is_an_anomaly(mae, judge, slack, by_length):
     detector, verdicts = judge(mae)
     messages = round(DEAD_TIME / DT) + 1
     assert not any(verdict.cause for verdict in verdicts(slack, messages))  # no command: no demand
@@ -101,14 +101,14 @@ def test_a_muscle_without_the_tension_it_is_commanded_is_dead(mae, judge, slack,
     assert 'no tension' in judged[-1].cause and judged[-1].suspect == 2
 
 
-def test_a_muscle_paid_out_to_nothing_is_not_dead(robot, mae, judge, slack):
+def test_a_muscle_that_is_paid_out_to_no_tension_is_no_anomaly(robot, mae, judge, slack):
     detector, verdicts = judge(mae)
     detector.commanded(tension=np.full(6, 0.5 * robot.tension.bias))
     assert not any(verdict.cause for verdict in verdicts(slack, 100))
 
 
 @pytest.mark.parametrize('moves', [True, False])
-def test_what_the_arm_s_own_motion_shortens_is_no_slack_wound_in(robot, mae, judge, moves):
+def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot, mae, judge, moves):
     detector, _ = judge(mae)
     steps = round(1.6 * DEAD_TIME / DT)
     theta = np.linspace(robot.lower, robot.upper, steps)
@@ -137,7 +137,7 @@ def test_what_the_arm_s_own_motion_shortens_is_no_slack_wound_in(robot, mae, jud
         (0.0, 1.5, 1, True),
     ],
 )
-def test_far_from_what_was_calibrated_less_is_sure_but_not_of_a_slack_muscle(
+def test_the_distance_counts_less_far_from_calibrated_postures_except_for_a_slack_muscle(
     robot, calibrated, judge, healthy, away, most, cut, found
 ):
     tension = np.where(np.arange(6) == 0, most * robot.tension.limit, healthy.tension)
@@ -152,7 +152,7 @@ def test_far_from_what_was_calibrated_less_is_sure_but_not_of_a_slack_muscle(
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
+def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
     calibrated, judge, healthy, wound, slack, known
 ):
     largest = judge(calibrated)[1](healthy)[0].anomaly
@@ -169,17 +169,17 @@ def test_preset_paper_decides_on_a_alone_once_it_knows_the_healthy_arm(
 
 @pytest.mark.parametrize('kind', ['length', 'tension'])
 @pytest.mark.parametrize('wound', [-0.01, 0.01])
-def test_a_winch_that_stands_whatever_is_commanded_is_jammed(robot, mae, wound, kind):
+def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, wound, kind):
     detector, rng, named = AnomalyDetector(robot), np.random.default_rng(0), []
     detector.use(mae)
     theta, tension = np.array([0.1, -1.0]), np.where(np.arange(6) == 3, 100.0, 60.0)
     state = State(theta, tension, mae.lengths(theta, tension))
-    told = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
+    reported = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
     for n in range(300):
         length = state.length + 1e-4 * rng.standard_normal(6)
         length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
-        told[0] = 140.0 if n < 200 else 60.0
-        command = {'length': length - (told - 30.0) / 1e4, 'tension': told}
+        reported[0] = 140.0 if n < 200 else 60.0
+        command = {'length': length - (reported - 30.0) / 1e4, 'tension': reported}
         detector.commanded(**{kind: command[kind]})
         verdict = detector.step(state, tension, tension, length, 0.01)
         named += [(n, verdict.suspect)] * ('its winch stands' in verdict.cause)

@@ -44,7 +44,7 @@ def stepped(robot, calibrated):
     return Stepped(robot, calibrated)
 
 
-def test_without_a_network_it_waits(robot, healthy):
+def test_the_estimator_waits_for_a_checkpoint(robot, healthy):
     core = Estimator(robot)
     assert core.step(*healthy, 0.0, 0.0) is None
     assert core.report(0.0) == ('warn', 'waiting for a checkpoint', {})
@@ -57,7 +57,9 @@ def test_the_estimate_is_the_networks(stepped, calibrated, healthy):
         np.testing.assert_array_equal(got, want)
 
 
-def test_it_says_whether_it_estimates_and_how_sure_the_detector_is(stepped, mae, healthy):
+def test_the_report_says_whether_it_estimates_and_whether_the_detector_is_calibrated(
+    stepped, mae, healthy
+):
     stepped.step(healthy)
     assert stepped.report()[:2] == ('ok', 'estimating')
     stepped.core.use(replace(mae, version=7))
@@ -68,7 +70,9 @@ def test_it_says_whether_it_estimates_and_how_sure_the_detector_is(stepped, mae,
     assert stepped.report()[:2] == ('warn', 'no muscle_states')
 
 
-def test_statistics_that_cannot_be_used_leave_the_network_in_use(stepped, calibrated, healthy):
+def test_a_network_with_singular_statistics_is_refused_and_the_one_in_use_stays(
+    stepped, calibrated, healthy
+):
     singular = replace(calibrated.anomaly, covariance=np.zeros((12, 12)))
     with pytest.raises(np.linalg.LinAlgError):
         stepped.core.use(replace(calibrated, version=9, anomaly=singular))
@@ -76,9 +80,11 @@ def test_statistics_that_cannot_be_used_leave_the_network_in_use(stepped, calibr
     assert np.isfinite(stepped.step(healthy)[0].anomaly)
 
 
-def test_an_anomaly_is_told_once_and_latched_with_its_first_suspect(stepped, robot, healthy, wound):
-    told = [estimate.detected for estimate in stepped.step(wound, 10)]
-    assert told.index(True) == 4 and sum(told) == 1
+def test_an_anomaly_is_detected_once_and_latched_with_its_first_suspect(
+    stepped, robot, healthy, wound
+):
+    reported = [estimate.detected for estimate in stepped.step(wound, 10)]
+    assert reported.index(True) == 4 and sum(reported) == 1
     suspect = robot.muscles[1]
     assert stepped.core.cause.startswith(f'{suspect}: ')
     stepped.step(healthy, 10)
@@ -90,7 +96,7 @@ def test_an_anomaly_is_told_once_and_latched_with_its_first_suspect(stepped, rob
     assert any(estimate.detected for estimate in stepped.step(wound, 5))
 
 
-def test_a_jump_of_the_clock_forgets_counts_but_not_the_latch(stepped, wound):
+def test_a_jump_of_the_clock_clears_counts_but_not_the_latched_anomaly(stepped, wound):
     stepped.step(wound, 4)
     stepped.core.clock_jumped_back()
     assert not any(estimate.detected for estimate in stepped.step(wound, 4))
@@ -99,7 +105,7 @@ def test_a_jump_of_the_clock_forgets_counts_but_not_the_latch(stepped, wound):
     assert stepped.core.cause
 
 
-def test_an_old_command_accuses_nobody(robot, mae, slack):
+def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
     stepped = Stepped(robot, mae)
     stepped.core.commanded(stepped.now, length=slack.length - 0.003)
     stepped.now += COMMAND_AGE
@@ -110,7 +116,7 @@ def test_an_old_command_accuses_nobody(robot, mae, slack):
     assert any(estimate.detected for estimate in stepped.step(slack, 2))
 
 
-def test_a_pause_of_the_messages_is_no_time_without_tension(robot, mae, slack):
+def test_a_pause_between_messages_does_not_count_as_time_without_tension(robot, mae, slack):
     stepped = Stepped(robot, mae)
     for _ in range(round(DEAD_TIME / LONGEST_PERIOD)):
         stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
@@ -120,7 +126,7 @@ def test_a_pause_of_the_messages_is_no_time_without_tension(robot, mae, slack):
 
 
 @pytest.mark.parametrize('network', [True, False])
-def test_a_muscle_is_isolated_only_if_all_messages_of_a_moment_lack_it(
+def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messages_for_a_while(
     robot, mae, healthy, network
 ):
     core = Estimator(robot)
@@ -142,11 +148,11 @@ def test_a_muscle_is_isolated_only_if_all_messages_of_a_moment_lack_it(
     assert any(core.unread(broken, now + 0.01 * n) for n in range(1, 20))
 
 
-def test_a_marker_gives_the_joint_angles_that_put_it_there(stepped, robot, healthy):
+def test_a_marker_pose_gives_the_joint_angles_that_reach_it(stepped, robot, healthy):
     stepped.step(healthy)
     theta = robot.lower + 0.4 * (robot.upper - robot.lower)
-    seen = stepped.core.see(robot.kinematics.end_effector_pose(theta))
-    np.testing.assert_allclose(seen, theta, atol=1e-3)
+    observed = stepped.core.see(robot.kinematics.end_effector_pose(theta))
+    np.testing.assert_allclose(observed, theta, atol=1e-3)
 
 
 def test_a_marker_that_the_arm_cannot_reach_is_refused(stepped):

@@ -49,11 +49,13 @@ def still(_, stir):
         (lambda _, shake: BIAS - 12.0 + shake, still, 0.0, 'jammed'),
     ],
 )  # fmt: skip
-def test_what_a_suspect_does_tells_what_it_is(tension, length, likely, found):
+def test_verification_recognises_the_fault_by_the_response_to_winding_in(
+    tension, length, likely, found
+):
     assert verdict(tension, length, likely).startswith(found)
 
 
-def test_whom_nobody_winds_in_stays_isolated():
+def test_a_suspect_that_is_not_wound_in_stays_isolated():
     watched = Verification(0, BIAS, STIFFNESS)
     answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]
     assert 'nobody' in answers[-1]
@@ -90,7 +92,7 @@ def cut(slack):
     return slack._replace(length=slack.length - 0.2 * (np.arange(6) == 2))
 
 
-def test_a_cut_muscle_is_isolated_at_once_and_stays_so(loop, robot, healthy, cut):
+def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
     assert loop.core.cause.startswith(robot.muscles[2])
@@ -115,7 +117,7 @@ def test_a_cut_muscle_is_isolated_at_once_and_stays_so(loop, robot, healthy, cut
     assert loop.core.mae.isolated == ()
 
 
-def test_a_healthy_suspect_is_used_again_but_not_acquitted_for_ever(loop, healthy, wound):
+def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, healthy, wound):
     for count in range(3):
         loop.command = healthy.length - (healthy.tension - 30.0) / 1e4
         loop.step(healthy, 30)
@@ -137,7 +139,7 @@ def test_a_healthy_suspect_is_used_again_but_not_acquitted_for_ever(loop, health
     assert loop.core.cause
 
 
-def test_stop_is_the_default_and_isolates_nobody(robot, calibrated, healthy, cut):
+def test_on_anomaly_stop_is_the_default_and_isolates_no_muscle(robot, calibrated, healthy, cut):
     loop = Loop(robot, calibrated, healthy)
     loop.core.detector.settings = Detection()
     loop.step(cut, 1000)
@@ -145,7 +147,7 @@ def test_stop_is_the_default_and_isolates_nobody(robot, calibrated, healthy, cut
     assert loop.core.robot.isolated == ()
 
 
-def test_a_reset_while_it_is_verified_takes_the_suspect_back(loop, healthy, cut):
+def test_a_reset_during_verification_restores_the_suspect(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
     loop.core.reset()
@@ -153,7 +155,7 @@ def test_a_reset_while_it_is_verified_takes_the_suspect_back(loop, healthy, cut)
     assert loop.core.cause == ''
 
 
-def test_a_suspect_that_is_used_again_is_not_verified_and_the_anomaly_stays(loop, healthy, cut):
+def test_a_suspect_restored_during_verification_leaves_the_anomaly_latched(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
     cause = loop.core.cause
@@ -162,7 +164,7 @@ def test_a_suspect_that_is_used_again_is_not_verified_and_the_anomaly_stays(loop
     assert loop.core.cause == cause
 
 
-def test_a_sensor_that_stands_still_while_the_arm_moves_is_named(robot, calibrated, healthy):
+def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calibrated, healthy):
     rng, frozen = np.random.default_rng(0), 3
     quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
     core = Estimator(robot)
@@ -180,7 +182,7 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_named(robot, calibrat
     assert core.cause == f'{robot.muscles[frozen]}: a sensor stands still while the arm moves'
 
 
-def test_a_tension_that_stays_at_bias_to_the_bit_is_no_dead_sensor(robot, calibrated, healthy):
+def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, calibrated, healthy):
     # As of a simulated module whose wire is paid out.
     rng, paid_out = np.random.default_rng(0), 3
     core = Estimator(robot)
@@ -196,7 +198,7 @@ def test_a_tension_that_stays_at_bias_to_the_bit_is_no_dead_sensor(robot, calibr
 
 
 @pytest.mark.parametrize('scale', [1.0, 0.1])
-def test_a_weak_muscle_is_jammed_as_a_strong_one_is(scale):
+def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
     # It stays at T_bias, demanded three times that.
     watched = Verification(0, scale * BIAS, scale * STIFFNESS)
     for n, (shake, stir) in enumerate(NOISE):

@@ -38,35 +38,37 @@ def noticed(robot, mae, slack):
     return run
 
 
-def test_a_module_that_stands_has_a_cut_muscle_after_half_a_second(noticed):
+def test_a_standing_module_without_tension_is_a_rupture_after_half_a_second(noticed):
     assert noticed(0.0, 0.0) <= DEAD_TIME + DT
 
 
 @pytest.mark.parametrize('speed', [0.009, 0.036])
-def test_a_slow_winch_may_take_up_slack(noticed, speed):
+def test_a_slow_winch_is_given_time_to_take_up_slack(noticed, speed):
     slack = 0.03
     assert noticed(speed, slack) >= slack / speed
     assert noticed(speed, slack) <= slack / speed + DEAD_TIME + 3 * DT
 
 
 @pytest.mark.parametrize('speed', [0.009, 0.036, 0.25])
-def test_no_slack_is_longer_than_the_limit(noticed, speed):
+def test_slack_beyond_the_limit_is_a_rupture(noticed, speed):
     longest = Detection().slack_length
     expected = max(DEAD_TIME, longest / speed)
     assert expected - 2 * DT <= noticed(speed, 1.0) <= expected + DEAD_TIME
 
 
-def test_the_limits_are_parameters(noticed):
+def test_the_limits_of_slack_are_parameters(noticed):
     assert noticed(0.036, 0.2, settings=Detection(slack_length=0.15)) >= 0.15 / 0.036 - DT
     assert noticed(0.036, 0.2, settings=Detection(slack_speed=0.05)) <= DEAD_TIME + DT
 
 
-def test_noise_of_the_sensor_is_no_winding(noticed):
+def test_noise_of_the_length_sensor_does_not_count_as_winding_in(noticed):
     assert noticed(0.001, 1.0) <= 2.0 * DEAD_TIME
 
 
 @pytest.mark.parametrize(('loose', 'found'), [(0.04, False), (-0.02, True)])
-def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, loose, found):
+def test_the_distance_waits_for_slack_but_not_for_a_rupture(
+    robot, calibrated, healthy, loose, found
+):
     """By a slow winch both look alike, but what is left of a cut wire is too short."""
     detector = AnomalyDetector(robot)
     detector.use(calibrated)
@@ -83,7 +85,9 @@ def test_d_waits_for_slack_but_not_for_a_cut_muscle(robot, calibrated, healthy, 
 
 @pytest.mark.parametrize('speed', [0.009, 0.036])
 @pytest.mark.parametrize('commanded', [True, False])
-def test_an_emulated_slow_winch_takes_up_slack_without_alarm(robot, calibrated, speed, commanded):
+def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
+    robot, calibrated, speed, commanded
+):
     """Before calibration, and before any command as well."""
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     arm.step(3.0)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What pushes the arm from outside: exact on an exact body image, silent where nothing does."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def felt(core, theta, tension):
 
 @pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('size', [-20.0, 20.0])
-def test_a_force_of_the_hand_is_found_and_its_opposite_too(axis, size):
+def test_a_force_on_the_hand_is_estimated_in_every_direction(axis, size):
     force = size * np.eye(3)[axis]
     core = observer()
     touch = felt(core, THETA, pulling(THETA, force)[0])
@@ -53,21 +54,21 @@ def test_a_force_of_the_hand_is_found_and_its_opposite_too(axis, size):
     assert touch.contact
 
 
-def test_an_arm_that_nothing_touches_feels_nothing():
+def test_a_free_arm_has_no_external_force_and_no_contact():
     touch = felt(observer(), THETA, pulling(THETA)[0])
     np.testing.assert_allclose(touch.torque, 0.0, atol=0.02)
     np.testing.assert_allclose(touch.force(), 0.0, atol=0.2)
     assert not touch.contact
 
 
-def test_a_planar_arm_feels_nothing_across_its_plane(robot):
+def test_a_planar_arm_estimates_no_force_across_its_plane(robot):
     theta = 0.5 * (robot.lower + robot.upper)
     core = observer(spread=np.full(2, 0.2), robot=robot)
     touch = felt(core, theta, pulling(theta, (5.0, 0.0, -5.0), robot)[0])
     np.testing.assert_allclose(touch.force(), [5.0, 0.0, -5.0], atol=0.5)
 
 
-def test_friction_that_is_known_is_no_force():
+def test_known_tendon_friction_is_not_taken_for_a_force():
     tension, length = pulling(THETA)
     wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # s = 1: the motor pulls more
     errors = []
@@ -80,7 +81,7 @@ def test_friction_that_is_known_is_no_force():
     assert errors[1] < 0.05 < 0.2 < errors[0]
 
 
-def test_inertia_is_no_force():
+def test_inertia_is_not_taken_for_a_force():
     """A swing whose muscles give just the torque of inverse dynamics."""
     core, largest, free, rate = observer(), 0.0, 0.0, 3.0
     for n in range(300):
@@ -98,7 +99,7 @@ def test_inertia_is_no_force():
     assert largest < 0.5 * free
 
 
-def test_a_joint_at_its_stop_says_nothing_of_what_the_stop_bears():
+def test_a_joint_at_its_stop_reports_no_torque_that_the_stop_carries():
     tension, _ = pulling(THETA)
     torques = []
     for joint in range(5):
@@ -116,7 +117,7 @@ def test_without_statistics_there_is_a_force_but_no_contact():
 
 
 @pytest.mark.filterwarnings('ignore:invalid value')
-def test_a_message_that_is_no_number_is_forgotten():
+def test_a_message_that_is_not_finite_leaves_no_trace():
     core, (tension, _) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
     touch = core.step(np.full(5, np.nan), tension, DT)
     np.testing.assert_array_equal(touch.force(), 0.0)
@@ -124,7 +125,7 @@ def test_a_message_that_is_no_number_is_forgotten():
     np.testing.assert_allclose(felt(core, THETA, tension).force(), [20.0, 0.0, 0.0], atol=1.0)
 
 
-def test_an_arm_that_moved_unseen_was_not_pushed(robot, mae):
+def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
     statistics = TouchStatistics(mae.friction, np.full(2, 0.25), LEAST_MOTION)
     mae = replace(mae, touch=statistics)
     core, middle, time = Estimator(robot), 0.5 * (robot.lower + robot.upper), 0.0
@@ -142,44 +143,52 @@ def test_an_arm_that_moved_unseen_was_not_pushed(robot, mae):
 
 
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
-def test_it_is_stable_at_any_rate(dt):
+def test_the_observer_is_stable_at_any_rate(dt):
     core, (tension, _) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
     for _ in range(200):
         touch = core.step(THETA, tension, dt)
     np.testing.assert_allclose(touch.force(), [0.0, 20.0, 0.0], atol=1.0)
 
 
-class Known(ExactMae):
-    """An exact image that estimates what it is told."""
+@dataclass
+class StatedPosture:
+    """An exact body image that estimates the posture it is given."""
+
+    theta: np.ndarray
+    touch: TouchStatistics
+    exact = ExactMae(ARM)
+    friction = exact.friction
 
     def estimate(self, *_):
-        return type('State', (), {'theta': self.theta})
+        return SimpleNamespace(theta=self.theta)
+
+    def muscle_jacobian(self, theta, tension):
+        return self.exact.muscle_jacobian(theta, tension)
 
 
-def test_statistics_are_of_motion_and_a_touch_hardly_counts():
-    core, mae = HealthyTorque(ARM), Known(ARM)
-    mae.touch = None
-    core.use(mae)
+def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts():
+    unknown = TouchStatistics(np.zeros(10), np.zeros(5), 0.0)
+    core, image = HealthyTorque(ARM), StatedPosture(THETA.copy(), unknown)
+    core.use(image)
     rng = np.random.default_rng(0)
     tension, length = pulling(THETA)
 
     def move(seconds, push=0.0):
         for n in range(round(seconds / DT)):
-            mae.theta = THETA + 0.3 * np.sin(2.0 * n * DT)
-            wrong = push + rng.normal(0.0, 20.0, 10)
-            core.step(tension + wrong, length, DT)
+            image.theta[:] = THETA + 0.3 * np.sin(2.0 * n * DT)
+            noise = rng.normal(0.0, 20.0, 10)
+            core.step(tension + push + noise, length, DT)
 
-    mae.theta = THETA
     for _ in range(100):
         core.step(tension, length, DT)
-    assert core._time == 0.0  # it rested
+    assert core.use(image).touch.time == 0.0  # it rested
     move(LEAST_MOTION + 20.0)
-    healthy = np.sqrt(core._square)
+    healthy = core.use(image).touch.spread
     move(1.0, push=500.0)
-    assert (np.sqrt(core._square) < 1.5 * healthy).all()
+    assert (core.use(image).touch.spread < 1.5 * healthy).all()
 
 
-def test_the_estimator_says_what_touches_the_arm(robot, mae):
+def test_the_estimator_reports_contacts(robot, mae):
     statistics = TouchStatistics(np.zeros(6), np.full(2, 0.1), LEAST_MOTION)
     core, theta = Estimator(robot), 0.5 * (robot.lower + robot.upper)
     core.use(replace(mae, touch=statistics))

@@ -28,20 +28,20 @@ def errors(estimate, theta):
     return np.linalg.norm(estimate - theta, axis=1)
 
 
-def test_elongation_is_taken_off_exactly(robot, motion):
+def test_the_elongation_is_removed_exactly(robot, motion):
     theta, tension, length = motion
     off = unstretched(robot, tension, length) - robot.routes.relative_lengths(theta)
     assert np.abs(off).max() < 1e-5  # second order in wire stretch times elongation
 
 
-def test_the_filter_on_a_polynomial_mapping_follows_the_motion(robot, motion):
+def test_the_polynomial_filter_follows_the_motion(robot, motion):
     theta, tension, length = motion
     estimate = PolynomialFilter(robot).estimate(tension, length)
     # What polynomials of degree 3 leave of these muscles is a few hundredths of a radian.
     assert errors(estimate, theta)[20:].mean() < 0.05
 
 
-def test_table_search_is_as_fine_as_its_table(robot, motion):
+def test_table_search_errs_by_less_than_its_spacing(robot, motion):
     theta, tension, length = motion
     estimate = TableSearch(robot).estimate(tension, length)
     spacing = (robot.upper - robot.lower) / TableSearch.ROWS ** (1.0 / robot.joint_count)
@@ -49,7 +49,7 @@ def test_table_search_is_as_fine_as_its_table(robot, motion):
 
 
 @pytest.mark.parametrize('kind', [PolynomialFilter, TableSearch])
-def test_what_can_learn_follows_a_body_with_other_lengths(robot, motion, kind):
+def test_baselines_that_learn_improve_on_a_body_with_other_lengths(robot, motion, kind):
     rng = np.random.default_rng(0)
 
     def other(theta, tension):
@@ -59,13 +59,14 @@ def test_what_can_learn_follows_a_body_with_other_lengths(robot, motion, kind):
         middle[:, 1:] = 0.5 * (robot.lower + robot.upper)[1:]
         return lengths + 0.2 * robot.routes.relative_lengths(middle)
 
-    seen = robot.random_postures(3000, rng)
+    observed = robot.random_postures(3000, rng)
     pull = rng.uniform(30.0, 130.0, (3000, robot.muscle_count))
     theta, tension, _ = motion
-    untaught, taught = kind(robot), kind(robot)
-    taught.learn(seen, pull, other(seen, pull))
+    initial_baseline, trained_baseline = kind(robot), kind(robot)
+    trained_baseline.learn(observed, pull, other(observed, pull))
     length = other(theta, tension)
     before, after = (
-        errors(each.estimate(tension, length), theta)[20:].mean() for each in (untaught, taught)
+        errors(each.estimate(tension, length), theta)[20:].mean()
+        for each in (initial_baseline, trained_baseline)
     )
     assert after < before

@@ -3,8 +3,8 @@
 
 import numpy as np
 import pytest
+from nominal_body import nominal_arm
 
-from bench.control_nominal import nominal_arm, nominal_tables
 from musculoskeletal_ae.experiments.control import METHODS, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 
@@ -27,7 +27,7 @@ def test_a_posture_at_the_target_needs_the_bound(ended):
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 
-def test_where_a_controller_stops_all_else_is_measured(arm26, trained, monkeypatch):
+def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monkeypatch):
     target = ClosedLoop.target
 
     def stopping(loop, theta):
@@ -39,9 +39,3 @@ def test_where_a_controller_stops_all_else_is_measured(arm26, trained, monkeypat
     ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
     assert ended.stops == {name: int(name == 'geometric') for name in METHODS}
     assert all(np.isfinite(offset).all() for offset in ended.offset.values())
-
-
-def test_the_table_of_the_nominal_body_names_every_method(arm26, trained):
-    table = nominal_tables(arm26, trained['default'], trained['paper'], quick=True)
-    for word in ('bound', 'proposed, paper', 'second', 'stiffness', 'torque'):
-        assert word in table

@@ -41,7 +41,7 @@ class Fake:
             self.off.append(np.zeros(len(self.tension), dtype=bool) if off is None else off)
 
 
-def test_grasp_comes_midway_and_every_muscle_is_cut_once_and_mended(arm26):
+def test_the_script_grasps_midway_and_ruptures_and_mends_every_muscle_once(arm26):
     plan = GraspAndCut(arm26, 4.0, seed=0)
     arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
     arm.follow(plan, plan.duration)
@@ -56,7 +56,7 @@ def test_grasp_comes_midway_and_every_muscle_is_cut_once_and_mended(arm26):
         assert (cut - 4.0) // SLOT == (mended - 4.0) // SLOT
 
 
-def test_a_muscle_that_never_carries_tension_is_cut_at_the_end_of_its_wait(arm26):
+def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(arm26):
     plan = GraspAndCut(arm26, 4.0, seed=0)
     Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
     assert not plan.carried.any()
@@ -64,7 +64,7 @@ def test_a_muscle_that_never_carries_tension_is_cut_at_the_end_of_its_wait(arm26
     assert plan.counted.tolist() == list(range(arm26.muscle_count))  # rather all than none
 
 
-def test_a_muscle_that_is_switched_off_keeps_its_wire_and_is_commanded_no_tension(arm26):
+def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):
     plan = GraspAndCut(arm26, 4.0, seed=0, switched_off=True)
     arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
     arm.follow(plan, plan.duration)
@@ -74,7 +74,7 @@ def test_a_muscle_that_is_switched_off_keeps_its_wire_and_is_commanded_no_tensio
     assert off.sum(axis=1).max() == 1
 
 
-def test_on_the_arm_a_switched_off_muscle_goes_slack_and_the_others_hold(arm26, trained):
+def test_a_switched_off_muscle_of_the_arm_goes_slack_and_the_others_hold(arm26, trained):
     def script(_, time):
         return np.arange(6) == 1 if time >= 6.0 else None
 
@@ -86,13 +86,13 @@ def test_on_the_arm_a_switched_off_muscle_goes_slack_and_the_others_hold(arm26, 
     assert np.abs(taken.length[-1] - taken.length[599]).max() < 0.05  # nothing winds in
 
 
-def test_the_weight_is_grasped_and_released_every_minute(arm26):
+def test_the_payload_changes_every_minute(arm26):
     arm = Fake(arm26, 0.0)
     arm.follow(grasp_and_release, 181.0)
     assert arm.done == [(0.0, 0.0), (60.0, PAYLOAD), (120.0, 0.0), (180.0, PAYLOAD)]
 
 
-def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, trained):
+def test_only_an_alarm_that_begins_after_the_rupture_counts_as_detection(arm26, trained):
     plan = GraspAndCut(arm26, 4.0, seed=0)
     count, muscles = round(plan.duration / 0.01), arm26.muscle_count
     plan.cut, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
@@ -101,9 +101,9 @@ def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, trained):
     alarm[starts[0] + 9 : starts[0] + 20] = True  # noticed after 0.1 s, named rightly
     alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, and muscle 0 is named
     alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
-    seen = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
+    observed = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
     well = Watched(*(np.zeros(5, dtype=bool) for _ in range(5)))
-    numbers = detection(arm26, plan, seen, well, trained['default'])
+    numbers = detection(arm26, plan, observed, well, trained['default'])
     cuts = list(numbers['cuts'].values())
     assert [cut['detected'] for cut in cuts[:3]] == [True, True, False]
     assert [cut['named'] for cut in cuts[:3]] == [True, False, False]
@@ -112,7 +112,7 @@ def test_only_an_alarm_that_begins_after_the_cut_has_noticed_it(arm26, trained):
     assert numbers['false_alarms'] == 0 and numbers['false_alarms_beside_cuts'] == 1
 
 
-def test_auroc_is_the_share_of_pairs_in_the_right_order():
+def test_auroc_is_the_share_of_correctly_ordered_pairs():
     assert auroc(np.array([0.0, 1.0]), np.array([2.0, 3.0])) == 1.0
     assert auroc(np.array([2.0, 3.0]), np.array([0.0, 1.0])) == 0.0
     assert auroc(np.array([1.0, 3.0]), np.array([2.0])) == 0.5

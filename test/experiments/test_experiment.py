@@ -34,10 +34,7 @@ KEYS = {
     'sensors': 'all_rad elbow_only_rad none_rad marker_tenth_rad imu_rad before_rad '
     'ellipsoid_share',
 }
-REALITY = (
-    'before_rad after_rad paper_after_rad oracle_rad informed_oracle_rad frozen_after_rad '
-    'samples_to_halve'
-)
+REALITY = 'before_rad after_rad paper_after_rad oracle_rad informed_oracle_rad samples_to_halve'
 METHODS = ('geometric', 'first', 'second', 'proposed', 'second_paper', 'proposed_paper')
 
 
@@ -69,7 +66,7 @@ class Links(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_every_module_that_is_an_experiment_can_be_named():
+def test_every_module_with_an_experiment_is_registered():
     modules = pkgutil.iter_modules(experiments.__path__, f'{experiments.__name__}.')
     loaded = [importlib.import_module(module.name) for module in modules]
     defined = [module.EXPERIMENT for module in loaded if hasattr(module, 'EXPERIMENT')]
@@ -91,12 +88,10 @@ def test_control_has_every_method_of_the_paper(quick):
         assert {'error_rad', 'error_var', 'tension_n'} <= set(content[method])
 
 
-def test_robustness_has_both_bodies_and_says_why_there_is_no_frozen_learner(quick):
+def test_robustness_has_both_emulator_models_and_says_why_a_number_is_missing(quick):
     content = result(quick, 'robustness')
     for reality in ('kin', 'foreign'):
         assert set(REALITY.split()) <= set(content[reality])
-        assert content[reality]['frozen_after_rad'] is None
-    assert 'quick' in content['frozen']
     # Sensors and friction of the first body are all that is wrong with it beside its geometry.
     kin = content['kin']
     assert kin['informed_oracle_rad'] < min(kin['oracle_rad'], kin['least_squares_rad'])
@@ -113,7 +108,7 @@ def test_every_experiment_draws_the_plots_it_lists(quick, name):
         assert plot['caption']
 
 
-def test_the_report_is_one_well_formed_page_that_needs_nothing_else(quick):
+def test_the_report_is_one_well_formed_page_without_external_files(quick):
     page = (quick / 'report.html').read_text(encoding='utf-8')
     links = Links()
     links.feed(page)
@@ -131,17 +126,7 @@ def test_the_report_has_the_papers_numbers_and_the_command_to_repeat_it(quick):
     assert 'experiment all --robot arm26 --preset default --seeds 0 --minutes 0.35 --quick' in page
 
 
-@pytest.mark.parametrize('name', EXPERIMENTS)
-def test_the_report_explains_every_experiment(quick, name):
-    page = (quick / 'report.html').read_text(encoding='utf-8')
-    title, *parts = EXPERIMENTS[name].text.split('\n\n')
-    assert f'<h2 id="{name}">{title.rstrip(".")}</h2>' in page
-    for part, heading in zip(parts, ('Paper', 'Here'), strict=True):
-        words = part.removeprefix(f'{heading}. ').partition('\n')[0].partition(' `')[0]
-        assert f'<b>{heading}.</b> {words}' in page
-
-
-def test_the_report_says_by_how_much_an_aim_is_missed(quick, tmp_path):
+def test_the_report_names_missed_aims_and_their_difference(quick, tmp_path):
     folder = tmp_path / 'bad'
     shutil.copytree(quick, folder)
     content = result(folder, 'control')
@@ -152,7 +137,7 @@ def test_the_report_says_by_how_much_an_aim_is_missed(quick, tmp_path):
     assert 'proposed, distance from θ_eval [rad]' in page.split('Aims missed:')[1].split('</p>')[0]
 
 
-def test_the_report_of_one_experiment_has_that_one_only(quick, tmp_path):
+def test_the_report_of_one_experiment_contains_only_that_one(quick, tmp_path):
     shutil.copytree(quick / 'body_change', tmp_path / 'body_change')
     page = write_report(tmp_path).read_text(encoding='utf-8')
     assert page.count('<h2 id=') == 1
@@ -163,15 +148,8 @@ def test_the_report_of_one_experiment_has_that_one_only(quick, tmp_path):
     'wrong',
     [
         ['nothing'],
-        ['control,nothing'],
-        [],
-        ['all', '--seeds', '0,x'],
         ['all', '--seeds', '1,1'],
-        ['all', '--seeds', '-1'],
         ['all', '--minutes', '0'],
-        ['all', '--minutes', 'nan'],
-        ['all', '--jobs', '0'],
-        ['all', '--preset', 'best'],
     ],
 )
 def test_bad_options_end_with_status_2(wrong, capsys):
@@ -181,7 +159,7 @@ def test_bad_options_end_with_status_2(wrong, capsys):
     assert 'error' in capsys.readouterr().err
 
 
-def test_a_robot_that_is_not_there_ends_with_status_1(tmp_path, capsys):
+def test_a_missing_robot_ends_with_status_1(tmp_path, capsys):
     folder = tmp_path / 'out'
     assert experiment.main(['all', '--robot', str(tmp_path / 'none'), '--out', str(folder)]) == 1
     assert 'none' in capsys.readouterr().err

@@ -38,7 +38,7 @@ def body(robot, name):
 
 
 @pytest.mark.parametrize('name', ['true', 'learned', 'geometric'])
-def test_it_is_exact_on_its_own_body(robot, name):
+def test_least_squares_is_exact_on_its_own_body(robot, name):
     rng = np.random.default_rng(1)
     estimator, lengths = body(robot, name)
     # Away from the limits, where it is clipped, and within reach of its start at mid-range.
@@ -55,7 +55,7 @@ def test_the_jacobian_of_the_learned_body_is_its_slope(robot):
     np.testing.assert_allclose(geometric, robot.routes.muscle_jacobian(theta), atol=1e-4)
 
 
-def test_without_friction_the_oracle_is_left_with_the_sensors(robot):
+def test_the_oracle_without_friction_errs_only_by_its_sensors(robot):
     """A recording whose lengths carry 3 mm of hysteresis besides."""
     rng = np.random.default_rng(2)
     individual = Individual(robot, 0)

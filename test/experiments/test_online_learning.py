@@ -92,7 +92,7 @@ def test_the_fit_finds_an_exponential():
     np.testing.assert_allclose(exponential_fit(time, error), error, atol=1e-6)
 
 
-def test_the_error_counts_as_halved_once_it_stays_below():
+def test_the_error_counts_as_halved_once_it_stays_below_half():
     samples, none = [0, 5, 10, 15], np.zeros(0)
     assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.6, 0.3], none)) == 15
     assert samples_to_halve(Curve(samples, [1.0, 0.4, 0.3, 0.2], none)) == 5
@@ -100,11 +100,11 @@ def test_the_error_counts_as_halved_once_it_stays_below():
     assert samples_to_halve(Curve([0], [math.e], none)) is None
 
 
-def test_a_marker_is_seen_as_often_once_the_store_is_full(arm26):
+def test_a_full_sample_store_does_not_change_how_often_a_marker_is_used(arm26):
     learner, nothing = Learner(arm26), np.zeros(arm26.muscle_count)
     learner.samples = SampleStore(capacity=2 * SIGHTED)
-    seen = []
+    observed = []
     for count in range(6 * SIGHTED):
-        seen.append(sighted(learner))
+        observed.append(sighted(learner))
         learner.accept(Sample(np.full(2, 0.1 * count), nothing, nothing, nothing))
-    assert np.flatnonzero(seen).tolist() == list(range(0, 6 * SIGHTED, SIGHTED))
+    assert np.flatnonzero(observed).tolist() == list(range(0, 6 * SIGHTED, SIGHTED))

@@ -29,27 +29,27 @@ def plain(arm26, mae):
     return record(EmulatedArm(arm26, 3), mae, 7, 8.0)
 
 
-def test_it_lasts_for_whole_steps_and_rests_at_the_end_of_each(plain):
+def test_a_recording_lasts_for_whole_steps_and_rests_at_the_end_of_each(plain):
     assert len(plain.theta) == round(10.0 / SAMPLE_TIME)  # 5 s + 2 s are too short for 8 s
     for end in (5.0, 7.0, 10.0):
         commands = plain.command[rows_between(end - 0.5, end)]
         np.testing.assert_array_equal(commands, np.broadcast_to(commands[0], commands.shape))
 
 
-def test_a_script_that_does_nothing_changes_nothing_and_is_told_every_step(arm26, mae, plain):
-    told = []
+def test_a_script_is_called_in_every_step_and_an_empty_one_changes_nothing(arm26, mae, plain):
+    reported = []
 
     def script(arm, time):
         assert isinstance(arm, EmulatedArm)
-        told.append(time)
+        reported.append(time)
 
     recording = record(EmulatedArm(arm26, 3), mae, 7, 8.0, script)
     for ours, theirs in zip(recording, plain, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    np.testing.assert_array_equal(told, times(len(plain.theta)))
+    np.testing.assert_array_equal(reported, times(len(plain.theta)))
 
 
-def test_a_script_changes_the_arm_from_its_moment_on(arm26, mae, plain):
+def test_a_script_changes_the_arm_from_its_time_on(arm26, mae, plain):
     def load(arm, time):
         if time == 2.0:
             arm.set_payload(3.6)
@@ -61,7 +61,7 @@ def test_a_script_changes_the_arm_from_its_moment_on(arm26, mae, plain):
     np.testing.assert_array_equal(loaded.command, plain.command)
 
 
-def test_without_friction_it_is_the_same_body_otherwise(arm26, tmp_path):
+def test_an_arm_without_friction_is_otherwise_the_same_body(arm26, tmp_path):
     study = Study(arm26, 'default', (3,), 1.0, True, tmp_path)
     smooth, rubbing = study.arm(3, friction=False).individual, study.arm(3).individual
     assert not smooth.cable_friction.any() and not smooth.joint_friction.any()
@@ -70,7 +70,7 @@ def test_without_friction_it_is_the_same_body_otherwise(arm26, tmp_path):
     np.testing.assert_array_equal(smooth.absolute_lengths(theta), rubbing.absolute_lengths(theta))
 
 
-def test_a_recording_is_estimated_as_the_estimator_does(arm26, mae, plain):
+def test_a_recording_is_estimated_as_by_the_estimator(arm26, mae, plain):
     spread, rubbing = np.ones(arm26.joint_count), np.full(arm26.muscle_count, 0.1)
     mae = replace(mae, touch=TouchStatistics(rubbing, spread))
     core, estimated = Estimator(arm26), []

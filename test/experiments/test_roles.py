@@ -22,7 +22,7 @@ from musculoskeletal_ae.robot.robot import Robot
     ('name', 'flexes', 'forced'),
     [('musashi_left_arm', 'elbow_pitch', 'shoulder_pitch'), ('arm26', 'elbow', 'shoulder')],
 )
-def test_joints_are_found_by_name(name, flexes, forced):
+def test_elbow_and_shoulder_are_found_by_name(name, flexes, forced):
     robot = Robot.load(name)
     assert robot.joints[elbow(robot)] == flexes
     assert robot.joints[shoulder(robot)] == forced
@@ -30,7 +30,7 @@ def test_joints_are_found_by_name(name, flexes, forced):
     assert within(robot, shoulder(robot), 30.0) == pytest.approx(math.radians(30.0), abs=1e-3)
 
 
-def test_the_elbows_of_two_arms_are_those_whose_names_say_so():
+def test_the_elbows_of_two_arms_are_found_by_name():
     robot = Robot.load('musashi_upper_body')
     named = [name for name, elbow in zip(robot.joints, elbows(robot), strict=True) if elbow]
     assert named == [
@@ -38,7 +38,7 @@ def test_the_elbows_of_two_arms_are_those_whose_names_say_so():
     ]
 
 
-def test_foreign_names_leave_the_first_and_the_last_joint_that_turn(tmp_path):
+def test_without_known_names_the_first_and_last_revolute_joints_are_shoulder_and_elbow(tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
     assert robot.kinematics.slides.tolist() == [False, False, False, True]
     assert shoulder(robot) == 0

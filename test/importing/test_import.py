@@ -51,23 +51,23 @@ def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('old', 'new', 'told', 'off', 'least'),
+    ('old', 'new', 'expected', 'off', 'least'),
     [
         ('0.1 0.5 0 0 0', '0.1 0.5 0.1 0 0', 'curl follows elbow by a line', 'curler', 1e-5),
         ('<site site="o3"/>', BRANCH, 'of 2 branches over pulleys', 'out', 0.01),
     ],
 )
-def test_what_the_format_cannot_express_is_told_and_measured(
-    mjcf, tmp_path, old, new, told, off, least
+def test_what_the_format_cannot_express_is_reported_and_measured(
+    mjcf, tmp_path, old, new, expected, off, least
 ):
     mjcf.write_text(mjcf.read_text().replace(old, new))
     result = import_robot(mjcf, tmp_path / 'out')
-    assert any(told in note for note in result.notes)
+    assert any(expected in note for note in result.notes)
     assert result.errors.pop(off) > least
     assert max(result.errors.values()) < 1e-6
 
 
-@pytest.mark.parametrize('names', [('wrist', 'grip'), ('a', 'b'), ('b', 'a')])
+@pytest.mark.parametrize('names', [('a', 'b'), ('b', 'a')])
 def test_the_end_effector_is_the_tip_of_the_chain_whatever_its_name(mjcf, tmp_path, names, capsys):
     inner, tip = (f'<body name="{name}" pos="0 0 -0.05">' for name in names)
     beside = '<body name="zz" pos="0.01 0 0"/>'
@@ -80,14 +80,6 @@ def test_the_end_effector_is_the_tip_of_the_chain_whatever_its_name(mjcf, tmp_pa
     assert Robot.load(out).description.end_effector == names[1]
 
 
-def test_a_motor_on_a_tendon_pulls_what_its_control_range_and_gear_say(mjcf, tmp_path):
-    muscle, motor = '<muscle name="m3" tendon="out" force="150"/>', '<motor tendon="out" gear="20" '
-    motor += 'ctrllimited="true" ctrlrange="-1 0"/>'
-    mjcf.write_text(mjcf.read_text().replace(muscle, motor))
-    result = import_robot(mjcf, tmp_path / 'out')
-    assert result.robot.tension.limit[result.robot.muscles.index('out')] == pytest.approx(20.0)
-
-
 RANGE = 'tendon="out" ctrllimited="true" ctrlrange='
 FORCES = 'forcelimited="true" forcerange="-100 500"'
 
@@ -95,29 +87,19 @@ FORCES = 'forcelimited="true" forcerange="-100 500"'
 @pytest.mark.parametrize(
     ('actuators', 'limit'),
     [
-        (f'<motor {RANGE}"-50 250"/>', 50.0),
         (f'<motor gear="-2" {RANGE}"-50 100"/>', 200.0),
-        (f'<motor {RANGE}"-250 0" {FORCES}/>', 100.0),
         (f'<motor {RANGE}"-250 0"/><motor gear="-1" {RANGE}"0 100"/>', 350.0),
         (f'<muscle tendon="out" force="150" {FORCES}/>', 100.0),
         (f'<motor {RANGE}"0 250"/>', None),
-        ('<muscle tendon="out" force="150" gear="-1"/>', None),
     ],
 )
 def test_what_pushes_is_no_strength_and_what_pulls_together_adds(mjcf, tmp_path, actuators, limit):
     muscle = '<muscle name="m3" tendon="out" force="150"/>'
     mjcf.write_text(mjcf.read_text().replace(muscle, actuators))
     result = import_robot(mjcf, tmp_path / 'out')
-    given = result.robot.tension.limit[result.robot.muscles.index('out')]
-    assert given == pytest.approx(limit or TENSION_DEFAULT['limit'])
+    actual = result.robot.tension.limit[result.robot.muscles.index('out')]
+    assert actual == pytest.approx(limit or TENSION_DEFAULT['limit'])
     assert any('it can only push' in note for note in result.notes) == (limit is None)
-
-
-def test_what_resists_in_joints_is_said_to_be_dropped(mjcf, tmp_path):
-    more = '<joint name="elbow" damping="5" frictionloss="2" '
-    mjcf.write_text(mjcf.read_text().replace('<joint name="elbow" ', more, 1))
-    notes = import_robot(mjcf, tmp_path / 'out').notes
-    assert {'dropped: damping: joint elbow', 'dropped: friction: joint elbow'} <= {*notes}
 
 
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
@@ -140,17 +122,20 @@ def test_what_is_included_must_be_a_regular_file(mjcf, tmp_path):
         import_robot(mjcf, tmp_path / 'out')
 
 
-def test_what_tendons_and_contacts_do_beside_pulling_is_said_to_be_dropped(mjcf, tmp_path):
-    more = 'limited="true" range="0 9" damping="1" frictionloss="2" stiffness="3" name="out"'
-    mjcf.write_text(mjcf.read_text().replace('name="out"', more))
+def test_forces_that_are_not_modelled_are_reported_as_dropped(mjcf, tmp_path):
+    joint = '<joint name="elbow" damping="5" frictionloss="2" stiffness="2" armature="1" '
+    tendon = 'limited="true" range="0 9" damping="1" frictionloss="2" stiffness="3" name="out"'
+    text = mjcf.read_text().replace('<joint name="elbow" ', joint, 1)
+    mjcf.write_text(
+        text.replace('name="out"', tendon).replace('name="upper"', 'name="upper" gravcomp="1"')
+    )
     notes = import_robot(mjcf, tmp_path / 'out').notes
-    for told in ('limits', 'damping', 'friction', 'springs'):
-        assert f'dropped: {told}: tendon out' in notes
+    for effect in ('damping', 'friction', 'springs', 'armature'):
+        assert f'dropped: {effect}: joint elbow' in notes
+    for effect in ('damping', 'friction', 'springs', 'limits'):
+        assert f'dropped: {effect}: tendon out' in notes
+    assert 'dropped: compensated weight: body upper' in notes
     assert any(re.match(r'dropped: contacts: \d+ geoms', note) for note in notes)
-    free = '<default><geom contype="0" conaffinity="0"/></default><worldbody>'
-    mjcf.write_text(mjcf.read_text().replace('<worldbody>', free))
-    notes = import_robot(mjcf, tmp_path / 'other').notes
-    assert not any('contacts' in note for note in notes)
 
 
 def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
@@ -178,15 +163,15 @@ def test_a_side_site_on_the_axis_means_what_mujoco_makes_of_it(mjcf, tmp_path, t
 def test_a_side_site_on_another_body_is_taken_where_it_is_at_the_start(mjcf, tmp_path):
     mjcf.write_text(mjcf.read_text().replace('sidesite="side"', 'sidesite="o2"'))
     notes = import_robot(mjcf, tmp_path / 'out').notes
-    told = "muscle stretch: side site 'o2' is on another body; taken where it is at the start"
-    assert f'approximated: {told}' in notes
+    expected = "muscle stretch: side site 'o2' is on another body; taken where it is at the start"
+    assert f'approximated: {expected}' in notes
 
 
 COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
 
 
 @pytest.mark.parametrize(
-    ('old', 'new', 'told'),
+    ('old', 'new', 'expected'),
     [
         (
             '<equality>',
@@ -198,18 +183,15 @@ COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="cu
             '<option gravity="0 0 -1.6"/><worldbody>',
             'gravity: 9.81 m/s², the source',
         ),
-        ('name="upper"', 'name="upper" gravcomp="1"', 'compensated weight: body upper'),
-        ('name="curl"', 'name="curl" stiffness="2" armature="1"', 'armature: joint curl'),
-        ('<site site="o3"/>', '<pulley divisor="2"/><site site="o3"/>', 'one is kept, undivided'),
         ('<site name="o1"', '<site user="nan" name="o1"', 'MuJoCo warns: XML contains a'),
         ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
         ('force="50"', 'force="0.004"', 'tension.limit is what the source says'),
     ],
 )
-def test_what_differs_from_the_source_is_told(mjcf, tmp_path, monkeypatch, old, new, told):
+def test_what_differs_from_the_source_is_reported(mjcf, tmp_path, monkeypatch, old, new, expected):
     monkeypatch.chdir(tmp_path)
     mjcf.write_text(mjcf.read_text().replace(old, new, 1))
-    assert any(told in note for note in import_robot(mjcf, tmp_path / 'out').notes)
+    assert any(expected in note for note in import_robot(mjcf, tmp_path / 'out').notes)
     assert not (tmp_path / 'MUJOCO_LOG.TXT').exists()
 
 
@@ -244,21 +226,6 @@ def test_cardsflow_muscles_of_one_name_are_told_apart(cardsflow, tmp_path):
     assert 'renamed: muscle front is front_ here' in result.notes
 
 
-def test_what_is_dropped_keeps_its_name(cardsflow, tmp_path):
-    point = '<link name="base"><viaPoint>0 0 0</viaPoint></link>'
-    short = f'<cardsflow><myoMuscle name="a b">{point}</myoMuscle>'
-    cardsflow.write_text(bodies.CARDSFLOW.replace('<cardsflow>', short))
-    contact = CONTACT.replace('"c"', '"a b"')
-    osim = bodies.OSIM.replace('<ForceSet><objects>', f'<ForceSet><objects>{contact}')
-    for file, told in (
-        (cardsflow, 'dropped: muscle a b: fewer than 2 points'),
-        (put(tmp_path, 'own.osim', osim), 'dropped: HuntCrossleyForce a b: no muscle with a path'),
-    ):
-        notes = read_source(file).notes
-        assert any(note.startswith(told) for note in notes)
-        assert not any(note.startswith('renamed') for note in notes)
-
-
 def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
     wrap = '<viaPoint type="SPHERICAL" radius="0.02">0 -0.01 0.1</viaPoint>'
     text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
@@ -272,18 +239,11 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         read_source(cardsflow)
 
 
-def test_of_a_model_without_routes_it_is_said_what_was_dropped_of_muscles(tmp_path):
-    text = bodies.MJCF
-    for name in ('front', 'back', 'out', 'in', 'bend', 'stretch', 'curler'):
-        text = re.sub(f'<spatial name="{name}">.*?</spatial>', '', text, flags=re.S)
-    text = re.sub('<muscle [^>]*>', '', text).replace('polycoef="0.1 0.5', 'polycoef="0.1 0.5 0.1')
-    text = text.replace('<equality>', '<equality><connect body1="upper" anchor="0 0 0"/>')
-    with pytest.raises(SourceError) as refusal:
-        read_source(put(tmp_path, 'own.xml', text.replace('0.1 0 0 0"', '0.1 0 0"')))
-    told = str(refusal.value)
-    assert 'it has no muscle with a route; ' in told
-    assert 'tendon none: a fixed one, which has no route' in told
-    assert 'equality' not in told and 'follows' not in told
+def test_a_model_without_routes_is_refused_with_what_was_dropped(tmp_path):
+    text = re.sub('<spatial .*?</spatial>', '', bodies.MJCF, flags=re.DOTALL)
+    file = put(tmp_path, 'own.xml', re.sub('<muscle [^>]*>', '', text))
+    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: a fixed one'):
+        read_source(file)
 
 
 def wires_and_weight(tmp_path, name, text):
@@ -330,7 +290,7 @@ def test_points_of_the_world_stay_where_they_are_if_the_root_link_stands_elsewhe
     np.testing.assert_allclose(point.xyz, [0.05, 0.0, -0.4])
 
 
-def test_a_limit_with_one_end_is_none_and_a_joint_of_the_root_link_is_told(cardsflow, tmp_path):
+def test_a_limit_with_one_end_is_none_and_a_joint_of_the_root_link_is_reported(cardsflow, tmp_path):
     (tmp_path / 'model.urdf').unlink()
     turntable = '<joint name="t" type="revolute"><parent>world</parent><child>base</child></joint>'
     text = bodies.SDF.replace('<lower>-1</lower>', '').replace('</model>', f'{turntable}</model>')
@@ -350,25 +310,19 @@ def test_an_import_that_is_interrupted_leaves_nothing(mjcf, tmp_path, monkeypatc
     assert not (tmp_path / 'out').exists()
 
 
-TWICE = '<joint name="other" type="fixed"><child>arm</child></joint></model>'
-
-
 @pytest.mark.parametrize(
-    ('old', 'new', 'told'),
+    ('old', 'new', 'expected'),
     [
         ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only what SDF 1.6 knows is read'),
         ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
-        ('"shoulder"', '"universe"', 'joint universe: expected a name that no other has'),
         ('<joint', '<link name="arm"/><joint', "link 'arm' comes twice; expected unique names"),
         ('</model>', '<model name="palm"/></model>', 'expected one model'),
-        ('</model>', '<include><uri>a</uri></include></model>', 'expected one model'),
-        ('</model>', TWICE, "child of a joint 'arm' comes twice; expected one joint for each link"),
     ],
 )
-def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, told):
+def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, expected):
     (tmp_path / 'model.urdf').unlink()
     put(tmp_path, 'model.sdf', bodies.SDF.replace(old, new, 1))
-    with pytest.raises(SourceError, match=re.escape(told)):
+    with pytest.raises(SourceError, match=re.escape(expected)):
         import_robot(cardsflow, tmp_path / 'out')
 
 
@@ -376,117 +330,34 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
     assert main([str(file), '--out', str(tmp_path / 'out')]) == 0
-    told = capsys.readouterr().out
-    assert 'coupled: wrist = -0.5 · shoulder +0.1' in told and 'meshes' not in told
+    assert 'coupled: wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
     robot = Robot.load(tmp_path / 'out')
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1)
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
-    named = bodies.URDF.format(mimic=mimic).replace('"shoulder"', '"shoulder, left"')
-    shape = '<visual><geometry><mesh filename="package://own/a.stl"/></geometry></visual>'
-    put(tmp_path, 'named.urdf', named.replace('<link name="base">', f'<link name="base">{shape}'))
-    assert main([str(tmp_path / 'named.urdf'), '--out', str(tmp_path / 'named')]) == 0
-    assert 'dropped: meshes and other shapes: of 1 links' in capsys.readouterr().out
-    assert Robot.load(tmp_path / 'named').muscles == ('muscle_of_shoulder_left', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
     with pytest.raises(SourceError, match="there is no joint 'moon'"):
         read_source(file)
 
 
-def test_an_opensim_model_says_what_lines_and_standing_points_cost(tmp_path):
-    result = import_robot(put(tmp_path, 'own.osim', bodies.OSIM), tmp_path / 'out')
-    assert result.robot.joints == ('raise', 'flexion')
-    assert result.errors['flexor'] < 1e-6
-    assert result.errors['extensor'] < 1e-6  # beside its wrap object, which is that of the result
-    assert 1e-4 < result.errors['moving'] < 0.005
-    told = '\n'.join(result.notes)
-    for expected in (
-        'a moving point stands still, off by 1.0 mm',
-        'active in 95 % of flexion is always there',
-        'locked coordinate bend at 0.1',
-        'PointActuator push',
-        'follows raise by a line, off by up to',
-    ):
-        assert expected in told
-    assert {c.master for c in result.robot.description.couplings.values()} == {'raise'}
-    assert result.robot.root_link == 'ground_upright'  # OpenSim's y axis is up
-    pose = result.robot.kinematics.link_pose(np.zeros(2), 'humerus')
-    assert pose.translation[2] > 0.9
-
-
-COUPLER = """<CoordinateCouplerConstraint name="c"><isEnforced>{}</isEnforced>
-<coupled_coordinates_function><LinearFunction><coefficients>0.5 0</coefficients></LinearFunction>
-</coupled_coordinates_function><independent_coordinate_names>{}</independent_coordinate_names>
-<dependent_coordinate_name>flexion</dependent_coordinate_name></CoordinateCouplerConstraint>"""
-CONTACT = '<HuntCrossleyForce name="c"><HuntCrossleyForce::Parts/><A::B::C/></HuntCrossleyForce>'
-LONE = '<Thelen2003Muscle name="lone"><GeometryPath/></Thelen2003Muscle>'
-
-
-@pytest.mark.parametrize(
-    ('old', 'new', 'told'),
-    [
-        ('<range>0 2</range>', '', 'joint flexion: limits ±3.142'),
-        ('<range>0 2</range>', '<prescribed>true</prescribed>', 'prescribed motion of'),
-        ('name="flexor">', 'name="f"><appliesForce>false</appliesForce>', 'f: it applies no force'),
-        ('<ForceSet><objects>', f'<ForceSet><objects>{LONE}', 'muscle lone: fewer than 2 points'),
-        ('<ForceSet><objects>', f'<ForceSet><objects>{CONTACT}', 'HuntCrossleyForce c: no muscle'),
-        ('', COUPLER.format('true', 'flexion'), 'c: flexion is coupled or locked already'),
-        ('', COUPLER.format('false', 'raise'), 'locked coordinate bend'),
-        ('name="extensor"', 'name="flexor"', 'renamed: muscle flexor is flexor_ here'),
-        ('name="extensor"', 'name="a b"', 'renamed: muscle a b is a_b here'),
-        ('</Body><Body name="hand">', f'{bodies._WRAP}</Body><Body name="hand">', 'drum of ulna'),
-        ('name="bend"', 'name="a&#10;joints: b"', r'a\njoints: b'),
-    ],
-)
-def test_what_an_opensim_model_leaves_open_is_told(tmp_path, old, new, told):
-    if not old:
-        old, new = (
-            '<ForceSet>',
-            f'<ConstraintSet><objects>{new}</objects></ConstraintSet><ForceSet>',
-        )
-    source = read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
-    assert any(told in note for note in source.notes)
-    assert 'flexion' in source.model.names
-    assert len(source.routes) == (2 if told == 'f: it applies no force' else 3)
-
-
-@pytest.mark.parametrize(
-    ('old', 'new', 'told'),
-    [
-        ('<inertia>0.01 ', '<inertia>-0.01 ', 'link humerus: expected principal moments'),
-        ('/flexion</socket_x', '/flex</socket_x', "there is no coordinate 'flex'"),
-        ('</Body></obj', '</Body><Body name="ulna"/></obj', "body 'ulna' comes twice; .* rename"),
-        ('</Body></obj', '</Body><Body name="ground"/></obj', "'ground' comes twice"),
-        ('"wrist"', '"elbow"', "joint 'elbow' comes twice; expected unique names: rename one"),
-        ('"bend"', '"flexion"', "coordinate 'flexion' comes twice"),
-        ('<Coordinate name="bend">', '<Coordinate>', 'a Coordinate has no name; expected one'),
-        ('="up"', '="down"', "frame 'shoulder/down' comes twice"),
-        ('/bodyset/hand<', '/bodyset/ulna<', "joint 'ulna' comes twice; expected one joint for"),
-    ],
-)
-def test_a_wrong_opensim_model_is_refused_by_name(tmp_path, old, new, told):
-    with pytest.raises(SourceError, match=told):
-        read_source(put(tmp_path, 'own.osim', bodies.OSIM.replace(old, new, 1)))
+def test_an_opensim_model_is_refused_with_the_way_to_convert_it(tmp_path):
+    # Tags as OpenSim writes them are no XML.
+    text = '<?xml version="1.0"?><OpenSimDocument Version="40000"><A::B/></OpenSimDocument>'
+    with pytest.raises(SourceError, match='convert it to MJCF with MyoConverter'):
+        read_source(put(tmp_path, 'own.osim', text))
 
 
 def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     out = tmp_path / 'out'
     options = ['--base', 'upper', '--end', 'lower', '--out', str(out)]
     assert main([str(mjcf), *options]) == 0
-    robot, told = Robot.load(out), capsys.readouterr().out
+    robot, output = Robot.load(out), capsys.readouterr().out
     assert (robot.root_link, robot.description.end_effector) == ('upper_upright', 'lower')
     assert robot.joints == ('elbow',)
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
-    assert 'dropped: muscle front: fastened to base, which was cut off' in told
-    assert 'largest length error over 1000 postures: 0.000 mm' in told
-    assert 'check_robot: not sound' in told  # nothing holds it open against its weight
-
-
-def test_lengths_of_a_chain_out_of_opensim_are_compared_with_the_whole_model(tmp_path):
-    file = put(tmp_path, 'own.osim', bodies.OSIM)
-    errors = import_robot(file, tmp_path / 'out', base='humerus').errors
-    assert errors.keys() == {'flexor', 'extensor', 'moving'}
-    assert max(errors['flexor'], errors['extensor']) < 1e-6
+    assert 'dropped: muscle front: fastened to base, which was cut off' in output
+    assert 'largest length error over 1000 postures: 0.000 mm' in output
+    assert 'check_robot: not sound' in output  # nothing holds it open against its weight
 
 
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
@@ -506,17 +377,15 @@ def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ('options', 'told'),
+    ('options', 'expected'),
     [
         ({'joints': ['knee']}, '--joints knee: no such joint; joints: swing, lift, elbow'),
-        ({'joints': ['curl']}, '--joints curl: coupled'),
         ({'muscles': ['psoas']}, '--muscles psoas: no such muscle'),
-        ({'base': 'moon'}, '--base moon: no such link; links: world, base'),
         ({'base': 'lower', 'end': 'upper'}, 'does not hang on --base lower'),
     ],
 )
-def test_a_wrong_option_names_what_is_legal(mjcf, options, told):
-    with pytest.raises(SourceError, match=re.escape(told)):
+def test_a_wrong_option_names_what_is_legal(mjcf, options, expected):
+    with pytest.raises(SourceError, match=re.escape(expected)):
         cut(read_source(mjcf), **options)
 
 
@@ -537,7 +406,7 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
 
 
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
-@given(st.sampled_from(['OSIM', 'CARDSFLOW', 'URDF', 'SDF']), st.data())
+@given(st.sampled_from(['CARDSFLOW', 'URDF', 'SDF']), st.data())
 def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, format_, data):
     """Words of a file are replaced or left out, elements cut away."""
     text = getattr(bodies, format_).format(mimic='<mimic joint="shoulder" multiplier="2"/>')
@@ -550,9 +419,9 @@ def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, fo
     file = put(folder, 'cardsflow.xml', bodies.CARDSFLOW)
     if format_ == 'CARDSFLOW':
         put(folder, 'model.urdf', bodies.URDF.format(mimic=''))
-    names = {'CARDSFLOW': file.name, 'URDF': 'model.urdf', 'SDF': 'model.sdf', 'OSIM': 'own.osim'}
-    damaged = put(folder, names[format_], ''.join(words))
+    names = {'CARDSFLOW': file.name, 'URDF': 'model.urdf', 'SDF': 'model.sdf'}
+    put(folder, names[format_], ''.join(words))
     with suppress(MusculoskeletalError):
-        source = read_source(damaged if format_ == 'OSIM' else file)
+        source = read_source(file)
         cut(source)
         assert urdf(source)

@@ -17,14 +17,14 @@ def rms(body, theta, tension, length):
     return float(np.sqrt(np.mean((body.lengths(theta, tension, 0 * tension)[0] - length) ** 2)))
 
 
-def test_without_corrections_it_is_the_geometric_model(arm26):
+def test_a_body_without_corrections_is_the_geometric_model(arm26):
     rng = np.random.default_rng(0)
     theta, tension = arm26.random_postures(50, rng), rng.uniform(0.0, 300.0, (50, 6))
     (length,) = CorrectedBody(arm26).lengths(theta, tension, np.zeros((50, 6)))
     np.testing.assert_allclose(length, arm26.muscle_lengths(theta, tension), atol=1e-12)
 
 
-def test_a_limb_alone_has_its_lengths_in_the_whole_body():
+def test_a_limb_alone_has_the_same_lengths_as_in_the_whole_body():
     robot, rng = Robot.load('musashi_upper_body'), np.random.default_rng(0)
     body = drawn_body(robot, 3, seed=1, scale=1.0)
     theta, tension = robot.random_postures(5, rng), rng.uniform(0.0, 300.0, (5, robot.muscle_count))
@@ -58,7 +58,7 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
 
 
 @pytest.mark.parametrize('joint', range(2))
-def test_the_slope_of_the_smooth_rest_is_its_derivative(other_body, arm26, joint):
+def test_the_slope_of_the_residual_model_is_its_derivative(other_body, arm26, joint):
     theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
     for single in other_body.smooth:
         smooth = Smooth(*(part.astype(float) for part in single))
@@ -89,7 +89,7 @@ def test_bad_samples_do_not_poison_the_fit(arm26, stage):
     assert (fit.weight[::10] < 0.1).all()
 
 
-def test_wires_that_creep_are_followed_however_far(arm26, stage):
+def test_tendons_that_creep_are_followed_without_limit(arm26, stage):
     creep = 1e-5 * np.array([1.0, 1.0, 1.0, -1.0, 0.5, 0.0])
     store, still = SampleStore(capacity=100), SampleStore(capacity=100)
     for n in range(2000):
@@ -106,7 +106,7 @@ def test_wires_that_creep_are_followed_however_far(arm26, stage):
     assert rms(body, *now) < 1.5 * rms(spared, theta, tension, length)
 
 
-def test_samples_that_say_nothing_change_nothing(arm26, stage):
+def test_samples_without_known_muscles_change_nothing(arm26, stage):
     observations = stage.store(1).observations()
     nothing = observations[:]
     nothing.known[:] = False
@@ -120,7 +120,7 @@ def test_samples_that_say_nothing_change_nothing(arm26, stage):
     )
 
 
-def test_a_body_of_a_network_that_knows_friction_begins_with_it(arm26, initial):
+def test_a_body_begins_with_the_tendon_friction_of_its_network(arm26, initial):
     friction = np.linspace(0.0, 0.4, 6)
     statistics = TouchStatistics(friction, np.ones(2))
     for touch, known in ((None, np.full(6, 0.05)), (statistics, friction)):
@@ -129,7 +129,7 @@ def test_a_body_of_a_network_that_knows_friction_begins_with_it(arm26, initial):
         np.testing.assert_allclose(body.frictions(), known, atol=1e-3)
 
 
-def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_know(arm26, stage):
+def test_a_relearned_muscle_takes_a_new_offset_and_the_others_keep_theirs(arm26, stage):
     store = stage.store(60)
     body = CorrectedBody(arm26)
     fit_body(body, store.observations())
@@ -147,7 +147,7 @@ def test_a_reopened_muscle_takes_on_a_new_offset_and_the_others_keep_what_they_k
     np.testing.assert_allclose(found[:, 0], known[:, 0], atol=5e-4)
 
 
-def test_a_muscle_that_nothing_is_known_of_is_trusted_as_far_as_it_may_be_off(arm26, stage):
+def test_a_muscle_without_samples_gets_a_large_noise(arm26, stage):
     store = stage.store(30)
     known = fit_body(CorrectedBody(arm26), store.observations()).noise
     store.forget(1)

@@ -32,14 +32,14 @@ def test_the_detector_is_calibrated_only_with_enough_healthy_data(learned):
     assert not lost.calibrated  # after a muscle was replaced
 
 
-def test_one_posture_is_not_enough_for_a_detector(learned):
+def test_the_detector_is_not_calibrated_on_one_posture(learned):
     _, updater, store, stage = learned
-    seen = stage.messages(600)
-    few = updater.update(job(store, seen, LEAST_TIME, 1, rests=LEAST_SAMPLES - 1)).mae
+    observed = stage.messages(600)
+    few = updater.update(job(store, observed, LEAST_TIME, 1, rests=LEAST_SAMPLES - 1)).mae
     assert not few.anomaly.calibrated
 
 
-def test_the_statistics_of_many_rests_are_kept_until_there_are_as_many_again(learned):
+def test_statistics_of_many_rests_are_kept_until_as_many_are_collected_again(learned):
     _, updater, store, stage = learned
     before = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae.anomaly
     assert before.calibrated
@@ -48,20 +48,20 @@ def test_the_statistics_of_many_rests_are_kept_until_there_are_as_many_again(lea
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_glitch_does_not_spoil_the_detector(learned, seed):
+def test_glitches_do_not_change_the_threshold(learned, seed):
     mae, _, _, stage = learned
-    seen = Stage(stage.body, seed).messages(1000)
-    clean = calibrate(mae, Healthy(seen, LEAST_TIME, 50), 50)
-    for row in range(int(GLITCHES * len(seen))):
-        seen[100 * row + 7, 6 + row] += 0.2
-    spoilt = calibrate(mae, Healthy(seen, LEAST_TIME, 50), 50)
+    observed = Stage(stage.body, seed).messages(1000)
+    clean = calibrate(mae, Healthy(observed, LEAST_TIME, 50), 50)
+    for row in range(int(GLITCHES * len(observed))):
+        observed[100 * row + 7, 6 + row] += 0.2
+    with_glitches = calibrate(mae, Healthy(observed, LEAST_TIME, 50), 50)
     assert clean.samples == 1000
-    assert spoilt.samples == 1000 - int(GLITCHES * len(seen))
+    assert with_glitches.samples == 1000 - int(GLITCHES * len(observed))
     for name, threshold in clean.thresholds.items():
-        assert spoilt.thresholds[name] == pytest.approx(threshold, rel=0.02)
+        assert with_glitches.thresholds[name] == pytest.approx(threshold, rel=0.02)
 
 
-def test_healthy_messages_stay_below_the_threshold_and_a_cut_muscle_does_not(learned):
+def test_healthy_messages_stay_below_the_threshold_and_a_rupture_does_not(learned):
     _, updater, store, stage = learned
     mae = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
 
@@ -89,15 +89,17 @@ def reading(n, theta=0.0, tension=50.0, **others):
     return Sample(np.full(2, theta), np.full(3, tension), np.full(3, n), np.zeros(3), **others)
 
 
-def test_every_second_message_is_learned_and_the_others_judge():
+def test_every_second_message_is_learned_and_the_others_validate():
     reservoir = Reservoir(3)
     for n in range(10):
         reservoir.step(reading(float(n), theta=0.1 * n), 0.1)
-    seen = reservoir.healthy()
-    np.testing.assert_array_equal(seen.learned.length[:, 0], [0, 2, 4, 6, 8])
-    np.testing.assert_array_equal(seen.judging.length[:, 0], [1, 3, 5, 7, 9])
-    np.testing.assert_allclose(seen.judging.theta, 0.1 * seen.judging.length[:, :2], rtol=1e-6)
-    assert seen.learned.known.all()
+    observed = reservoir.healthy()
+    np.testing.assert_array_equal(observed.learned.length[:, 0], [0, 2, 4, 6, 8])
+    np.testing.assert_array_equal(observed.judging.length[:, 0], [1, 3, 5, 7, 9])
+    np.testing.assert_allclose(
+        observed.judging.theta, 0.1 * observed.judging.length[:, :2], rtol=1e-6
+    )
+    assert observed.learned.known.all()
 
 
 @pytest.mark.parametrize(
@@ -108,22 +110,22 @@ def test_every_second_message_is_learned_and_the_others_judge():
         {'spread': np.full(2, 0.01)},  # a camera's
     ],
 )
-def test_messages_that_do_not_tell_the_posture_are_not_learned(unfit):
+def test_messages_that_do_not_determine_the_posture_are_not_learned(unfit):
     reservoir = Reservoir(3)
     for n in range(10):
         reservoir.step(reading(float(n), **(unfit if n < 6 else {})), 0.1)
-    seen = reservoir.healthy()
-    assert len(seen.messages) == 10
-    np.testing.assert_array_equal(seen.learned.length[:, 0], [6, 8])
+    observed = reservoir.healthy()
+    assert len(observed.messages) == 10
+    np.testing.assert_array_equal(observed.learned.length[:, 0], [6, 8])
 
 
-def test_messages_of_long_ago_are_not_learned_and_of_others_is_known_how_old_they_are():
+def test_messages_of_long_ago_are_not_learned_and_the_others_have_an_age():
     reservoir = Reservoir(3, capacity=20_000)
     for n in range(4):
         reservoir.step(reading(float(n)), 0.1)
         reservoir.rest(reading(float(n), theta=n))
-    seen = reservoir.healthy().learned
-    np.testing.assert_array_equal(seen.age, [4, 2])
+    observed = reservoir.healthy().learned
+    np.testing.assert_array_equal(observed.age, [4, 2])
     while reservoir.time < RECENT + 0.05:
         reservoir.step(reading(0.0, theta=np.nan), 0.2)
     np.testing.assert_array_equal(reservoir.healthy().learned.length[:, 0], [2.0])

@@ -11,7 +11,7 @@ from musculoskeletal_ae.mae import checkpoint
 LOST = 2
 
 
-def test_what_an_isolated_muscle_reads_teaches_its_body_nothing(learned):
+def test_readings_of_an_isolated_muscle_do_not_change_its_body(learned):
     _, updater, store, stage = learned
     theta, tension, _ = stage.states(100)
 
@@ -33,7 +33,7 @@ def test_what_an_isolated_muscle_reads_teaches_its_body_nothing(learned):
     assert np.isfinite(update.loss)
 
 
-def test_the_learner_keeps_the_list_over_a_restart_and_its_samples_go_on(
+def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     arm26, initial, stage, tmp_path
 ):
     learner = Learner(arm26, initial, training=Prepared, directory=tmp_path)
@@ -67,14 +67,3 @@ def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
     learner.isolate((LOST,))
     learner.anomaly(False)
     assert learner.mae.isolated == (LOST,)
-
-
-def test_what_moves_while_a_muscle_is_isolated_is_no_healthy_message_of_it(arm26, initial, stage):
-    learner = Learner(arm26, initial, training=Prepared)
-    _, tension, length = stage.states(500)
-    learner.isolate((LOST,))
-    for n, row in enumerate(zip(tension, length)):
-        learner.muscles(0.02 * n, *row)
-    assert len(learner._healthy.healthy().messages)
-    learner.isolate(())
-    assert not len(learner._healthy.healthy().messages)

@@ -10,7 +10,7 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.learning.body import PRIOR, CorrectedBody, fit_body
+from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
 from musculoskeletal_ae.learning.postures import Bent, _GroupFit
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
@@ -51,60 +51,60 @@ def resting(other_body) -> Resting:
 
 
 @pytest.fixture(scope='module')
-def seen(resting) -> Observations:
+def observed(resting) -> Observations:
     return resting.observations(60)
 
 
-def blind(seen: Observations) -> Observations:
-    nothing = np.full_like(seen.theta, np.nan)
-    return replace(seen, theta=nothing, spread=np.zeros_like(nothing))
+def blind(observed: Observations) -> Observations:
+    nothing = np.full_like(observed.theta, np.nan)
+    return replace(observed, theta=nothing, spread=np.zeros_like(nothing))
 
 
-def errors(arm26, seen, truth) -> tuple[float, float]:
+def errors(arm26, observed, truth) -> tuple[float, float]:
     """Return how far postures are off before and after the fit [rad]."""
     rng = np.random.default_rng(1)
     guess = truth + rng.normal(0.0, 0.15, truth.shape)
-    found = fit_body(CorrectedBody(arm26), seen, guess=guess).theta
+    found = fit_body(CorrectedBody(arm26), observed, guess=guess).theta
     return tuple(float(np.linalg.norm(t - truth, axis=1).mean()) for t in (guess, found))
 
 
-def test_postures_are_found_from_the_muscles_alone(arm26, seen):
-    before, after = errors(arm26, blind(seen), seen.theta)
+def test_postures_are_found_from_the_muscles_alone(arm26, observed):
+    before, after = errors(arm26, blind(observed), observed.theta)
     assert after < before / 3.0
 
 
-def test_a_fit_goes_on_until_it_would_not_move(arm26, seen):
+def test_a_fit_is_run_until_it_has_converged(arm26, observed):
     body, rng = CorrectedBody(arm26), np.random.default_rng(1)
-    guess = seen.theta + rng.normal(0.0, 0.3, seen.theta.shape)
-    first = fit_body(body, blind(seen), guess=guess).theta
-    second = fit_body(body, blind(seen), guess=first).theta
+    guess = observed.theta + rng.normal(0.0, 0.3, observed.theta.shape)
+    first = fit_body(body, blind(observed), guess=guess).theta
+    second = fit_body(body, blind(observed), guess=first).theta
     assert np.linalg.norm(second - first, axis=1).mean() < 0.005
 
 
 @pytest.mark.parametrize('other', [False, True], ids=['arm26', 'other'])
 @pytest.mark.parametrize('scale', [0.3, 1.0])
-def test_without_any_anchor_learning_is_better_than_not_learning(arm26, tmp_path, other, scale):
+def test_learning_without_joint_angles_improves_the_estimate(arm26, tmp_path, other, scale):
     robot = Robot.load(write_robot(tmp_path / 'other')) if other else arm26
     resting = Resting(drawn_body(robot, 7, seed=2, scale=scale), seed=9)
-    seen, test = resting.observations(40), resting.observations(40)
+    observed, test = resting.observations(40), resting.observations(40)
 
     def estimate(body, at):
         return learned(robot, body).estimate(at.tension, at.length)
 
     before, body = CorrectedBody(robot), CorrectedBody(robot)
-    fit_body(body, blind(seen), guess=estimate(before, seen))
+    fit_body(body, blind(observed), guess=estimate(before, observed))
     off = [np.linalg.norm(estimate(b, test) - test.theta, axis=1).mean() for b in (body, before)]
     assert off[0] < off[1]
 
 
-def test_each_anchor_brings_them_nearer(arm26, seen):
-    truth, rng = seen.theta, np.random.default_rng(2)
-    _, nothing = errors(arm26, blind(seen), truth)
-    sighted = blind(seen)
+def test_each_additional_sensor_improves_the_postures(arm26, observed):
+    truth, rng = observed.theta, np.random.default_rng(2)
+    _, nothing = errors(arm26, blind(observed), truth)
+    sighted = blind(observed)
     sighted.theta[::10] = truth[::10] + rng.normal(0.0, 0.01, truth[::10].shape)
     sighted.spread[::10] = 0.02
     assert errors(arm26, sighted, truth)[1] < nothing
-    partly = blind(seen)
+    partly = blind(observed)
     partly.theta[:, 1] = truth[:, 1]
     assert errors(arm26, partly, truth)[1] < nothing
     kinematics = arm26.kinematics
@@ -112,34 +112,34 @@ def test_each_anchor_brings_them_nearer(arm26, seen):
     gravity = np.full((len(truth), len(kinematics.parent), 3), np.nan)
     down = kinematics.model.gravity.linear / np.linalg.norm(kinematics.model.gravity.linear)
     gravity[:, -1] = turn[:, -1].swapaxes(1, 2) @ down
-    tilted = replace(blind(seen), gravity=gravity.reshape(len(truth), -1))
+    tilted = replace(blind(observed), gravity=gravity.reshape(len(truth), -1))
     assert errors(arm26, tilted, truth)[1] < nothing
 
 
-def test_the_zero_of_a_joint_sensor_is_no_error_of_the_body(arm26, seen):
-    off = replace(seen, theta=seen.theta + [0.03, 0.0])
+def test_a_joint_sensor_offset_is_not_taken_for_an_error_of_the_body(arm26, observed):
+    off = replace(observed, theta=observed.theta + [0.03, 0.0])
     found = fit_body(CorrectedBody(arm26), off).theta
-    left = np.abs(found - seen.theta).mean(axis=0)
+    left = np.abs(found - observed.theta).mean(axis=0)
     assert left[0] < 0.03
     assert left[1] < 0.01
 
 
-def test_angles_that_are_read_stay_where_they_are_read(arm26, seen):
-    found = fit_body(CorrectedBody(arm26), seen).theta
-    assert np.abs(found - seen.theta).max() < 0.03
+def test_measured_joint_angles_stay_where_they_were_measured(arm26, observed):
+    found = fit_body(CorrectedBody(arm26), observed).theta
+    assert np.abs(found - observed.theta).max() < 0.03
 
 
-def test_positions_of_what_slides_stay_where_they_are_read(tmp_path):
+def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(tmp_path):
     robot, off = Robot.load(write_robot(tmp_path, slider=True)), []
     for seed in range(4):
-        seen = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
-        off.append(fit_body(CorrectedBody(robot), seen).theta[:, -1] - seen.theta[:, -1])
+        observed = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
+        off.append(fit_body(CorrectedBody(robot), observed).theta[:, -1] - observed.theta[:, -1])
     # 0.2 mm; 0.7 mm if zeros of sensors were thought to be off by 2° in metres.
     assert np.abs(off).mean() < 4e-4
 
 
-def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
-    part = seen[np.arange(8)]
+def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting, observed):
+    part = observed[np.arange(8)]
     body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
     joints, muscles = np.arange(2), np.arange(6)
     mean = [np.zeros(layout.size) for layout in body.layouts]
@@ -163,31 +163,20 @@ def test_the_rows_are_linear_in_what_a_step_changes(arm26, resting, seen):
         column += layout.size
 
 
-def test_a_joint_leans_on_a_stop_while_it_is_near_and_pushed(arm26, seen):
-    part, body, upper = blind(seen[np.arange(8)]), CorrectedBody(arm26), arm26.upper
-    means, spreads = zip(*((PRIOR.mean(o), PRIOR.spread(o)) for o in body.layouts))
-    prior, bent = ([*means], [*spreads], 3e-4), Bent.unknown(8, 2)
-    fit = _GroupFit(body, part, np.arange(2), np.arange(6), *prior, bent)
-    theta = np.tile(0.5 * (arm26.lower + upper), (8, 1))
-    theta[:2, 1] = upper[1] - [0.02, 0.1]
-    rows = fit.rows(theta, np.zeros(2))
-    for pushed, leaning in ((10.0, [0]), (0.1, [])):
-        torque = np.full_like(rows.torque, 0.1)
-        torque[:2, 1] = pushed
-        fit.weigh(rows._replace(torque=torque), theta, np.zeros(6))
-        assert np.flatnonzero(fit._stops(theta)[1][:, 1]).tolist() == leaning
-
-
-def test_where_no_sensor_reads_a_joint_the_ellipsoid_holds_what_errs_alike_in_all_samples(arm26):
+def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26):
     inside = []
     for seed in (0, 2, 4):  # bodies that are found worst
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
-        seen, test = resting.observations(60), resting.observations(40)
+        observed, test = resting.observations(60), resting.observations(40)
         body = CorrectedBody(arm26)
-        fit = fit_body(body, blind(seen), guess=learned(arm26, body).estimate(*seen.state()[1:]))
+        fit = fit_body(
+            body, blind(observed), guess=learned(arm26, body).estimate(*observed.state()[1:])
+        )
         estimate = learned(arm26, body).estimate
-        exact = SimpleNamespace(estimate=lambda *seen, e=estimate: SimpleNamespace(theta=e(*seen)))
-        tension = seen.end_tension(body.frictions())
+        exact = SimpleNamespace(
+            estimate=lambda *observed, e=estimate: SimpleNamespace(theta=e(*observed))
+        )
+        tension = observed.end_tension(body.frictions())
         covariance = estimate_covariance(exact, body, fit, tension, seed, None)
         error = estimate(test.end_tension(body.frictions()), test.length) - test.theta
         inside.append((ellipsoids(covariance, error) <= 1.0).mean())

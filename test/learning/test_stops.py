@@ -29,40 +29,40 @@ def found(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_readings_that_pile_up_tell_the_zeros(seed):
+def test_readings_at_the_stops_give_the_joint_sensor_offsets(seed):
     noise = 0.002 * np.random.default_rng(9).standard_normal((150, 3))
     zero, spread = found(rests(seed=seed) + TRUE + noise)
     assert zero == pytest.approx(TRUE, abs=STOP)
     assert (spread < 0.5 * ZERO).all()
 
 
-def test_a_sensor_whose_zero_is_right_is_left_alone():
+def test_a_sensor_without_offset_is_not_corrected():
     zero, _ = found(rests())
     assert zero == pytest.approx(np.zeros(3), abs=0.005)
 
 
-def test_joints_that_never_reach_a_limit_say_nothing():
+def test_joints_that_never_reach_a_stop_give_no_offset():
     zero, spread = found(within(0.1) + TRUE)
     assert zero == pytest.approx(np.zeros(3), abs=0.003)
     assert (spread > 0.5 * ZERO).all()
 
 
 @pytest.mark.parametrize('count', [20, 60, 200])
-def test_few_readings_that_happen_to_be_near_each_other_are_no_pile(count):
+def test_a_few_readings_close_together_are_no_stop(count):
     rng = np.random.default_rng(4)
     for _ in range(10):
         zero, _ = found(rng.uniform(LOWER, UPPER, (count, 3)))
         assert np.linalg.norm(zero) < 2.0 * STOP
 
 
-def test_one_posture_near_a_limit_is_no_stop_however_often_it_is_held():
+def test_one_posture_held_near_a_limit_is_no_stop():
     theta = within(0.1)
     held = LOWER + 0.04 + 0.001 * np.random.default_rng(1).standard_normal((40, 3))
     zero, _ = found(np.vstack([theta, held]))
     assert zero == pytest.approx(np.zeros(3), abs=0.005)
 
 
-def test_a_joint_parked_near_a_limit_while_others_move_is_not_stopped():
+def test_a_joint_parked_near_a_limit_while_others_move_is_no_stop():
     theta = within(0.1)
     theta[50:] = LOWER + 0.04 + 0.001 * theta[50:] * [1, 0, 0] + within(0.1)[50:] * [0, 1, 1]
     zero, _ = found(theta)
@@ -76,7 +76,7 @@ def test_limits_that_stop_nothing_are_not_taken_for_stops():
     assert zero == pytest.approx(np.zeros(3), abs=STOP)
 
 
-def test_a_joint_that_no_sensor_reads_has_no_zero():
+def test_a_joint_without_sensor_has_no_offset():
     read = rests() + TRUE
     read[:, 1] = np.nan
     zero, spread = found(read)
@@ -86,7 +86,7 @@ def test_a_joint_that_no_sensor_reads_has_no_zero():
     assert found(read[:0])[0] == pytest.approx(np.zeros(3))
 
 
-def test_joints_that_slide_are_told_by_what_counts_as_a_radian():
+def test_offsets_of_prismatic_joints_scale_with_their_radian():
     read = rests() + TRUE
     (zero, spread), (slid, slid_spread) = found(read), found(read, 0.02)
     assert slid == pytest.approx(0.02 * zero)

@@ -35,7 +35,7 @@ def test_twenty_samples_halve_the_error(learned, initial):
     assert error(mae, *states) < 0.5 * error(initial, *states)
 
 
-def test_what_a_wire_is_longer_by_everywhere_needs_no_training(arm26, initial):
+def test_constant_length_differences_are_learned_in_one_step(arm26, initial):
     longer = CorrectedBody(arm26)
     for parameters, layout in zip(longer.parameters, longer.layouts, strict=True):
         parameters[layout.offset] = 0.008
@@ -66,20 +66,23 @@ class Giving(Stage):
         return sample._replace(length=sample.length + give)
 
 
-def test_messages_of_the_moving_arm_tell_what_the_body_cannot_say(arm26, initial, other_body):
+def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
+    arm26, initial, other_body
+):
     def learned(**parts):
         updater = BodyUpdater(arm26, initial)
         for _ in range(4):
             update = updater.update(job(store, steps=150, **parts))
-        return error(update.mae, seen.theta, seen.tension, seen.length)
+        return error(update.mae, observed.theta, observed.tension, observed.length)
 
     stage = Giving(other_body)
-    store, (seen, messages) = stage.store(30), (stage.store(400).observations() for _ in range(2))
+    store = stage.store(30)
+    observed, messages = (stage.store(400).observations() for _ in range(2))
     # Over eight bodies and streams 0.91 with a standard deviation of 0.02.
     assert learned(learned=messages) < 0.98 * learned()
 
 
-def test_messages_that_contradict_the_body_are_not_learned(arm26, initial, stage):
+def test_motion_samples_that_contradict_the_body_model_are_not_learned(arm26, initial, stage):
     def learned(**parts):
         update = BodyUpdater(arm26, initial).update(job(store, steps=10, **parts))
         return update.mae.encoder[0][0]
@@ -89,10 +92,10 @@ def test_messages_that_contradict_the_body_are_not_learned(arm26, initial, stage
     np.testing.assert_array_equal(learned(learned=wrong), learned())
 
 
-def test_the_ellipsoid_holds_as_many_of_the_messages_that_judge(arm26, initial, stage):
+def test_the_covariance_covers_95_percent_of_validation_messages(arm26, initial, stage):
     judging, fresh = stage.store(1000).observations(), stage.store(1000).observations()
-    for seen in (judging, fresh):
-        seen.length[:] += 0.003 * stage.rng.standard_normal(seen.length.shape)
+    for observed in (judging, fresh):
+        observed.length[:] += 0.003 * stage.rng.standard_normal(observed.length.shape)
 
     def inside(**parts):
         mae = BodyUpdater(arm26, initial).update(job(store, steps=100, **parts)).mae
@@ -107,7 +110,7 @@ def test_the_ellipsoid_holds_as_many_of_the_messages_that_judge(arm26, initial, 
     assert inside(judging=judging) == pytest.approx(0.95, abs=0.07)
 
 
-def test_a_changed_muscle_is_noticed_unasked(arm26, initial, stage):
+def test_a_changed_muscle_is_detected(arm26, initial, stage):
     updater, store = BodyUpdater(arm26, initial), stage.store(20)
     assert updater.update(job(store, steps=1)).changed == ()
     for _ in range(5):
@@ -117,7 +120,7 @@ def test_a_changed_muscle_is_noticed_unasked(arm26, initial, stage):
     assert updater.update(job(store, steps=1)).changed == ((3, 5),)
 
 
-def test_a_slipped_joint_sensor_reopens_no_muscle(arm26, initial, stage):
+def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial, stage):
     updater, store = BodyUpdater(arm26, initial), stage.store(20)
     updater.update(job(store, steps=1))
     for _ in range(4):
@@ -137,12 +140,13 @@ def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_bod
     assert trainer.steps == 1
 
 
-def test_synthetic_lengths_scatter_both_ways_by_what_of_friction_stays_unknown(other_body):
+def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
     data = synthetic_samples(other_body, np.zeros(6), 2000, np.random.default_rng(0))
     scale = scale_vector(2, 6)
-    (theta, tension, length), seen = np.split(data.true / scale, [2, 8], axis=1), data.seen / scale
-    off = seen[:, 8:] - length
-    np.testing.assert_array_equal(seen[:, :8], np.hstack([theta, tension]))
+    theta, tension, length = np.split(data.true / scale, [2, 8], axis=1)
+    observed = data.seen / scale
+    off = observed[:, 8:] - length
+    np.testing.assert_array_equal(observed[:, :8], np.hstack([theta, tension]))
     all_of_it = [
         other_body.lengths(theta, tension, way * np.ones_like(length))[0] for way in (-1, 1)
     ]
@@ -150,7 +154,7 @@ def test_synthetic_lengths_scatter_both_ways_by_what_of_friction_stays_unknown(o
     assert abs(np.sign(off).mean()) < 0.1 and np.abs(off).mean() > 1e-5
 
 
-def test_preset_paper_takes_its_hundred_steps(arm26, initial, stage):
+def test_preset_paper_takes_100_steps_in_each_update(arm26, initial, stage):
     updater = PaperUpdater(arm26, initial)
     store = stage.store(PAPER.least_samples)
     states = stage.states(500)
@@ -177,7 +181,7 @@ def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
         Training(arm26, 'best')
 
 
-def test_a_learned_network_without_its_samples_is_not_forgotten(learned, arm26, initial):
+def test_an_update_on_few_samples_keeps_most_of_a_learned_network(learned, arm26, initial):
     mae, _, _, stage = learned
     states, two = stage.states(1000), job(stage.store(2))
     # Four seeds, because a network of so few steps wanders: 1.1 to 2.5 times what it was before.
@@ -188,7 +192,7 @@ def test_a_learned_network_without_its_samples_is_not_forgotten(learned, arm26, 
     assert going_on < 0.75 * anew
 
 
-def test_a_learner_that_starts_again_goes_on_as_calmly_as_it_was(learned, arm26):
+def test_a_restarted_learner_continues_with_small_changes(learned, arm26):
     mae, _, store, stage = learned
     assert learned_steps(mae) == 6 * 60
     states = stage.states(1000)
@@ -199,9 +203,7 @@ def test_a_learner_that_starts_again_goes_on_as_calmly_as_it_was(learned, arm26)
     assert learned_steps(update.mae) == learned_steps(mae) + 2 * 60
 
 
-def test_a_network_of_another_arm_is_learned_anew_as_fast_as_one_of_geometry(
-    learned, arm26, initial
-):
+def test_a_network_of_another_arm_adapts_as_fast_as_an_initial_one(learned, arm26, initial):
     stage = Stage(drawn_body(arm26, 8, 5, 1.0))
     states = stage.states(1000)
     store = stage.store(20)
@@ -214,23 +216,23 @@ def test_a_network_of_another_arm_is_learned_anew_as_fast_as_one_of_geometry(
     assert ends[0] < 1.3 * ends[1]
 
 
-def test_what_friction_adds_to_the_tension_is_taken_out_before_the_network_is_asked(learned):
+def test_removing_tendon_friction_improves_the_estimate(learned):
     mae, _, _, stage = learned
-    seen = stage.store(500).observations()
+    observed = stage.store(500).observations()
     read, end = (
-        error(mae, seen.theta, tension, seen.length)
-        for tension in (seen.tension, seen.end_tension(mae.friction))
+        error(mae, observed.theta, tension, observed.length)
+        for tension in (observed.tension, observed.end_tension(mae.friction))
     )
     assert end < 0.8 * read
 
 
-def test_a_network_of_geometry_brings_no_body(arm26, initial):
+def test_an_initial_network_has_no_body_corrections(arm26, initial):
     assert learned_steps(initial) == 0
     body = BodyUpdater(arm26, initial).body
     assert all((parameters == 0.0).all() for parameters in body.parameters)
 
 
-def test_a_network_tells_how_far_its_estimates_may_be_off(arm26, learned):
+def test_the_covariance_of_a_network_covers_its_errors_and_is_saved(arm26, learned):
     mae, _, _, stage = learned
     theta, tension, length = stage.states(1000)
     error = mae.estimate(tension, length).theta - theta

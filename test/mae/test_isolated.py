@@ -26,7 +26,7 @@ def states():
 
 @pytest.mark.parametrize('lost', [(0,), (5,), (1, 3)])
 @pytest.mark.parametrize('preset', PRESETS)
-def test_what_isolated_muscles_read_has_no_influence(trained, states, preset, lost):
+def test_readings_of_isolated_muscles_have_no_influence(trained, states, preset, lost):
     mae, (_, tension, length) = trained[preset].without(lost), states
     before = mae.estimate(tension, length)
     rng = np.random.default_rng(1)
@@ -42,7 +42,7 @@ def test_what_isolated_muscles_read_has_no_influence(trained, states, preset, lo
     assert np.isfinite(anomaly(error)).all()
 
 
-def test_without_isolated_muscles_nothing_differs(trained, states):
+def test_a_network_without_isolated_muscles_is_unchanged(trained, states):
     mae, (_, tension, length) = trained['default'], states
     assert mae.without(()) is mae
     back = mae.without((2,)).without(())
@@ -50,7 +50,7 @@ def test_without_isolated_muscles_nothing_differs(trained, states):
         np.testing.assert_array_equal(got, want)
 
 
-def test_the_others_tell_the_posture(trained, states):
+def test_the_remaining_muscles_determine_the_posture(trained, states):
     mae, (theta, tension, length) = trained['default'], states
     for lost in range(6):
         off = mae.without((lost,)).estimate(tension, length).theta - theta
@@ -71,24 +71,24 @@ def test_a_joint_at_its_end_is_not_taken_for_one_in_the_middle(trained):
         assert off.mean() < healthy
 
 
-def test_healthy_statistics_are_those_of_the_others(trained):
+def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     mae = trained['default']
     mae = replace(mae, anomaly=replace(mae.anomaly, calibrated=True))
-    less = mae.without((1,))
+    reduced = mae.without((1,))
     kept = [m for m in range(12) if m % 6 != 1]
     np.testing.assert_array_equal(
-        less.anomaly.covariance[np.ix_(kept, kept)], mae.anomaly.covariance[np.ix_(kept, kept)]
+        reduced.anomaly.covariance[np.ix_(kept, kept)], mae.anomaly.covariance[np.ix_(kept, kept)]
     )
-    np.linalg.cholesky(less.anomaly.covariance)
-    assert less.anomaly.calibrated
-    assert not less.without(()).anomaly.calibrated  # nobody knows what is normal for it
+    np.linalg.cholesky(reduced.anomaly.covariance)
+    assert reduced.anomaly.calibrated
+    assert not reduced.without(()).anomaly.calibrated  # nobody knows what is normal for it
 
 
-def test_a_checkpoint_says_who_is_isolated(trained):
-    less = trained['default'].without((4, 1))
-    back = checkpoint.from_bytes(checkpoint.to_bytes(less), ROBOT)
-    assert back.isolated == less.isolated == (1, 4)
+def test_a_checkpoint_stores_the_isolated_muscles(trained):
+    reduced = trained['default'].without((4, 1))
+    back = checkpoint.from_bytes(checkpoint.to_bytes(reduced), ROBOT)
+    assert back.isolated == reduced.isolated == (1, 4)
     for wrong in ((6,), (1, 1)):
-        data = checkpoint.to_bytes(replace(less, isolated=wrong))
+        data = checkpoint.to_bytes(replace(reduced, isolated=wrong))
         with pytest.raises(CheckpointError, match='isolated'):
             checkpoint.from_bytes(data, ROBOT)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 
-import pickle
 
 import numpy as np
 import pytest
@@ -37,9 +36,10 @@ def test_numpy_agrees_with_torch(mae, states, index):
 @pytest.mark.parametrize('mask', Mask)
 def test_masked_input_is_ignored(mae, states, mask):
     hidden = [
-        part if seen else np.full_like(part, np.nan) for part, seen in zip(states, mask.value)
+        part if observed else np.full_like(part, np.nan)
+        for part, observed in zip(states, mask.value)
     ]
-    absent = [part if seen else None for part, seen in zip(states, mask.value)]
+    absent = [part if observed else None for part, observed in zip(states, mask.value)]
     expected = mae.encode(mask, *states)
     np.testing.assert_array_equal(mae.encode(mask, *hidden), expected)
     np.testing.assert_array_equal(mae.encode(mask, *absent), expected)
@@ -51,7 +51,7 @@ def test_missing_input_is_refused(mae, mask):
         mae.encode(mask)
 
 
-def test_latent_has_as_many_entries_as_joints_and_muscles(mae, states):
+def test_the_latent_state_has_as_many_entries_as_joints_and_muscles(mae, states):
     assert mae.encode(Mask.THETA_TENSION, *states).shape == (12, 2 + 6)
 
 
@@ -121,16 +121,3 @@ def test_muscle_jacobian_is_the_limit_of_the_papers_difference(mae, states):
     np.testing.assert_allclose(
         mae.muscle_jacobian(states.theta[0], states.tension[0]), analytic[0], atol=1e-6
     )
-
-
-def test_weights_cannot_be_written(mae):
-    for weight, bias in (*mae.encoder, *mae.decoder, (mae.mean, mae.std)):
-        assert not weight.flags.writeable and not bias.flags.writeable
-
-
-def test_a_network_that_was_simulated_goes_to_other_processes(mae, states):
-    length, pullback = mae.lengths_with_pullback(states.theta, states.tension)
-    sent = pickle.loads(pickle.dumps(mae))
-    again, torque = sent.lengths_with_pullback(states.theta, states.tension)
-    np.testing.assert_array_equal(again, length)
-    np.testing.assert_array_equal(torque(states.tension), pullback(states.tension))

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
@@ -63,7 +62,7 @@ def test_loss_has_a_finite_gradient_where_nothing_is_wrong():
     assert gradients and all(torch.isfinite(g).all() for g in gradients)
 
 
-def test_samples_are_the_geometric_model_to_a_little_beyond_its_limits(robot):
+def test_training_samples_cover_the_geometric_model_slightly_beyond_its_limits(robot):
     theta, tension, length = overload_states(robot, 2000, np.random.default_rng(0))
     margin = POSTURE_MARGIN * (robot.upper - robot.lower)
     assert (theta >= robot.lower - margin).all() and (theta <= robot.upper + margin).all()
@@ -126,14 +125,14 @@ def test_training_leaves_the_callers_random_state_and_threads_alone(robot):
 def test_training_goes_on_from_given_weights(robot, trained):
     rng = np.random.default_rng(2)
     batches = shuffled(random_states(robot, 2000, rng, 200.0).scaled(), 64, rng)
-    settings = replace(PAPER.training, steps=200, step_size=3e-4)
+    settings = structs.replace(PAPER.training, steps=200, step_size=3e-4)
     before = trained['paper']
     network = from_mae(before)
-    seen: list[int] = []
-    losses = fit(network, batches, settings, progress=lambda step, *_: seen.append(step))
+    observed: list[int] = []
+    losses = fit(network, batches, settings, progress=lambda step, *_: observed.append(step))
     after = to_mae(network, robot.joints, robot.muscles, 'paper', 'more')
     states = random_states(robot, 500, rng, 200.0)
-    assert seen == list(range(200)) and len(losses) == 200
+    assert observed == list(range(200)) and len(losses) == 200
 
     def error(mae):
         return sum(e.norm for e in pair_errors(mae, states) if e.output == 'theta')

@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the status line says, and the screen that takes its place on a terminal."""
+"""What the status line says."""
 
-import io
 import math
-from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from graph import no_number_of
 
 from musculoskeletal_ae.nodes import bringup_status
-from musculoskeletal_ae.nodes.bringup_status import muscle_table, open_screen
 from musculoskeletal_ae.nodes.situation import Situation, figures
 
 
@@ -108,38 +103,3 @@ def test_an_error_of_any_node_is_told_until_it_is_over():
     assert told.trouble() == '/left/learner: the disk is full'
     told.diagnosed(said('/left/learner', 'learning'))
     assert told.trouble() == ''
-
-
-def test_a_terminal_shows_every_muscle_and_the_trouble_where_rich_is_there(arm26):
-    console = pytest.importorskip('rich.console', reason='rich comes with ./bringup.sh --view')
-    states = np.stack([np.linspace(-0.02, 0.03, 6), np.linspace(30.0, 250.0, 6), np.full(6, 41.0)])
-    screen = console.Console(width=100, record=True, file=io.StringIO())
-    marked = SimpleNamespace(muscles=[f'{m} [/l]' for m in arm26.muscles], tension=arm26.tension)
-    screen.print(muscle_table(marked, states, ['error 0.1 rad', 'STOPPED']))
-    text = screen.export_text()
-    assert all(name in text for name in marked.muscles)
-    assert 'STOPPED' in text and '250' in text and '█' in text
-    assert open_screen() is None  # output is kept, not a terminal
-
-
-def test_the_screen_goes_on_where_an_isolated_muscle_says_no_number(graph, arm26, monkeypatch):
-    console = pytest.importorskip('rich.console', reason='rich comes with ./bringup.sh --view')
-    shown = console.Console(width=100, record=True, file=io.StringIO())
-    screen = SimpleNamespace(
-        update=lambda table, refresh: shown.print(table),  # noqa: ARG005
-        stop=lambda: None,
-    )
-    monkeypatch.setattr(bringup_status, 'open_screen', lambda: screen)
-    node = graph.host(bringup_status.BringupStatus, robot='arm26')
-    publish = no_number_of(graph, arm26, 'brachialis')
-
-    def taken():
-        publish()
-        return node.states is not None
-
-    graph.wait(taken, 'what the others say')
-    node.anomalies.append(0.0)  # an estimate has come
-    node._print()
-    rows = dict(line.split(maxsplit=1) for line in shown.export_text().splitlines() if 'i' in line)
-    assert rows['brachialis'].split() == ['0', '–', '25']
-    assert rows['biceps_long'].split()[:2] == ['0', '61']

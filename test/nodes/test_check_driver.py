@@ -4,8 +4,10 @@
 import signal
 
 import pytest
-from graph import Process, executable
+from graph import PATIENCE, Process, executable
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
+
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 
 
 def check(graph, *options):
@@ -14,20 +16,26 @@ def check(graph, *options):
     return Process('check_driver', command)
 
 
-def started(graph, **parameters):
-    graph.start('hardware_emulator', robot='arm26', **parameters)
+def start_driver(graph, **parameters):
+    graph.host(HardwareEmulator, robot='arm26', **parameters)
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.next('muscle_states')
 
 
-def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
-    started(graph)
+def ended(graph, process):
+    """Let the driver run until check_driver has ended; return its exit status and output."""
+    graph.wait(lambda: not process.alive(), 'the end of check_driver', PATIENCE)
+    return process.ended()
+
+
+def test_a_sound_driver_passes_and_is_moved_only_with_move(graph):
+    start_driver(graph)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
     # A busy machine may keep a sound driver waiting: it is listened to until it is heard well.
-    assert check(graph, '--wait', '--seconds', '2').ended()[0] == 0
+    assert ended(graph, check(graph, '--wait', '--seconds', '2'))[0] == 0
     assert not commands
     one = ['--move', '--muscles', 'biceps_long']
-    status, output = check(graph, '--wait', '--seconds', '2', *one).ended()
+    status, output = ended(graph, check(graph, '--wait', '--seconds', '2', *one))
     faults = [line for line in output.splitlines() if line.startswith('fault: ')]
     assert {line.split()[1] for line in faults} <= {'latency', 'rate'}, output
     assert status == 0 or faults
@@ -36,7 +44,7 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
 
 
 @pytest.mark.parametrize(
-    ('fault', 'options', 'told'),
+    ('fault', 'options', 'reported'),
     [
         ('bias:biceps_long:0.1', [], 'fault: zero of biceps_long'),
         (
@@ -46,69 +54,62 @@ def test_a_sound_driver_passes_and_is_wound_in_only_if_asked(graph):
         ),
     ],
 )
-def test_each_fault_is_told_with_what_to_change(graph, fault, options, told):
-    started(graph, faults=[fault])
-    status, output = check(graph, '--seconds', '2', *options).ended()
+def test_a_fault_is_reported_with_what_to_change(graph, fault, options, reported):
+    start_driver(graph, faults=[fault])
+    status, output = ended(graph, check(graph, '--seconds', '2', *options))
     assert status == 1, output
-    assert told in output
+    assert reported in output
     assert 'change: ' in output
 
 
-def test_it_says_what_it_waits_for_and_what_is_wrong_until_it_is_right(graph):
+def test_with_wait_check_driver_reports_faults_until_the_driver_is_right(graph):
     waiting = check(graph, '--wait', '--seconds', '2')
-    lines = iter(waiting.process.stdout.readline, '')
-    assert f'waiting for {graph.namespace}/muscle_states' in next(lines)
-    graph.start('hardware_emulator', robot='arm26', faults=['bias:biceps_long:0.1'])
-    for line in lines:
-        if 'nothing may move' in line:
-            break
-        assert 'keeps its contract' not in line
+    waiting.wait_for_output(f'waiting for {graph.namespace}/muscle_states')
+    start_driver(graph, faults=['bias:biceps_long:0.1'])
+    graph.wait(lambda: 'nothing may move' in waiting.output, 'the fault')
+    assert 'keeps its contract' not in waiting.output
     assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]
-    status, output = waiting.ended()
+    status, output = ended(graph, waiting)
     assert status == 0
     assert 'the driver keeps its contract' in output
 
 
-def test_a_topic_of_another_type_is_told(graph):
+def test_a_topic_of_the_wrong_type_is_reported(graph):
     graph.node.create_publisher(Float32MultiArray, 'muscle_states', 10)
     status, output = check(graph, '--seconds', '1').ended()
     assert status == 1
     assert 'is a std_msgs/msg/Float32MultiArray' in output
 
 
-def test_it_does_not_move_what_a_controller_moves(graph):
-    started(graph)
+def test_check_driver_does_not_move_an_arm_under_control(graph):
+    start_driver(graph)
     graph.publisher(Float64MultiArray, 'muscle_length_command')
-    status, output = check(graph, '--seconds', '1', '--move').ended()
+    status, output = ended(graph, check(graph, '--seconds', '1', '--move'))
     assert status == 1
     assert 'stop the controller' in output
 
 
-def test_it_stops_winding_when_a_controller_starts(graph):
-    started(graph)
+def test_check_driver_stops_moving_when_a_controller_starts(graph):
+    start_driver(graph)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
     process = check(graph, '--wait', '--seconds', '1', '--move')
     graph.wait(lambda: commands, 'the first command')
     graph.publisher(Float64MultiArray, 'muscle_length_command')
-    status, output = process.ended()
+    status, output = ended(graph, process)
     assert status == 1
     assert 'stop the controller' in output
 
 
-def test_ctrl_c_ends_it_without_a_traceback(graph):
+def test_ctrl_c_ends_check_driver_without_a_traceback(graph):
     waiting = check(graph)
-    waiting.process.stdout.readline()
+    waiting.wait_for_output('waiting for')
     status, output = waiting.end(signal.SIGINT)
-    assert status == 130 and output == ''
+    assert status == 130
+    assert 'Traceback' not in output
 
 
 def test_nodes_say_what_they_wait_for(graph):
     estimator = graph.start('estimator', robot='arm26')
-    graph.listen(Float64MultiArray, 'muscle_states')
-    graph.wait(lambda: 'estimator' in graph.node.get_node_names(), 'the estimator')
-    graph.spin(4.0)  # it says so once
-    _, output = estimator.end()
-    waiting = [line for line in output.splitlines() if 'waiting for' in line]
-    assert len(waiting) == 1
-    assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting[0]
-    assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting[0]
+    waiting = estimator.wait_for_output('waiting for')
+    assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting
+    assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from controlled_arm import ControlledArm
 from geometry_msgs.msg import WrenchStamped
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([0.1, -0.4])
 
@@ -20,7 +18,7 @@ def arm(graph, arm26, trained_file):
     return ControlledArm(graph, arm26, trained_file)
 
 
-def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
+def test_every_length_method_moves_the_arm_without_a_jump_and_a_wrong_one_is_refused(arm):
     for n, method in enumerate(('geometric', 'first', 'second', 'proposed', 'stiffness')):
         assert arm.graph.set_parameter('controller', 'method', method)[0]
         goal = THERE if n % 2 else HERE
@@ -30,17 +28,10 @@ def test_every_length_method_moves_the_arm_and_a_wrong_one_is_refused(arm):
     assert not done
     assert 'proposed' in reason
     assert len(arm.sent('tension')) == 0
-
-
-def test_a_target_is_approached_without_a_jump_and_the_next_one_as_well(arm):
-    arm.target(HERE)
-    arm.goes_to(HERE)
-    arm.target(THERE)
-    arm.goes_to(THERE)
     arm.never_jumped()
 
 
-def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_lengths(arm):
+def test_method_tension_sends_tensions_only_and_returns_to_lengths(arm):
     arm.target(HERE)
     arm.goes_to(HERE)
     assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
@@ -55,34 +46,6 @@ def test_tension_sends_tensions_only_reaches_the_posture_and_goes_back_to_length
     assert arm.graph.set_parameter('controller', 'method', 'proposed')[0]
     arm.graph.wait(lambda: len(arm.sent()) > lengths + 50, 'length commands')
     arm.goes_to(THERE)
-
-
-def test_a_stiffness_within_the_reported_range_is_planned_and_one_that_fits_no_joint_refused(arm):
-    posture, joint = arm.controller.core.posture, arm.robot.joints[0]
-    assert arm.graph.set_parameter('controller', 'method', 'stiffness')[0]
-    assert not arm.graph.set_parameter('controller', 'joint_stiffness', [1.0, 2.0, 3.0])[0]
-    arm.target([0.3, -0.8])
-    text = arm.said(f'joint stiffness {joint}')
-    low, high = map(float, text.split('reachable ')[1].split(' to '))
-    pulls = []
-    for share in (0.125, 0.875):
-        desired = low + share * (high - low)
-        done, _ = arm.graph.set_parameter('controller', 'joint_stiffness', [desired, 0.0])
-        assert done
-        planned = pytest.approx(desired, rel=0.01)
-        arm.graph.wait(lambda p=planned: posture.solution.stiffness.expected[0, 0] == p, 'the plan')
-        arm.goes_to([0.3, -0.8], within=0.2)
-        pulls.append(np.linalg.norm(posture.solution.tension))
-    assert pulls[1] > pulls[0] + 20.0  # the stiffer, the tenser
-    assert arm.graph.set_parameter('controller', 'joint_stiffness', [1e3, 0.0])[0]
-    arm.says('clamped')
-    assert arm.graph.set_parameter('controller', 'joint_stiffness', [0.0])[0]
-    # What is said of it, and what of a stop, stand beside each other.
-    assert arm.graph.call(Trigger, 'controller/stop').success
-    for _ in range(2):
-        assert arm.state().message.startswith('stopped: controller/stop')
-    assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
-    assert not any('stiffness' in key for key in arm.state().values)
 
 
 def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm):
@@ -115,31 +78,7 @@ def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
     assert 'stopped' not in arm.state().message
 
 
-def test_heat_lowers_the_limit_and_is_said(arm):
-    arm.target(HERE)
-    arm.goes_to(HERE)
-    # Modules at room temperature lie 15 °C below 40 °C; the load of holding warms them into that.
-    assert arm.graph.set_parameter('controller', 'temperature_limit', 40.0)[0]
-    arm.says('tension limited by heat')
-    assert 'stopped' not in arm.state().message
-
-
-def test_parameters_set_together_are_taken_all_or_none(arm):
-    changes = [Parameter('method', value='tension'), Parameter('checkpoint', value='/nowhere')]
-    request = SetParametersAtomically.Request(parameters=[p.to_parameter_msg() for p in changes])
-    result = arm.graph.call(
-        SetParametersAtomically, 'controller/set_parameters_atomically', request
-    ).result
-    assert not result.successful
-    assert 'nowhere' in result.reason
-    arm.target(HERE)
-    arm.goes_to(HERE)
-    assert len(arm.sent('tension')) == 0
-    arm.says('method')
-    assert arm.state().values['method'] == 'proposed'
-
-
-def test_a_hand_moves_a_floating_arm_and_the_estimator_feels_it(arm):
+def test_a_push_moves_an_arm_in_gravity_compensation_and_is_estimated(arm):
     graph = arm.graph
     graph.listen(WrenchStamped, 'estimated_external_wrench', 1000)
     pushes = graph.publisher(WrenchStamped, 'hardware_emulator/external_wrench')

@@ -15,7 +15,7 @@ TEMPLATE = Path(__file__).parents[2] / 'examples' / 'driver.py'
 ROBOT = Robot.load('arm26')
 
 
-def test_it_follows_lengths_and_tensions_whichever_came_last(graph):
+def test_the_driver_template_follows_lengths_and_tensions_whichever_came_last(graph):
     command = [sys.executable, str(TEMPLATE), '--ros-args', '-r', f'__ns:={graph.namespace}']
     graph.processes.append(Process('driver.py', command))
     graph.listen(Float64MultiArray, 'muscle_states')
@@ -40,7 +40,7 @@ def test_it_follows_lengths_and_tensions_whichever_came_last(graph):
         graph.wait(pulled, f'{kind}s to be followed')
 
 
-def test_nothing_commands_tensions_that_no_driver_follows(graph):
+def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(graph):
     core = graph.host(Controller, robot='arm26').core
     graph.listen(Float64MultiArray, 'muscle_length_command')
     graph.wait(lambda: not graph.set_parameter('controller', 'method', 'float')[0], 'a refusal')

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import InvalidParameterValueException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
@@ -61,7 +61,7 @@ def answer(graph, message):
     return graph.received['estimated_joint_states'][-1]
 
 
-def test_estimates_come_by_name_and_near_the_truth(estimator, arm26, healthy):
+def test_estimates_are_published_by_name_and_near_the_truth(estimator, arm26, healthy):
     joints = answer(estimator, healthy)
     assert tuple(joints.name) == arm26.joints
     assert joints.header.stamp.sec > 0
@@ -106,7 +106,7 @@ def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimato
     assert {f'rejected muscle_states: {reason}' for reason in cases} <= values(estimator).keys()
 
 
-def test_a_checkpoint_is_swapped_in_by_parameter_and_topic_and_an_unfit_one_refused(
+def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refused(
     estimator, healthy, trained_file, tmp_path
 ):
     answer(estimator, healthy)
@@ -145,11 +145,11 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
     sick = deepcopy(healthy)
     sick.data[0] -= 0.1  # a muscle wound in by 10 cm
 
-    def seen():
+    def observed():
         answer(estimator, sick)
         return detected and detected[-1].data
 
-    estimator.wait(seen, 'the detection')
+    estimator.wait(observed, 'the detection')
     estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the diagnosis')
     assert 'anomaly detected: ' in estimator.report('estimator').message
     for _ in range(8):
@@ -162,19 +162,21 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
 
 
 @pytest.mark.parametrize('kind', ['length', 'tension'])
-def test_commands_of_either_kind_tell_a_dead_muscle(estimator, arm26, healthy, kind):
+def test_a_muscle_without_its_commanded_length_or_tension_is_an_anomaly(
+    estimator, arm26, healthy, kind
+):
     healthy.data[6 + 2] = 0.0  # tension of muscle 2
     command = estimator.publisher(Float64MultiArray, f'muscle_{kind}_command')
     demand = np.array(healthy.data[:6]) - 0.003 if kind == 'length' else np.full(6, 60.0)
     detected = estimator.received['anomaly_detected']
 
-    def seen():
+    def observed():
         command.publish(array_message(demand, 'muscle'))
         estimator.muscles.publish(healthy)
         estimator.spin(0.02)
         return detected and detected[-1].data
 
-    estimator.wait(seen, 'the detection')
+    estimator.wait(observed, 'the detection')
     assert estimator.estimator.core.cause.startswith(arm26.muscles[2])
 
 
@@ -193,30 +195,30 @@ def picture(robot, theta):
     return message
 
 
-def test_a_marker_says_nothing_of_joints_that_do_not_move_it(graph):
+def test_a_marker_gives_no_angles_of_joints_that_do_not_move_it(graph):
     robot = Robot.load('musashi_upper_body')
     graph.host(Estimator, robot='musashi_upper_body')
-    seen = graph.listen(JointState, 'vision_joint_states')
+    observed = graph.listen(JointState, 'vision_joint_states')
     graph.publisher(PoseStamped, 'marker_pose').publish(picture(robot, 0.5 * robot.lower))
-    graph.wait(lambda: seen, 'the joint angles')
+    graph.wait(lambda: observed, 'the joint angles')
     hand = robot.description.end_effector.partition('_')[0]
-    assert seen[0].name == [joint for joint in robot.joints if joint.startswith(hand)]
-    assert 0 < len(seen[0].position) == len(seen[0].name) < robot.joint_count
+    assert observed[0].name == [joint for joint in robot.joints if joint.startswith(hand)]
+    assert 0 < len(observed[0].position) == len(observed[0].name) < robot.joint_count
 
 
-def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, arm26):
+def test_a_marker_pose_becomes_joint_angles_with_the_stamp_of_the_picture(estimator, arm26):
     theta = arm26.lower + 0.4 * (arm26.upper - arm26.lower)
     message = picture(arm26, theta)
-    camera, seen = estimator.publisher(PoseStamped, 'marker_pose'), estimator.received
+    camera, observed = estimator.publisher(PoseStamped, 'marker_pose'), estimator.received
 
     def arrived():
         camera.publish(message)
         estimator.spin(0.05)
-        return seen['vision_joint_states']
+        return observed['vision_joint_states']
 
     estimator.wait(arrived, 'the joint angles')
-    assert seen['vision_joint_states'][0].header.stamp.sec == 42
-    np.testing.assert_allclose(seen['vision_joint_states'][0].position, theta, atol=1e-3)
+    assert observed['vision_joint_states'][0].header.stamp.sec == 42
+    np.testing.assert_allclose(observed['vision_joint_states'][0].position, theta, atol=1e-3)
     message.header.frame_id = 'camera'
     rejected = estimator.estimator.rejected
     estimator.wait(lambda: arrived() and rejected['marker_pose: wrong frame'], 'the refusal')
@@ -226,9 +228,7 @@ def test_a_seen_marker_becomes_joint_angles_with_the_pictures_stamp(estimator, a
     ('parameters', 'error', 'expected'),
     [
         ({'robot': 'no_such_arm'}, MusculoskeletalError, 'musashi_left_arm'),
-        ({'checkpoint': '/no/such/file'}, MusculoskeletalError, '/no/such/file'),
         ({'preset': 'magic'}, MusculoskeletalError, r'parameter preset: .*default, paper'),
-        ({'anomaly_threshold': 1}, InvalidParameterTypeException, 'anomaly_threshold'),
         ({'anomaly_threshold': -1.0}, InvalidParameterValueException, 'anomaly_threshold'),
     ],
 )
@@ -240,7 +240,7 @@ def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected
 # -- the process ---------------------------------------------------------------------------------
 
 
-def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
+def test_ctrl_c_ends_the_estimator_without_a_traceback(graph, trained_file):
     process = graph.start('estimator', robot='arm26', checkpoint=trained_file)
     graph.wait(lambda: graph.node.count_publishers('anomaly') > 0, 'the estimator')
     status, output = graph.ended(process, signal.SIGINT)
@@ -248,25 +248,21 @@ def test_it_ends_quietly_on_ctrl_c(graph, trained_file):
     assert 'Traceback' not in output
 
 
-@pytest.mark.parametrize(
-    ('parameters', 'expected'),
-    [({'robot': 'no_such_arm'}, 'musashi_left_arm'), ({'anomaly_threshold': 1}, 'type')],
-)
-def test_a_wrong_parameter_is_one_clear_line(graph, parameters, expected):
-    status, output = graph.ended(graph.start('estimator', **parameters))
+def test_a_wrong_parameter_ends_the_process_with_one_clear_line(graph):
+    status, output = graph.ended(graph.start('estimator', robot='no_such_arm'))
     assert status == 1
     assert output.startswith('error: ') and output.count('\n') == 1
-    assert expected in output
+    assert 'musashi_left_arm' in output
 
 
-def test_a_network_that_knows_its_uncertainty_tells_it(graph, arm26, trained_file, tmp_path):
+def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, tmp_path):
     covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     mae = replace(checkpoint.load(trained_file, arm26), covariance=covariance)
     file = tmp_path / 'sure.safetensors'
     checkpoint.save(mae, file)
     node = graph.host(Estimator, robot='arm26', checkpoint=str(file))
-    told = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
+    reported = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
     graph.host(HardwareEmulator, robot='arm26')
-    message = graph.wait(lambda: told and told[-1], 'the covariance')
+    message = graph.wait(lambda: reported and reported[-1], 'the covariance')
     np.testing.assert_array_equal(np.reshape(message.data, (2, 2)), covariance)
     assert '0.020' in node.report().values['joint uncertainty']

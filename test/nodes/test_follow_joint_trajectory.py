@@ -17,7 +17,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import NumberOfEntities, Waitable
 from trajectory_msgs.msg import JointTrajectory
 
-from musculoskeletal_ae.nodes import follow_joint_trajectory, running
+from musculoskeletal_ae.nodes import executor, follow_joint_trajectory
 
 from .test_motion import HERE, THERE, trajectory
 
@@ -91,7 +91,7 @@ def arm(graph, arm26, trained_file, monkeypatch):
     return ControlledArm(graph, arm26, trained_file)
 
 
-def test_goals_are_followed_told_of_replaced_cancelled_and_refused(arm):
+def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     server = arm.controller.action._server
     assert server.name == 'follow_joint_trajectory'
     first = server.send(Goal(trajectory(arm, HERE)))
@@ -164,15 +164,15 @@ class Asked(Waitable):
         self.guard.handle.__exit__(*how)
 
 
-def test_what_is_waited_for_as_an_action_is_served_without_the_second_s_look(monkeypatch):
-    monkeypatch.setattr(running, 'EVENTS_EVERY', 600)  # only what is served at once is served
+def test_requests_of_an_action_are_served_at_once(monkeypatch):
+    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)  # only what is served at once is served
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('asked', context=context)
     asked = Asked(node)
-    executor = running.LeanExecutor(context=context)
-    executor.add_node(node)
-    spun = threading.Thread(target=lambda: _until_shutdown(executor), daemon=True)
+    lean = executor.LeanExecutor(context=context)
+    lean.add_node(node)
+    spun = threading.Thread(target=lambda: _until_shutdown(lean), daemon=True)
     spun.start()
     end = time.monotonic() + 60.0
     for count in range(1, 4):
@@ -184,6 +184,6 @@ def test_what_is_waited_for_as_an_action_is_served_without_the_second_s_look(mon
     assert asked.served == ['asked'] * 3
 
 
-def _until_shutdown(executor):
-    with suppress(running.ExternalShutdownException):
-        executor.spin()
+def _until_shutdown(lean):
+    with suppress(executor.ExternalShutdownException):
+        lean.spin()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated hardware as a robot on the graph."""
 
-import bodies
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,10 +11,9 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 
 @pytest.fixture
@@ -32,7 +30,7 @@ def arm(graph):
 
 
 def rows(graph, robot):
-    return read_array(graph.next('muscle_states'), 3, robot.muscle_count)
+    return read_muscle_states(graph.next('muscle_states'), robot.muscle_count)
 
 
 def drive(graph, command, condition, what):
@@ -46,7 +44,7 @@ def drive(graph, command, condition, what):
     graph.wait(done, what)
 
 
-def test_it_publishes_what_musashi_s_modules_would(arm, arm26):
+def test_the_emulator_publishes_the_topics_of_a_robot(arm, arm26):
     message = arm.next('muscle_states')
     assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
         ('quantity', 3, 18),
@@ -66,7 +64,7 @@ def test_it_publishes_what_musashi_s_modules_would(arm, arm26):
     assert {m.header.frame_id for m in markers} == {arm26.root_link}
 
 
-def test_length_commands_move_it_and_silence_makes_it_safe(arm, arm26):
+def test_length_commands_move_the_arm_and_their_absence_makes_it_safe(arm, arm26):
     theta = 0.5 * (arm26.lower + arm26.upper)
     tension = np.full(6, 80.0)
     command = arm26.muscle_lengths(theta, tension) - 50.0 / arm26.stiffness
@@ -80,7 +78,7 @@ def test_length_commands_move_it_and_silence_makes_it_safe(arm, arm26):
     arm.wait(lambda: rows(arm, arm26)[1].max() < 35.0, 'the safe state after the timeout')
 
 
-def test_a_muscle_can_be_cut_and_mended_at_run_time(arm, arm26):
+def test_a_muscle_is_ruptured_and_mended_at_run_time(arm, arm26):
     name = arm26.muscles[3]
     success, reason = arm.set_parameter('hardware_emulator', 'ruptured_muscles', ['biceps'])
     assert not success
@@ -127,7 +125,7 @@ def test_a_marker_pose_is_published_on_request(arm, arm26):
     assert np.linalg.norm(pin.log3(turn)) < 0.1
 
 
-def test_bad_commands_do_not_move_it(arm, arm26):
+def test_bad_commands_are_rejected_and_do_not_move_the_arm(arm, arm26):
     publisher = arm.publisher(Float64MultiArray, 'muscle_length_command')
     before = rows(arm, arm26)[0]
     for data in ([float('nan')] * 6, [-0.05] * 5, [], [0.0] * 1_300_000):
@@ -137,7 +135,7 @@ def test_bad_commands_do_not_move_it(arm, arm26):
     assert sum(arm.emulator.rejected.values()) == 4
 
 
-def test_reset_brings_it_back(arm, arm26):
+def test_a_reset_brings_the_arm_back(arm, arm26):
     command = rows(arm, arm26)[0] - 0.02
     start = np.array(arm.next('joint_states').position)
     drive(arm, command, lambda: rows(arm, arm26)[1].max() > 60.0, 'tension')
@@ -145,7 +143,7 @@ def test_reset_brings_it_back(arm, arm26):
     np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
 
 
-def test_what_no_hand_can_take_neither_breaks_it_for_good(arm, arm26):
+def test_an_impossible_wrench_is_rejected_and_a_broken_simulation_mended_by_a_reset(arm, arm26):
     push = arm.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
     message = WrenchStamped()
     message.wrench.torque.x = 1000.0
@@ -183,19 +181,7 @@ def test_without_joint_sensors_there_are_no_joint_states(graph):
     assert graph.node.count_publishers('joint_states') == 0
 
 
-def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):
-    graph.listen(PoseStamped, 'marker_pose')
-    emulator = graph.host(HardwareEmulator, robot='arm26', marker_rate=30.0)
-    assert emulator.parameter('marker_pose_rate') == 30.0
-    graph.next('marker_pose', 2)
-    for name, other in ('marker_pose_rate', 'marker_rate'), ('marker_rate', 'marker_pose_rate'):
-        for rate in 10.0, 0.0:
-            assert graph.set_parameter('hardware_emulator', name, rate)[0]
-            assert emulator.get_parameter(other).value == rate
-    assert emulator.marker_pose_rate == 0.0
-
-
-def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
+def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(JointState, 'joint_states')
     graph.listen(MarkerArray, 'hardware_emulator/markers')
@@ -208,20 +194,7 @@ def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
         assert not graph.set_parameter('hardware_emulator', 'ruptured_muscles', wrong)[0]
 
 
-def test_a_model_whose_lengths_are_others_is_told_at_the_start(graph, tmp_path, capfd):
-    file, path = tmp_path / 'own.xml', '<site site="u1"/><site site="l1"/>'
-    file.write_text(bodies.MJCF.replace(path, f'<pulley divisor="4"/>{path}'), encoding='utf-8')
-    import_robot(file, tmp_path / 'own')
-    graph.host(HardwareEmulator, robot=str(tmp_path / 'own'), reality=str(file))
-    assert "muscle 'bend' is up to" in capfd.readouterr().err
-
-
-def test_no_such_reality_ends_it_with_a_reason(graph):
-    with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
-        graph.host(HardwareEmulator, robot='arm26', reality='no/such.xml')
-
-
-def test_an_accelerometer_on_request_tells_where_down_is(graph):
+def test_an_accelerometer_is_published_on_request(graph):
     graph.host(HardwareEmulator, robot='arm26', imu_link='hand', frame_prefix='left/')
     read = graph.listen(Imu, 'imu')
     message = graph.wait(lambda: read and read[-1], 'the accelerometer')

@@ -11,7 +11,6 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.nodes.situation import VERIFYING
 
@@ -28,7 +27,7 @@ def arm(graph, arm26, trained_file):
     return arm
 
 
-def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
+def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph, name = arm.graph, arm.robot.muscles[3]
     assert graph.received['isolated_muscles'][-1].data == ''
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
@@ -50,7 +49,7 @@ def test_a_cut_muscle_is_verified_isolated_and_left_out_and_taken_back(arm):
     graph.wait(lambda: arm.controller.core.robot.isolated == (), 'its use')
 
 
-def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
+def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     graph, name = arm.graph, arm.robot.muscles[2]
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
@@ -64,7 +63,7 @@ def test_a_sensor_that_says_no_number_is_left_out_and_the_arm_goes_on(arm):
         assert any('not finite' in reason for reason in node.rejected)
 
 
-def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, trained):
+def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trained):
     graph, names = arm.graph, list(arm.robot.muscles[1:3])
     assert not graph.call(Trigger, 'estimator/isolate').success  # none is named
     done, reason = graph.set_parameter('estimator', 'isolate_muscles', ['tail'])
@@ -85,48 +84,11 @@ def test_muscles_are_isolated_by_hand_and_a_stranger_s_names_are_refused(arm, tr
     assert arm.estimator.core.robot.isolated == (1, 2)
 
 
-def test_an_estimator_that_starts_anew_learns_from_the_network_who_is_isolated(
-    graph, arm26, trained
-):
+def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):
     known = replace(trained['default'].without((4,)), version=5)
-    told = graph.listen(String, 'isolated_muscles', LATCHED)
+    reported = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
     graph.send_network(checkpoint.to_bytes(known))
-    graph.wait(lambda: told, 'the list')
-    assert told[-1].data == arm26.muscles[4]
+    graph.wait(lambda: reported, 'the list')
+    assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
-
-
-def test_what_an_estimator_says_before_it_knows_who_is_isolated_does_not_count(
-    graph, arm26, trained_file, tmp_path
-):
-    options = {'robot': 'arm26', 'checkpoint': trained_file}
-    learner = graph.host(Learner, state_directory=str(tmp_path), **options)
-    took = learner._reception.take_received
-
-    def tell(estimator, names):
-        estimator.publish(String(data=names))
-        graph.wait(lambda: took().get('isolated_muscles'), 'the learner to hear it')
-        return learner.core.isolated
-
-    estimator = graph.publisher(String, 'isolated_muscles', LATCHED)
-    assert tell(estimator, arm26.muscles[3]) == (3,)
-    graph.node.destroy_publisher(estimator)
-    successor = graph.publisher(String, 'isolated_muscles', LATCHED)
-    assert tell(successor, '') == (3,)
-    assert tell(successor, '') == ()
-
-
-def test_a_suspect_that_is_isolated_by_hand_while_it_is_verified_stays_so(graph, trained_file):
-    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, on_anomaly='isolate')
-    names = node.robot.muscles
-    node.core.detector.judges = True
-    for by_hand, isolated in ((3, (3,)), (5, (3, 5))):
-        node.core.isolate(())
-        node.core.jumped(3, 0.0)
-        assert node.core.cause and node.core.robot.isolated == (3,)
-        assert graph.set_parameter('estimator', 'isolate_muscles', [names[by_hand]])[0]
-        answer = graph.call(Trigger, 'estimator/isolate').message
-        assert answer == f'isolated: {", ".join(names[m] for m in isolated)}'
-        assert node.core.robot.isolated == isolated
-        assert not node.core.cause

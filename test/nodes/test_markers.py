@@ -24,7 +24,7 @@ from musculoskeletal_ae.nodes.shell import Shell
 CONFIG = Path(__file__).parents[2] / 'config'
 
 
-def test_estimate_and_hardware_are_drawn_apart_with_names_in_prefixed_frames(
+def test_markers_of_estimate_and_hardware_differ_and_have_names_and_prefixed_frames(
     graph, arm26, trained_file
 ):
     options = {'robot': 'arm26', 'frame_prefix': 'left/'}
@@ -56,7 +56,7 @@ def test_estimate_and_hardware_are_drawn_apart_with_names_in_prefixed_frames(
 
 
 @pytest.mark.parametrize(('file', 'status'), [('arm.png', 0), ('arm.foo', 2)])
-def test_a_picture_is_written_or_its_ending_refused(graph, tmp_path, file, status):
+def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_path, file, status):
     graph.host(HardwareEmulator, robot='arm26')
     out = tmp_path / file
     arguments = ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}']
@@ -67,7 +67,7 @@ def test_a_picture_is_written_or_its_ending_refused(graph, tmp_path, file, statu
     assert status == 0 or (file in output and '.png' in output and 'Traceback' not in output)
 
 
-def test_where_there_is_no_emulator_the_estimate_is_drawn(graph, tmp_path):
+def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
     """As with an arm of one's own; an estimator that waits for a network draws nothing yet."""
     publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
     bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
@@ -108,7 +108,7 @@ def test_poses_of_all_links_go_to_tf_where_tf2_msgs_is(graph, monkeypatch):
     np.testing.assert_allclose([end.x, end.y, end.z], hand)
 
 
-def test_the_layouts_for_rviz_and_foxglove_show_topics_that_there_are():
+def test_the_layouts_for_rviz_and_foxglove_show_existing_topics():
     topics = {'hardware_emulator/markers', 'estimated/markers', 'sim/markers'}
     rviz = yaml.safe_load((CONFIG / 'rviz.rviz').read_text('utf-8'))['Visualization Manager']
     shown = {d['Topic']['Value'] for d in rviz['Displays'] if d['Class'].endswith('/MarkerArray')}

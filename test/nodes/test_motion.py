@@ -22,7 +22,7 @@ def trajectory(arm, goal, seconds=1, names=None):
     return JointTrajectory(joint_names=names or arm.robot.joints, points=[point])
 
 
-def test_a_trajectory_is_followed_and_its_state_said_and_a_wrong_one_moves_nothing(arm):
+def test_a_trajectory_is_followed_and_its_state_published_and_a_wrong_one_moves_nothing(arm):
     graph, robot = arm.graph, arm.robot
     graph.listen(JointTrajectory, 'controller_state', 1000)
     publisher = graph.publisher(JointTrajectory, 'joint_trajectory')

@@ -17,7 +17,7 @@ def rights(node: str, kind: str, action: str) -> set[str]:
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_a_node_uses_the_rights_that_the_policy_gives_it(graph, name, tmp_path):
+def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     module = importlib.import_module(f'musculoskeletal_ae.nodes.{name}')
     kind = getattr(module, ''.join(word.title() for word in name.split('_')))
     extra = {

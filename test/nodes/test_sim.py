@@ -14,10 +14,12 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 
 @pytest.fixture
@@ -56,13 +58,13 @@ def held_command(mae, arm26):
     return first_command(arm26, mae, theta, np.full(arm26.muscle_count, 60.0))
 
 
-def test_before_a_command_it_rests_at_the_bias(arm, arm26, core):
+def test_the_simulator_rests_at_the_tension_bias_before_a_command(arm, arm26, core):
     message = arm.next('sim/muscle_states')
     assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
         ('quantity', 3, 18),
         ('muscle', 6, 6),
     ]
-    _, tension, temperature = read_array(message, 3, 6)
+    _, tension, temperature = read_muscle_states(message, 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     np.testing.assert_array_equal(temperature, 25.0)
     assert tuple(arm.next('sim/joint_states').name) == arm26.joints
@@ -76,7 +78,7 @@ def test_before_a_command_it_rests_at_the_bias(arm, arm26, core):
     assert arm.node.count_publishers('joint_states') == 0
 
 
-def test_it_follows_the_command_of_the_hardware(arm, arm26, mae, core):
+def test_the_simulator_follows_the_command_of_the_hardware(arm, arm26, mae, core):
     command = held_command(mae, arm26)
     core.command = command[None]
     arm.publisher(Float64MultiArray, 'muscle_length_command').publish(
@@ -124,7 +126,7 @@ def test_joints_are_forced_and_released(arm, core):
     wait_for_posture(arm, rest, 'the release')
 
 
-def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm26):
+def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm, arm26):
     commands = arm.publisher(Float64MultiArray, 'muscle_length_command')
     before = posture(arm)
     for data in ([float('nan')] * 6, [-0.05] * 5, [], [0.0] * 1_300_000):
@@ -134,13 +136,13 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
-    _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
+    _, tension, _ = read_muscle_states(arm.next('sim/muscle_states'), 6)
     assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
 
 
-def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, mae, trained_file):
+def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.host(Sim, robot='arm26')
@@ -150,20 +152,24 @@ def test_it_waits_for_a_checkpoint_takes_new_ones_and_refuses_unfit_ones(graph, 
     graph.wait(lambda: 'rejected mae_checkpoint' in str(graph.report('sim').values), 'the refusal')
     for version in (41, 42):
         graph.send_network(checkpoint.to_bytes(replace(mae, version=version)))
-        said = f"'checkpoint version': '{version}'"
-        graph.wait(lambda said=said: said in str(graph.report('sim').values), said)
+        reported = f"'checkpoint version': '{version}'"
+        graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
     assert graph.set_parameter('sim', 'checkpoint', trained_file)[0]
 
 
-def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, arm26, trained_file):
+def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
+    graph, arm26, trained_file
+):
     graph.listen(JointState, 'joint_states')
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(String, 'robot_description', LATCHED)
-    graph.start('sim', robot='arm26', checkpoint=trained_file, as_robot=True)
-    graph.start('estimator', robot='arm26', checkpoint=trained_file)
-    graph.start('controller', robot='arm26', checkpoint=trained_file, first_duration=1.0)
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    graph.host(Sim, **common, as_robot=True)
+    graph.host(Estimator, **common)
+    # A loaded machine is not the cause of a stop.
+    graph.host(Controller, **common, first_duration=1.0, max_age=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
     assert graph.received['robot_description'][0].data == arm26.description.urdf
@@ -177,18 +183,18 @@ def test_as_the_robot_it_closes_the_loop_with_estimator_and_controller(graph, ar
     assert graph.node.count_publishers('sim/joint_states') == 0
 
 
-def test_as_the_robot_it_pulls_what_others_leave_out(graph, arm26, trained_file):
+def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, trained_file):
     graph.listen(Float64MultiArray, 'muscle_states')
     shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
     graph.wait(lambda: shell.left_out == (1,), 'the isolation')
     graph.next('muscle_states', 2)
-    _, tension, _ = read_array(graph.received['muscle_states'][-1], 3, 6)
+    _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     assert shell.longest_step == 1.0  # or at 2 Hz it would fall behind
 
 
-def test_as_the_robot_it_has_no_zeros_but_its_own(graph, trained_file):
+def test_the_simulator_as_robot_does_not_use_length_offsets_of_others(graph, trained_file):
     shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True)
     topics = {subscription.topic_name for subscription in shell.subscriptions}
     assert f'{graph.namespace}/muscle_length_command' in topics

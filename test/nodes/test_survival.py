@@ -73,7 +73,7 @@ def node(request, graph):
 
 def test_no_request_or_clock_ends_a_node(graph, node):
     names = [*PARAMETERS[node], 'use_sim_time', 'start_type_description_service', *NAMES]
-    lists = [[], names[:1] * 3, *([name] for name in names)]
+    lists = [[], names, names[:1] * 3, *([name] for name in NAMES)]
     for value in strange_values():
         # One at a time, all in one, and one that is sound before those that are not.
         parameters = [Parameter(name=name, value=value) for name in names]
@@ -128,7 +128,7 @@ def test_no_request_or_clock_ends_a_node(graph, node):
     assert all(value.isprintable() for value in values.values())
 
 
-def test_no_escape_from_a_message_reaches_the_terminal(graph, capsys):
+def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
     status = graph.host(BringupStatus, robot='arm26')
     shouting = [
         DiagnosticStatus(
@@ -150,7 +150,7 @@ def test_no_escape_from_a_message_reaches_the_terminal(graph, capsys):
     assert code == 1 and '\x1b' not in output
 
 
-def test_the_status_line_waits_for_a_slow_start_and_not_for_ever(graph):
+def test_the_status_line_waits_for_a_slow_start_for_a_limited_time(graph):
     status = graph.host(BringupStatus, robot='arm26', duration=1e6, patience=0.01)
     status.anomalies.append(0.0)
     status._print()  # it has come up, however late
@@ -161,7 +161,7 @@ def test_the_status_line_waits_for_a_slow_start_and_not_for_ever(graph):
         status._print()
 
 
-def test_what_ends_the_interpreter_says_where(graph):
+def test_a_crash_of_the_interpreter_prints_where_it_happened(graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     process = graph.start('hardware_emulator', robot='arm26')
     graph.wait(lambda: states(graph, 'hardware_emulator'), 'its diagnostics')

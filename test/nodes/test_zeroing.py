@@ -15,7 +15,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 
 @pytest.mark.parametrize('stands', [True, False], ids=['stated posture', 'gentle motion'])
-def test_winches_that_forgot_their_zeros_are_told_them(
+def test_length_offsets_are_found_and_reach_every_node(
     graph, trained_file, tmp_path, monkeypatch, stands
 ):
     monkeypatch.setattr(zeroing, 'ENOUGH_SEEN', 2.0)
@@ -44,13 +44,13 @@ def test_winches_that_forgot_their_zeros_are_told_them(
     assert not node.core.cause
 
 
-def test_zeros_of_an_estimator_that_starts_anew_are_not_known_until_it_finds_them(
+def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them(
     graph, trained_file
 ):
     controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
     estimator = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
 
-    def told(offset, deviation):
+    def reported(offset, deviation):
         rows = np.array([np.full(6, offset), np.full(6, deviation)])
         estimator.publish(array_message(rows, 'quantity', 'muscle'))
 
@@ -60,14 +60,22 @@ def test_zeros_of_an_estimator_that_starts_anew_are_not_known_until_it_finds_the
             'the zeros',
         )
 
-    told(0.05, 0.0)
+    reported(0.05, 0.0)
     graph.wait(lambda: controller.zeros.offset.all(), 'the zeros')
-    told(0.0, 0.0)  # as a new one says
+    reported(0.0, 0.0)  # as a new one says
     known(False)
-    told(0.0, 0.0)
+    reported(0.0, 0.0)
     graph.spin(0.3)
     known(False)
-    told(0.01, 1.0)
+    reported(0.01, 1.0)
     graph.wait(lambda: controller.zeros.offset.all(), 'a guess')
-    told(0.05, 0.001)
+    reported(0.05, 0.001)
     known(True)
+
+
+def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):
+    common = {'robot': 'arm26', 'checkpoint': trained_file}
+    controller = graph.host(Controller, **common)
+    estimator = graph.host(Estimator, **common, zero_at_start=True)
+    graph.wait(lambda: not controller.zeros.known, 'the controller to know of it')
+    assert not estimator.core.zeros.known

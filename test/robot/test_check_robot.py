@@ -354,24 +354,13 @@ def test_arms_of_human_size_are_judged_by_the_round_figures(name):
     np.testing.assert_array_equal(result.matters, 0.003)
 
 
-BROKEN = {
-    'unknown link': (lambda d: d['muscles'][0]['route'][0].update(link='knee'), ['knee', 'torso']),
-    'nan': (lambda d: d['muscles'][0]['route'][0]['xyz'].__setitem__(1, float('nan')), ['finite']),
-    'one-point route': (lambda d: d['muscles'][0]['route'].pop(), ['at least 2 points']),
-    'unknown key': (lambda d: d.update(speed=1.0), ["'speed'", 'legal keys']),
-}
-
-
-@pytest.mark.parametrize('case', BROKEN)
-def test_a_description_error_is_one_line_and_status_1(tmp_path, capsys, case):
-    edit, fragments = BROKEN[case]
-    status, printed, error = verdict(capsys, change(copy_robot('arm26', tmp_path), edit))
+def test_a_description_error_is_one_line_and_status_1(tmp_path, capsys):
+    directory = change(copy_robot('arm26', tmp_path), lambda d: d.update(speed=1.0))
+    status, printed, error = verdict(capsys, directory)
     assert status == 1
     assert printed == ''
-    assert error.startswith('error: ')
-    assert error.count('\n') == 1
-    for fragment in ['muscles.yaml', *fragments]:
-        assert fragment in error
+    assert error.startswith('error: ') and error.count('\n') == 1
+    assert 'muscles.yaml' in error and "'speed'" in error
 
 
 @pytest.mark.parametrize(

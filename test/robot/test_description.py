@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import math
 import re
 
 import numpy as np
 import pytest
-from robots import copy_robot, read_muscles, write_muscles, write_robot
+from robots import chain, copy_robot, read_muscles, write_muscles, write_robot
 
-from bench.attack_files import chain
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.robot.directories import shipped_robots
@@ -45,49 +45,31 @@ def drop(path):
 
 ROUTE = ('muscles', 0, 'route')
 POINT = (*ROUTE, 1)
-NAMED = "muscle 'deltoid_anterior'"
+AT_POINT = '$.muscles[0].route[1]'
 
+#: an edit of muscles.yaml, and what the error names: the place, the value, what is legal
 BAD = {
-    'unknown top key': (put(['speed'], 1.0), ["unknown key 'speed'", 'joints, muscles']),
-    'unknown muscle key': (put(['muscles', 0, 'colour'], 1), ["key 'colour'", 'name, route']),
-    'unknown point key': (put([*POINT, 'frame'], 1), [NAMED, 'route[1]', "'frame'", 'link, xyz']),
-    'unknown link': (put([*POINT, 'link'], 'hnad'), [NAMED, "'hnad'", 'torso, upper_arm']),
-    'unknown joint': (put(['joints', 1], 'knee'), ["'knee'", 'shoulder, elbow']),
-    'fixed joint': (put(['joints', 1], 'wrist'), ["'wrist'", 'shoulder, elbow']),
-    'joint twice': (put(['joints', 1], 'shoulder'), ["'shoulder'", 'twice']),
+    'unknown key': (put(['speed'], 1.0), ["$: unknown key 'speed'", 'joints, muscles']),
+    'unknown key within': (put([*POINT, 'frame'], 1), [AT_POINT, "'frame'", 'link, xyz']),
+    'key missing': (drop(['muscles', 0, 'name']), ['$.muscles[0]', "'name' is missing"]),
+    'wrong type': (put(['muscles', 0, 'name'], 7), ['$.muscles[0].name', 'got int: 7']),
+    'empty value': (put(['stiffness'], None), ['$.stiffness', 'expected float']),
+    'not a number': (put([*POINT, 'xyz', 2], math.nan), [f'{AT_POINT}.xyz[2]', 'got nan']),
+    'too large': (put([*POINT, 'xyz', 0], 10**400), [f'{AT_POINT}.xyz[0]', 'out of range']),
+    'number as text': (put([*POINT, 'xyz', 0], '1e5'), ["got str: '1e5'", '1.0e+5']),
+    'too few numbers': (put([*POINT, 'xyz'], [0.0, 1.0]), [f'{AT_POINT}.xyz', 'length 3, got 2']),
+    'not positive': (put(['series_elastic', 'force'], 0.0), ['$.series_elastic.force', '> 0']),
+    'no muscles': (put(['muscles'], []), ['$.muscles', 'length >= 1']),
+    'name with a comma': (put(['muscles', 0, 'name'], 'a, b'), ["'a, b'", 'without a comma']),
+    'name with a space': (put(['muscles', 0, 'name'], 'a '), ["'a '", 'without spaces around']),
+    'an escape in a name': (put(['muscles', 0, 'name'], 'a\x9b1m'), ['can be printed']),
     'muscle twice': (put(['muscles', 1, 'name'], 'deltoid_anterior'), ['twice', 'unique']),
-    'no joints': (put(['joints'], []), ['joints', 'at least 1']),
-    'joints missing': (drop(['joints']), ["'joints' is missing"]),
-    'muscles missing': (drop(['muscles']), ["'muscles' is missing"]),
-    'no muscles': (put(['muscles'], []), ['muscles', 'at least 1']),
-    'name missing': (drop(['muscles', 0, 'name']), ['muscles[0]', "'name' is missing"]),
-    'name a number': (put(['muscles', 0, 'name'], 7), ['muscles[0].name', '7']),
-    'route missing': (drop(ROUTE), [NAMED, "'route' is missing"]),
-    'one-point route': (drop(POINT), [NAMED, 'at least 2 points', '1 given']),
-    'route a text': (put(ROUTE, 'torso'), [NAMED, "'torso'"]),
-    'nan': (put([*POINT, 'xyz', 2], float('nan')), [NAMED, 'route[1].xyz[2]', 'finite', 'nan']),
-    'infinity': (put([*POINT, 'xyz', 0], float('inf')), ['route[1].xyz[0]', 'finite']),
-    'number as text': (put([*POINT, 'xyz', 0], '1e5'), ['finite', '1.0e+5']),
-    'truth as number': (put([*POINT, 'xyz', 0], True), ['finite', 'True']),
-    'endless integer': (put([*POINT, 'xyz', 0], 10**400), ['finite']),
-    'two coordinates': (put([*POINT, 'xyz'], [0.0, 1.0]), ['at least 3 numbers', '2 given']),
-    'four coordinates': (put([*POINT, 'xyz'], [0.0] * 4), ['expected 3 numbers, got 4']),
-    'elastic key': (put(['series_elastic', 'k'], 1.0), ["'k'", 'force, rate, wire_stretch']),
-    'elastic zero': (put(['series_elastic', 'force'], 0.0), ['series_elastic.force', '> 0']),
-    'negative stretch': (put(['series_elastic', 'wire_stretch'], -1e-5), ['wire_stretch', '>= 0']),
-    'name with a comma': (
-        put(['muscles', 0, 'name'], 'a, b'),
-        ['muscles[0].name', "'a, b'", 'without a comma'],
-    ),
-    'name with a space': (
-        put(['muscles', 0, 'name'], 'a '),
-        ['muscles[0].name', "'a '", 'without spaces around it'],
-    ),
-    'stiffness zero': (put(['stiffness'], 0.0), ['stiffness', '> 0']),
-    'stiffness empty': (put(['stiffness'], None), ['stiffness', 'None']),
-    'tension key': (put(['tension', 'min'], 1.0), ["'min'", 'bias, limit, max']),
+    'one-point route': (drop(POINT), ['$.muscles[0].route', 'length >= 2']),
+    'the same point twice': (put(ROUTE, [{'link': 'hand', 'xyz': [0, 0, 0]}] * 2), ['2 different']),
+    'unknown link': (put([*POINT, 'link'], 'hnad'), [AT_POINT, "'hnad'", 'torso, upper_arm']),
+    'unknown joint': (put(['joints', 1], 'knee'), ['$.joints[1]', "'knee'", 'shoulder, elbow']),
+    'fixed joint': (put(['joints', 1], 'wrist'), ["'wrist'", 'shoulder, elbow']),
     'tension order': (put(['tension', 'limit'], 20.0), ['bias < limit <= max', '20']),
-    'tension above max': (put(['tension', 'limit'], 600.0), ['bias < limit <= max', '600']),
     'end effector at rest': (
         put(['end_effector'], 'torso'),
         ["'torso'", 'that the joints move, upper_arm, forearm, hand'],
@@ -97,7 +79,7 @@ BAD = {
 
 
 @pytest.mark.parametrize('case', BAD)
-def test_a_bad_entry_is_refused_naming_file_entry_and_what_is_legal(tmp_path, case):
+def test_a_bad_entry_is_refused_naming_file_place_and_what_is_legal(tmp_path, case):
     edit, fragments = BAD[case]
     directory = copy_robot('arm26', tmp_path)
     document = read_muscles(directory)
@@ -107,32 +89,26 @@ def test_a_bad_entry_is_refused_naming_file_entry_and_what_is_legal(tmp_path, ca
 
 
 @pytest.mark.parametrize(
-    ('text', 'fragments'),
+    ('text', 'problem'),
     [
-        ('', ['top level', 'expected a mapping']),
-        ('- 1', ['expected a mapping']),
-        ('joints: [shoulder', ['not valid YAML']),
-        ('joints: [a]\njoints: [b]', ["'joints' is written twice"]),
-        ('joints: 2020-13-45', ['not valid YAML']),
-        ('!!python/object/apply:os.system [echo]', ['not valid YAML']),
-        ('[' * 3000, ['not valid YAML']),
+        ('', 'expected object, got null'),
+        ('- 1', 'expected object, got array'),
+        ('joints: [shoulder', 'not valid YAML'),
+        ('!!python/object/apply:os.system [echo]', 'not valid YAML'),
+        ('joints: 2020-13-45', 'not valid YAML'),
     ],
 )
-def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, fragments):
+def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, problem):
     directory = copy_robot('arm26', tmp_path)
     (directory / 'muscles.yaml').write_text(text)
-    refused(directory, 'muscles.yaml', *fragments)
+    refused(directory, 'muscles.yaml', problem)
 
 
 BAD_URDF = {
     'not XML': ('<robot', '<<robot', ['not valid XML']),
     'mass nan': ('<mass value="0.8"/>', '<mass value="nan"/>', ["'forearm'", 'mass value', 'nan']),
-    'mass a word': ('<mass value="0.8"/>', '<mass value="heavy"/>', ["'forearm'", 'heavy']),
     'mass negative': ('<mass value="0.8"/>', '<mass value="-1"/>', ["'forearm'", '>= 0']),
-    'inertia inf': ('ixx="0.0050"', 'ixx="inf"', ["link 'forearm'", 'inertia ixx', 'inf']),
-    'origin nan': ('xyz="0 0 -0.28"', 'xyz="0 0 nan"', ["joint 'elbow'", 'origin xyz']),
     'two numbers': ('xyz="0 0 -0.28"', 'xyz="0 -0.28"', ["joint 'elbow'", '3 finite numbers']),
-    'limit nan': ('lower="-1.9199"', 'lower="nan"', ["joint 'elbow'", 'limit lower']),
     'limits crossed': ('lower="-1.9199"', 'lower="1.0"', ["'elbow'", 'lower < upper']),
     'continuous': (
         'type="revolute"',
@@ -145,7 +121,6 @@ BAD_URDF = {
         ["joint 'elbow': parent", "'x'"],
     ),
     'mass missing': ('<mass value="0.8"/>', '', ["'forearm'", 'mass: expected value']),
-    'moment missing': ('ixx="0.0050"', '', ["'forearm'", 'inertia: expected ixx']),
     'no number to all': ('<mass value="0.8"/>', '<mass value="0_8"/>', ["'forearm'", '0_8']),
     'effort missing': ('effort="', 'force="', ["joint 'shoulder'", 'limit: expected effort']),
     'joint type': ('type="revolute"', 'type="hinge"', ["joint 'shoulder'", 'prismatic', 'hinge']),
@@ -248,6 +223,24 @@ def test_shipped_arms_have_the_sizes_and_names_the_paper_gives_them():
     assert (arm.joint_count, arm.muscle_count) == (2, 6)
     arms = np.abs(arm.routes.muscle_jacobian(arm.random_postures(50, np.random.default_rng(0))))
     assert (np.median(arms, axis=0) > 0.003).all(axis=1).sum() == 2  # biarticular
+
+
+@pytest.mark.parametrize(
+    ('old', 'new'),
+    [
+        ('<robot ', '<robot xmlns:x="http://ros.org/wiki/xacro" '),
+        ('</robot>', '<include filename="tool.urdf"/></robot>'),
+        ('<mass value="0.8"/>', '<mass value="${weight}"/>'),
+        ('parent link="upper_arm"', 'parent link="$(arg side)_arm"'),
+    ],
+)
+def test_a_urdf_that_is_still_to_be_expanded_is_refused(tmp_path, old, new):
+    file = copy_robot('arm26', tmp_path) / 'robot.urdf'
+    text = file.read_text().replace(old, new)
+    if 'xmlns' in new:
+        text = text.replace('</robot>', '<x:macro name="tool" params="parent"/></robot>')
+    file.write_text(text)
+    refused(tmp_path, str(file), 'expand it first, by xacro FILE')
 
 
 # -- URDFs that nobody writes by mistake ----------------------------------------------------------

@@ -16,7 +16,7 @@ def jumping(lengths, robot):
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
-def test_a_jump_is_found_where_it_is():
+def test_a_jump_of_length_is_located():
     def lengths(theta):
         return np.stack([theta[:, 0] ** 2, np.where(theta[:, 1] > 0.4, 0.01, 0.0)], axis=1)
 
@@ -26,7 +26,7 @@ def test_a_jump_is_found_where_it_is():
     assert where[1, 1] == pytest.approx(0.4, abs=0.02)
 
 
-def test_a_jump_of_the_model_is_a_warning_that_names_the_muscle(tmp_path):
+def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
     (warning,) = check_robot(behind_a_drum(tmp_path, DRUM_ENDS['jumps'])).warnings
     assert warning.kind == 'jumping_muscle'
     assert "'straightener' jumps by 17" in warning.message
@@ -41,7 +41,7 @@ def test_a_jump_of_the_model_is_a_warning_that_names_the_muscle(tmp_path):
     ],
     ids=['kin', 'foreign'],
 )
-def test_wires_of_individuals_jump_only_where_the_models_do(
+def test_lengths_of_emulated_individuals_jump_only_where_the_models_do(
     tmp_path, monkeypatch, module, body, seed
 ):
     robot, odd = (behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items())

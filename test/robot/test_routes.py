@@ -34,14 +34,14 @@ def test_relative_length_is_zero_at_theta_zero(robot):
     np.testing.assert_array_equal(no_tension, np.zeros(robot.muscle_count))
 
 
-def test_a_tensed_muscle_is_shorter_at_the_motor(robot):
+def test_a_muscle_under_tension_is_shorter_at_the_motor(robot):
     theta = robot.random_postures(5, np.random.default_rng(2))
     tension = np.full((5, robot.muscle_count), 100.0)
     loose = robot.muscle_lengths(theta, 0.0 * tension)
     assert (robot.muscle_lengths(theta, tension) < loose).all()
 
 
-def test_a_batch_gives_what_single_postures_give_whatever_its_size(robot, monkeypatch):
+def test_a_batch_of_any_size_agrees_with_single_postures(robot, monkeypatch):
     theta = robot.random_postures(7, np.random.default_rng(3))
     single = [robot.routes.muscle_jacobian(row) for row in theta]
     lengths = [robot.routes.absolute_lengths(row) for row in theta]

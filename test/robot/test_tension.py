@@ -11,7 +11,7 @@ LOW, HIGH = 30.0, 200.0
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 60.0]))
-def test_it_produces_the_torque_within_limits_and_no_feasible_direction_is_nearer(seed, desired):
+def test_the_programme_finds_the_nearest_feasible_tension(seed, desired):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     inside = rng.uniform(LOW, HIGH, 8)  # so that a solution exists
@@ -45,7 +45,7 @@ def test_limits_may_differ_between_muscles():
     np.testing.assert_allclose(programme.nearest(60.0), [70.0, 50.0, 0.0], atol=1e-6)
 
 
-def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
+def test_torque_beyond_the_muscles_gives_the_nearest_tension_and_the_missing_torque():
     jacobian = np.array([[0.05, 0.0], [-0.05, 0.01], [0.0, -0.04]])
     torque = np.array([40.0, 0.5])
     nearest = least_tension(jacobian, torque, LOW, HIGH)
@@ -58,7 +58,7 @@ def test_torque_beyond_the_muscles_gives_the_nearest_and_says_what_is_missing():
 
 
 @given(st.integers(0, 10_000), st.floats(0.0, 3.0))
-def test_muscles_that_are_held_at_one_tension_leave_a_problem_that_is_solved(seed, share):
+def test_the_programme_is_solved_with_muscles_of_equal_bounds(seed, share):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     torque = -share * jacobian.T @ rng.uniform(LOW, HIGH, 8)
@@ -71,7 +71,7 @@ def test_muscles_that_are_held_at_one_tension_leave_a_problem_that_is_solved(see
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
-def test_what_is_not_finite_is_refused_instead_of_solved(bad):
+def test_numbers_that_are_not_finite_are_refused(bad):
     jacobian = np.array([[0.05], [-0.05]])
     with pytest.raises(InfeasibleError, match='finite'):
         least_tension(jacobian, np.array([bad]), LOW, HIGH)

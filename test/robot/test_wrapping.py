@@ -54,7 +54,7 @@ def robot(request, tmp_path_factory):
         ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
     ],
 )
-def test_a_wire_is_straight_or_two_tangents_and_an_arc(start, end, expected):
+def test_a_tendon_is_straight_or_two_tangents_and_an_arc(start, end, expected):
     assert wire(start, end, 0.5)[0] == pytest.approx(expected)
 
 
@@ -72,7 +72,7 @@ def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
         assert np.linalg.norm(arrive) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_over_a_drum_the_wire_is_the_geodesic():
+def test_a_tendon_over_a_drum_is_the_geodesic():
     # Half a turn from tangent to tangent, and up by 0.2 as it goes.
     flat = 2 * 0.3 + np.pi * 0.1
     length, leave, _ = wire([0.1, -0.3, 0], [-0.1, -0.3, 0.2], 0.1, (0, 0, 1), [0, 5, 0])
@@ -80,7 +80,7 @@ def test_over_a_drum_the_wire_is_the_geodesic():
     np.testing.assert_allclose(leave, np.array([0, flat, 0.2]) / length, atol=1e-9)
 
 
-def test_the_side_decides_which_way_round():
+def test_the_side_point_decides_the_direction_around_a_drum():
     near, _, _ = wire([0.2, 0.05, 0], [-0.2, 0.05, 0], 0.1, (0, 0, 1), [0, 1, 0])
     far, _, _ = wire([0.2, 0.05, 0], [-0.2, 0.05, 0], 0.1, (0, 0, 1), [0, -1, 0])
     free, _, _ = wire([0.2, 0.05, 0], [-0.2, 0.05, 0], 0.1, (0, 0, 1))
@@ -88,14 +88,14 @@ def test_the_side_decides_which_way_round():
     assert far > near + 0.05
 
 
-def test_a_ring_draws_the_wire_inwards_at_equal_angles():
+def test_a_ring_pulls_the_tendon_inwards_at_equal_angles():
     length, leave, arrive = wire([0.3, 0.2, 0], [-0.3, 0.2, 0], 0.05, (0, 0, 1), [0, 0, 0])
     assert length == pytest.approx(2 * np.hypot(0.3, 0.15))
     np.testing.assert_allclose(leave * [-1, 1, 1], arrive, atol=1e-6)
 
 
 @pytest.mark.parametrize(('axis', 'side'), [((0, 0, 0), NONE), ((0, 0.6, 0.8), [0.1, 0.2, 0])])
-def test_a_wire_turned_about_or_run_backwards_is_as_long(axis, side):
+def test_a_mirrored_or_reversed_tendon_has_the_same_length(axis, side):
     ends = np.array([[0.2, -0.05, 0.05], [-0.15, -0.02, 0.06]])
     length, leave, arrive = wire(*ends, 0.09, axis, side)
     back = wire(*ends[::-1], 0.09, axis, side)
@@ -107,7 +107,7 @@ def test_a_wire_turned_about_or_run_backwards_is_as_long(axis, side):
     np.testing.assert_allclose(mirrored[1], -leave, atol=1e-9)
 
 
-def test_length_and_pull_are_continuous_where_the_wire_lifts_off():
+def test_length_and_direction_are_continuous_where_the_tendon_lifts_off():
     """The pull turns by angles of the square root of the height that is left: bounded by that."""
     for axis in ((0, 0, 0), (0, 0, 1)):
         for gap in (1e-6, -1e-6):

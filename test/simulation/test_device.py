@@ -60,7 +60,7 @@ def pushed(robot, mae, device):
     return arms
 
 
-def test_torch_computes_what_numpy_does(robot, mae):
+def test_torch_agrees_with_numpy(robot, mae):
     one, other = (pushed(robot, mae, device) for device in (None, 'cpu'))
     for _ in range(3):
         for ours, theirs in zip(one.step(0.02), other.step(0.02), strict=True):
@@ -73,7 +73,7 @@ def test_torch_computes_what_numpy_does(robot, mae):
     assert (other.state.tension[:, 1] == 0.0).all()
 
 
-def test_a_step_written_all_in_torch_is_the_same(robot, mae):
+def test_a_step_agrees_with_an_implementation_in_torch(robot, mae):
     arms = pushed(robot, mae, None)
     other = EagerSimulation(arms)
     for _ in range(5):  # later, one may come to a stop a step before the other
@@ -83,7 +83,7 @@ def test_a_step_written_all_in_torch_is_the_same(robot, mae):
     np.testing.assert_allclose(theirs.holding, ours.holding, atol=0.02)
 
 
-def test_the_network_is_on_the_device(robot, mae):
+def test_the_network_is_computed_on_the_device(robot, mae):
     # Tensors of `meta` mix with no others, as those of a GPU do not; numbers they have none.
     theta = robot.random_postures(ARMS, np.random.default_rng(0))
     network, tension = TorchLengths(mae, 'meta'), np.ones((ARMS, robot.muscle_count))
@@ -93,11 +93,11 @@ def test_the_network_is_on_the_device(robot, mae):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='it simulates there')
-def test_without_a_gpu_it_says_so(robot, mae):
+def test_device_cuda_is_refused_without_a_gpu(robot, mae):
     with pytest.raises(MusculoskeletalError, match=r"device 'cuda'.*nothing there.*legal: cpu"):
         Simulation(robot, mae, device='cuda')
 
 
-def test_the_paper_s_descent_is_on_no_device(robot, mae):
+def test_preset_paper_is_refused_on_a_device(robot, mae):
     with pytest.raises(MusculoskeletalError, match=r"'paper'.*'cuda'.*Legal there: default"):
         Simulation(robot, mae, 'paper', device='cuda')

@@ -62,7 +62,7 @@ def test_each_limb_of_a_body_has_slopes_of_its_own():
         np.testing.assert_allclose(curvature[:, j], turned, rtol=1e-4, atol=1e-5)
 
 
-def test_modules_wind_at_a_limited_speed_and_never_far_beyond_what_counts():
+def test_modules_wind_at_a_limited_speed_and_by_a_bounded_length():
     for command, once, at_last in ((0.5, 0.01, 0.01), (-0.5, -0.01, -0.05), (1e-4, 1e-4, 1e-4)):
         followed = follow(command, 0.0, 0.0, 0.05, 0.01)
         assert followed == once

@@ -37,7 +37,7 @@ def kinematics(request):
     return sliding_tree() if request.param == 'sliding' else Robot.load(request.param).kinematics
 
 
-def test_load_is_pinocchio_s_gravity_less_the_push(kinematics):
+def test_the_load_is_the_gravity_of_pinocchio_less_the_wrench(kinematics):
     rng = np.random.default_rng(0)
     theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
     wrench = rng.normal(0.0, 20.0, (20, 6))

@@ -6,7 +6,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 
-def test_it_goes_towards_forced_postures(trained):
+def test_preset_paper_moves_towards_forced_joint_angles(trained):
     robot = Robot.load('arm26')
     arms = Simulation(robot, trained['paper'], 'paper')
     arms.fixed[0] = [np.nan, -1.2]
@@ -16,7 +16,7 @@ def test_it_goes_towards_forced_postures(trained):
     assert np.all((state.theta >= robot.lower) & (state.theta <= robot.upper))
 
 
-def test_l_sim_is_the_length_sent_whatever_muscle_stiffness_control_makes_of_it(trained):
+def test_preset_paper_moves_towards_the_commanded_lengths_without_stiffness_control(trained):
     """Where nothing is forced, w₅ outweighs the others: l goes to what was sent, not beyond it."""
     robot = Robot.load('arm26')
     arms = Simulation(robot, trained['paper'], 'paper')

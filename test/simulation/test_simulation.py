@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from bench import sim_pictures
-from bench.simulation_nominal import (
+from nominal_rest import (
     NOTICEABLE,
     nominal_rest,
     random_commands,
     responses,
     rest_errors,
 )
+
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.robot.robot import Robot
@@ -81,7 +80,7 @@ def rest_of_body(robot, state, command, i, wrench=None, fixed=None):
     return rest
 
 
-def test_it_rests_where_the_equations_of_the_body_do(robot, body, commands):
+def test_the_arm_rests_at_the_equilibrium_of_the_geometric_model(robot, body, commands):
     arms = settled(robot, body, commands)
     for i, command in enumerate(commands):
         if arms.limits(i):
@@ -102,7 +101,7 @@ def test_at_rest_tension_is_what_stiffness_control_makes_of_the_command(robot, b
     )
 
 
-def test_a_held_command_keeps_it_still_for_a_thousand_steps(robot, body, commands):
+def test_a_held_command_keeps_the_arm_still_for_a_thousand_steps(robot, body, commands):
     arms = settled(robot, body, commands)
     rest = arms.state
     for _ in range(1000):
@@ -111,7 +110,7 @@ def test_a_held_command_keeps_it_still_for_a_thousand_steps(robot, body, command
     assert np.abs(state.tension - rest.tension).max() < 0.05
 
 
-def test_a_push_bends_it_as_it_bends_the_body(robot, body, commands):
+def test_a_push_moves_the_arm_as_it_moves_the_geometric_model(robot, body, commands):
     arms = settled(robot, body, commands)
     wrench = np.array([5.0, 10.0, -15.0, 0.5, 0.0, -0.5])
     arms.wrench = np.tile(wrench, (len(commands), 1))
@@ -126,7 +125,7 @@ def test_a_push_bends_it_as_it_bends_the_body(robot, body, commands):
     )
 
 
-def test_forced_joints_go_there_and_the_others_follow(robot, body, commands):
+def test_forced_joints_take_their_angles_and_the_others_follow(robot, body, commands):
     arms = settled(robot, body, commands)
     forced = np.full(robot.joint_count, np.nan)
     forced[[1, 3]] = -0.3, -1.0
@@ -139,7 +138,7 @@ def test_forced_joints_go_there_and_the_others_follow(robot, body, commands):
             np.testing.assert_allclose(state.theta[i], rest.theta, atol=1e-4)
 
 
-def test_it_gives_way_to_the_paper_s_pushes_and_forced_joint_as_the_body_does(robot, body):
+def test_the_pushes_and_forced_joint_of_the_paper_move_the_arm_as_the_geometric_model(robot, body):
     for answer in responses(robot, body, 'default'):
         moved = np.abs(answer.body) > NOTICEABLE
         assert moved.any()
@@ -152,7 +151,7 @@ def test_without_a_command_every_muscle_is_at_the_bias(robot, body):
     np.testing.assert_array_equal(state.tension, robot.tension.bias[None])
 
 
-def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
+def test_a_command_out_of_reach_ends_at_the_limits_and_is_reported(robot, body):
     arms = Simulation(robot, body)
     assert not any(name in robot.muscles for name in arms.limits())
     shortest = robot.muscle_lengths(robot.random_postures(500, np.random.default_rng(0)),
@@ -174,14 +173,14 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_says_so(robot, body):
     assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0
 
 
-def test_a_joint_forced_beyond_its_limits_stops_there_and_says_so(robot, body):
+def test_a_joint_forced_beyond_its_limits_stops_there_and_is_reported(robot, body):
     arms = Simulation(robot, body)
     arms.fixed[0, 0] = 9.0
     assert arms.settle().theta[0, 0] == robot.upper[0]
     assert robot.joints[0] in arms.limits()
 
 
-def test_motion_is_smooth_however_far_the_command_jumps(robot, body, commands):
+def test_speeds_stay_limited_when_the_command_jumps(robot, body, commands):
     arms = settled(robot, body, commands)
     arms.command = commands[::-1]
     before = arms.state
@@ -192,7 +191,7 @@ def test_motion_is_smooth_however_far_the_command_jumps(robot, body, commands):
         before = state
 
 
-def test_a_long_step_is_as_good_as_many_short_ones(robot, body, commands):
+def test_a_long_step_agrees_with_many_short_ones(robot, body, commands):
     one, many = settled(robot, body, commands), settled(robot, body, commands)
     one.command = many.command = commands[::-1]
     one.step(0.05)
@@ -217,14 +216,14 @@ def test_one_arm_and_a_batch_agree(robot, body, commands, monkeypatch):
             np.testing.assert_allclose(ours[0], theirs[i], rtol=1e-6, atol=1e-6)
 
 
-def test_pieces_keep_their_order_and_a_fault_in_one_is_told():
+def test_results_of_parallel_pieces_keep_their_order_and_errors_are_raised():
     assert on_all_cores(lambda i: i * i, range(50)) == [i * i for i in range(50)]
     with pytest.raises(ZeroDivisionError):
         on_all_cores(lambda i: 1 // i, [1, 0])
 
 
 @pytest.mark.parametrize('friction', [0.1, 0.4])
-def test_friction_keeps_an_arm_where_it_was_wound_to(robot, commands, friction):
+def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
     arms = settled(robot, GeometricBody(robot, friction), commands)
     before = arms.state
     end = np.exp(-friction * before.slid) * before.tension
@@ -243,7 +242,7 @@ def test_friction_keeps_an_arm_where_it_was_wound_to(robot, commands, friction):
 # -- on networks ----------------------------------------------------------------------------------
 
 
-def test_on_a_network_it_rests_where_the_nominal_body_rests_and_stays_there(arm26, mae):
+def test_with_a_network_the_arm_rests_at_the_equilibrium_of_the_nominal_body(arm26, mae):
     commands = random_commands(arm26, 10, seed=2)
     theta, _, drift, tension_drift = rest_errors(arm26, mae, 'default', commands)
     # Over five seeds of the training at most 0.004 rad, 1e-6 rad and 1e-4 N.
@@ -252,7 +251,7 @@ def test_on_a_network_it_rests_where_the_nominal_body_rests_and_stays_there(arm2
     assert tension_drift.max() < 0.05
 
 
-def test_on_a_network_one_arm_and_a_batch_agree(arm26, mae):
+def test_with_a_network_one_arm_and_a_batch_agree(arm26, mae):
     commands = random_commands(arm26, 300, seed=3)
     batch = Simulation(arm26, mae, arms=300)
     batch.command = commands
@@ -268,7 +267,7 @@ def test_on_a_network_one_arm_and_a_batch_agree(arm26, mae):
             np.testing.assert_allclose(ours[0], theirs, rtol=1e-5, atol=atol)
 
 
-def test_more_or_fewer_arms_are_not_pushed_by_what_pushed_others(arm26, mae):
+def test_a_new_number_of_arms_clears_wrenches_and_forced_joints(arm26, mae):
     simulation = Simulation(arm26, mae, arms=2)
     simulation.wrench[:, 2], simulation.fixed[:, 0] = -10.0, -0.3
     for arms in (4, 1):
@@ -277,13 +276,13 @@ def test_more_or_fewer_arms_are_not_pushed_by_what_pushed_others(arm26, mae):
         np.testing.assert_allclose(simulation.step(0.02).theta, free.theta, atol=1e-9)
 
 
-def test_no_arms_at_all_are_refused(arm26, mae):
+def test_zero_arms_are_refused(arm26, mae):
     with pytest.raises(MusculoskeletalError, match='at least 1, got 0'):
         Simulation(arm26, mae, arms=0)
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])
-def test_a_nonsense_network_moves_it_within_its_limits_only(arm26, mae, preset):
+def test_a_nonsense_network_keeps_the_arm_within_its_limits(arm26, mae, preset):
     rng = np.random.default_rng(5)
     wild = tuple((1e3 * rng.normal(size=w.shape), 1e3 * b) for w, b in mae.decoder)
     arms = Simulation(arm26, replace(mae, decoder=wild), preset, arms=3)
@@ -307,9 +306,3 @@ def test_a_network_that_cannot_be_simulated_leaves_the_one_in_use(arm26, mae):
         simulation.use(beyond)
     assert simulation.mae is mae
     np.testing.assert_array_equal(simulation.step(0.01).theta, expected.step(0.01).theta)
-
-
-def test_pictures_of_an_arm_at_rest_and_loaded_are_written(arm26, mae, tmp_path):
-    files = sim_pictures.save_both(arm26, mae, tmp_path / 'new')
-    assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
-    assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)

@@ -43,7 +43,7 @@ def find_chromium() -> str | None:
 class Browser:
     """One tab."""
 
-    def __init__(self, profile: Path, url: str, size: tuple[int, int] = (1280, 800)) -> None:
+    def __init__(self, profile: Path, url: str, size: tuple[int, int] = (1024, 640)) -> None:
         """Open a page."""
         program = find_chromium()
         assert program is not None

@@ -32,7 +32,7 @@ def theta(robot):
     return robot.lower + 0.3 * (robot.upper - robot.lower)
 
 
-def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot, theta):
+def test_tubes_lie_on_the_routes_and_grow_thicker_with_tension(robot, theta):
     pull = np.linspace(0.0, 1.0, robot.muscle_count)
     tension = robot.tension.bias + pull * (robot.tension.limit - robot.tension.bias)
     tubes = muscle_tubes(robot, theta, tension, np.zeros(robot.muscle_count, dtype=int))
@@ -50,7 +50,7 @@ def test_tubes_lie_on_the_routes_and_are_thicker_the_harder_a_muscle_pulls(robot
     assert radius[1][0] > 2.0 * radius[0][0]
 
 
-def test_a_muscle_of_unknown_tension_is_drawn_as_one_that_does_not_pull(robot, theta):
+def test_a_muscle_of_unknown_tension_is_drawn_like_one_at_the_bias(robot, theta):
     tension = np.full((2, robot.muscle_count), robot.tension.bias)
     tension[0, 2], kinds = np.nan, np.zeros(robot.muscle_count, dtype=int)
     unknown, known = (muscle_tubes(robot, theta, each, kinds) for each in tension)
@@ -58,7 +58,7 @@ def test_a_muscle_of_unknown_tension_is_drawn_as_one_that_does_not_pull(robot, t
         np.testing.assert_array_equal(unknown[name], known[name])
 
 
-def test_a_wire_that_wraps_is_drawn_round_and_has_as_many_tubes_where_it_lifts_off(tmp_path):
+def test_a_wrapping_tendon_is_drawn_with_its_length_by_a_constant_number_of_tubes(tmp_path):
     directory = write_robot(tmp_path)
     document = read_muscles(directory)
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
@@ -76,7 +76,7 @@ def test_a_wire_that_wraps_is_drawn_round_and_has_as_many_tubes_where_it_lifts_o
         assert np.isfinite(tubes['batched_wxyzs']).all()
 
 
-def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):
+def test_ruptured_isolated_and_suspect_muscles_look_different(robot, theta):
     tension = np.full(robot.muscle_count, 100.0)
     kinds = np.arange(robot.muscle_count) % 4
     tubes = muscle_tubes(robot, theta, tension, kinds)
@@ -95,7 +95,7 @@ def test_cut_isolated_and_suspect_muscles_look_like_no_sound_one(robot, theta):
     assert np.diff(light).min() > 15.0
 
 
-def test_meshes_of_the_urdf_are_drawn_where_it_puts_them_else_capsules(tmp_path):
+def test_links_are_drawn_by_the_meshes_of_the_urdf_or_else_by_capsules(tmp_path):
     folder = tmp_path / 'arm'
     shutil.copytree(Robot.load('arm26').description.directory, folder)
     solids, notes = link_solids(Robot.load(folder))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
 
-import asyncio
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -23,8 +22,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
 import msgspec
-from viser._messages import GuiUpdateMessage
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
@@ -59,8 +57,7 @@ def view(graph):
         command = [*executable('view'), '--robot', 'arm26', '--port', str(port), *options]
         process = Process('view', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
         graph.processes.append(process)
-        lines = iter(process.process.stdout.readline, '')
-        assert any(line.startswith(f'http://localhost:{port}') for line in lines)
+        process.wait_for_output(f'http://localhost:{port}')
         return port
 
     return start
@@ -79,7 +76,7 @@ def read(other) -> None:
 
 
 @chromium
-def test_a_visitor_sees_the_arm_move_cuts_a_muscle_and_sees_the_alarm(
+def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
     graph, view, trained_file, tmp_path
 ):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
@@ -129,7 +126,7 @@ def test_a_visitor_sees_the_arm_move_cuts_a_muscle_and_sees_the_alarm(
 
 
 @chromium
-def test_muscles_are_shown_where_an_isolated_one_says_no_number(graph, view, arm26, tmp_path):
+def test_muscles_are_shown_although_an_isolated_one_sends_nan(graph, view, arm26, tmp_path):
     page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{view("--read-only")}')
     try:
         publish = no_number_of(graph, arm26, 'brachialis')
@@ -144,8 +141,8 @@ def test_muscles_are_shown_where_an_isolated_one_says_no_number(graph, view, arm
         page.close()
 
 
-@pytest.mark.parametrize('limits', [(0.001, 0.009), (0.0, 0.05), (-1.5, 2.0), (0.0, 2000.0)])
-def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
+@pytest.mark.parametrize('limits', [(0.001, 0.009), (-1.5, 2.0)])
+def test_sliders_reach_the_limits_of_a_prismatic_joint(tmp_path, limits):
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
     text, before = urdf.read_text(), 'lower="0.0" upper="0.05"'
     assert before in text
@@ -161,7 +158,7 @@ def test_sliders_reach_the_limits_of_whatever_slides(tmp_path, limits):
         page.close()
 
 
-def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
+def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph, view, arm26):
     port, asked = view(), []
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.wait(lambda: graph.report('view').message == 'nobody looks', 'its diagnostics')
@@ -187,34 +184,27 @@ def test_whatever_nodes_say_the_page_lives_on(graph, view, arm26):
     assert graph.processes[-1].alive()
 
 
-def test_whoever_is_turned_away_is_forgotten(arm26):
-    port = free_port()
-    page = Page(arm26, '127.0.0.1', port, False, lambda *_: None)
-    try:
-        for origin in ('http://evil.example', 'http://[bad') * 3:
-            with visit(port, origin) as other, pytest.raises(ConnectionClosed, match='1008'):
-                read(other)
-        sockets = page._server._websock_server
-        assert not sockets._live_connections and not sockets._client_state_from_id
-    finally:
-        page.close()
-
-
-def test_a_browser_changes_values_of_controls_and_nothing_else_of_them(arm26):
+def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
     port, asked = free_port(), []
     page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
+    slider = page._sliders[0]
+    control = {'type': 'GuiUpdateMessage', 'uuid': slider._impl.uuid}
     try:
-        handlers = page._server._websock_server._incoming_handlers[GuiUpdateMessage]
-        for control in page._sliders:
-            for update in {'update_cb': []}, {'value': control.max}:
-                for handler in handlers:
-                    asyncio.run(handler(0, GuiUpdateMessage(control._impl.uuid, update)))
-            assert control._impl.update_cb and control.value == control.max
+        with ThreadPoolExecutor(1) as aside, visit(port, f'http://localhost:{port}') as mine:
+            aside.submit(read, mine)
+            mine.send(msgspec.msgpack.encode({'type': 'ViewerCameraMessage', **CAMERA}))
+            graph.wait(page.looked_at.is_set, 'the visitor to be counted')
+            mine.send(b'no message')
+            for updates in {'update_cb': []}, 5, {'value': float(slider.max)}:
+                mine.send(msgspec.msgpack.encode({**control, 'updates': updates}))
+            # Without its listeners the slider would move, and nobody would hear of it.
+            graph.wait(lambda: asked, 'what the visitor asked for')
+        assert asked == [('targets', {arm26.joints[0]: pytest.approx(slider.max)})]
     finally:
         page.close()
 
 
-def test_whoever_leaves_while_pushing_pushes_no_longer(arm26):
+def test_a_push_ends_when_its_visitor_leaves(arm26):
     asked = []
     page = Page(arm26, '127.0.0.1', free_port(), False, lambda *what: asked.append(what))
     try:
@@ -231,7 +221,7 @@ def test_whoever_leaves_while_pushing_pushes_no_longer(arm26):
     assert what == 'push' and not force.any()
 
 
-def test_an_address_that_is_not_of_this_machine_is_refused(arm26):
+def test_an_address_of_another_machine_is_refused(arm26):
     with pytest.raises(MusculoskeletalError, match=r'no page at port \d+ of 192\.0\.2\.1: Cannot'):
         Page(arm26, '192.0.2.1', free_port(), False, lambda *_: None)
     with pytest.raises(MusculoskeletalError, match=r'of 127\.\.0\.1: .*choose another'):
@@ -240,13 +230,14 @@ def test_an_address_that_is_not_of_this_machine_is_refused(arm26):
 
 def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     port = view('--read-only')
-    for origin in ('http://evil.example', f'http://evil.example:{port}', 'null'):
-        with visit(port, origin) as other, pytest.raises(ConnectionClosed):
-            read(other)
+    foreign = 'http://evil.example', f'http://evil.example:{port}', 'null', 'http://[bad'
+    for origin in foreign:
+        with pytest.raises(InvalidStatus, match='403'):
+            visit(port, origin)
     with visit(port, f'http://localhost:{port}') as mine:
         assert mine.recv(timeout=300)
     second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
     status, output = second.ended()
     assert status == 1
-    told = f'error: no page at port {port} of 127.0.0.1: Address already in use'
-    assert told in output and 'Traceback' not in output
+    reported = f'error: no page at port {port} of 127.0.0.1: Address already in use'
+    assert reported in output and 'Traceback' not in output

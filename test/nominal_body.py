@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What control does on the nominal body: no mismatch, no friction, what is left is the network's.
+"""Control on the nominal body: no mismatch and no friction, so that what is left is the network's.
 
 1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
    QP on the true G, lengths by the true body.
 2. stiffness: the deflection of a push at a stiffness in the lower and the upper quarter of the
    reported reachable range, and the ratio of both beside the predicted one.
-3. torque: joint torque that the commanded tensions make, beside the commanded torque.
-
-    python -m bench control_nominal --checkpoint FILE --paper-checkpoint FILE [--robot …] [--quick]
 """
 
 import numpy as np
@@ -18,17 +15,12 @@ from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
 
-POSTURES, QUICK = 50, 3
 SETTLING, PERIOD = 3.0, 0.02  # [s]
 QUARTERS = (0.125, 0.875)  # middles of the lower and the upper quarter of the reachable range
 PUSH = 1.0  # [N·m] of torque at the joint
-TORQUE_SPREAD = 1.0  # [N·m] of effort beyond the arm's weight
 
 
 def nominal_arm(robot: Robot) -> EmulatedArm:
@@ -134,57 +126,3 @@ def _pushed(arm: EmulatedArm, theta: Array, length: Array, wrench: Array) -> Arr
     arm.set_wrench(np.zeros(6))
     turned: Array = 0.5 * (ends[0] - ends[1])
     return turned
-
-
-def torque_errors(robot: Robot, mae: Mae, count: int) -> Array:
-    """Return ‖−Gᵀ T − τ‖ / ‖τ‖ with the true G, for random postures and efforts, (N,)."""
-    errors = []
-    rng, limits = np.random.default_rng(9), robot.tension
-    postures = robot.random_postures(TRIES, rng)
-    for theta, least in holdable_postures(robot, postures, count):
-        effort = rng.normal(0.0, TORQUE_SPREAD, robot.joint_count)
-        torque = robot.kinematics.holding_torque(theta) + effort
-        jacobian = mae.muscle_jacobian(theta, least)
-        tension, missing = least_tension(jacobian, torque, limits.bias, limits.limit)
-        promised = torque - missing  # torque beyond the muscles is reported and not promised
-        exerted = -robot.routes.muscle_jacobian(theta).T @ tension
-        errors.append(np.linalg.norm(exerted - promised) / np.linalg.norm(promised))
-    return np.array(errors)
-
-
-def nominal_tables(robot: Robot, mae: Mae, paper: Mae, quick: bool = False) -> str:
-    """Return all three as text."""
-    count = QUICK if quick else POSTURES
-    lines = [f'{"posture, nominal body":30s}{"error [rad]":>12s}{"largest":>9s}{"‖T‖ [N]":>9s}']
-    for name, rows in posture_table(robot, mae, paper, count).items():
-        error, tension, bound = rows.T
-        lines.append(
-            f'{name:30s}{error.mean():12.4f}{error.max():9.4f}{tension.mean():9.1f}'
-            f'   {100.0 * (tension / bound).mean():.1f} % of the bound'
-        )
-    measured, predicted = stiffness_ratios(robot, mae, max(count // 5, 2)).T
-    off = measured / predicted - 1.0
-    lines.append(
-        f'stiffness: deflection ratio over predicted ratio − 1: mean {np.abs(off).mean():.3f}, '
-        f'largest {np.abs(off).max():.3f}, within 20 %: {100.0 * (np.abs(off) < 0.2).mean():.0f} %'
-    )
-    errors = torque_errors(robot, mae, count)
-    lines.append(
-        f'torque: relative error mean {errors.mean():.3f}, largest {errors.max():.3f}, '
-        f'within 10 %: {100.0 * (errors < 0.1).mean():.0f} %'
-    )
-    return '\n'.join(lines)
-
-
-def main(argv: list[str]) -> None:
-    """Print the tables."""
-    parser = Parser('control_nominal', 'What control does on the nominal body.')
-    parser.add_robot()
-    parser.add_argument('--checkpoint', required=True, help='network of preset default')
-    parser.add_argument('--paper-checkpoint', required=True, help='network of preset paper')
-    parser.add_quick('few postures')
-    args = parser.parse_args(argv)
-
-    robot = Robot.load(args.robot)
-    mae, paper = (checkpoint.load(f, robot) for f in (args.checkpoint, args.paper_checkpoint))
-    print(nominal_tables(robot, mae, paper, args.quick))

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does the simulator rest where the nominal body rests, and give way to pushes as it does?
 
-    python -m bench simulation_nominal --checkpoint FILE [--robot NAME|DIR] [--preset …] [--quick]
-
 (Paper, section "Simulation".) On a network trained on the geometric model, against that model as a
 body: the emulated arm without individual differences and friction, and the equations of its rest,
 
@@ -20,9 +18,7 @@ from musculoskeletal_ae.control.methods import msc_compensation
 from musculoskeletal_ae.emulator.arm import STOP_STIFFNESS, EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -195,47 +191,3 @@ def responses(robot: Robot, mae: Mae, preset: str) -> list[Response]:
             )
         )
     return result
-
-
-def print_responses(robot: Robot, mae: Mae, preset: str) -> None:
-    """Print the answers side by side."""
-    for answer in responses(robot, mae, preset):
-        print(f'{answer.name}: Δθ [rad] of body and simulator')
-        for name, body, simulated in zip(robot.joints, answer.body, answer.simulated):
-            note = ''
-            if abs(body) > NOTICEABLE:
-                share = simulated / body
-                note = f'  {share:.0%}' + ('' if 0.7 <= share <= 1.3 else '  beyond 30 %')
-            print(f'  {name:<16}{body:>8.3f}{simulated:>8.3f}{note}')
-        body_size = np.linalg.norm(answer.body_tension)
-        apart = np.linalg.norm(answer.simulated_tension - answer.body_tension)
-        print(f'  ‖ΔT‖ {body_size:.1f} N, {apart:.1f} N apart')
-
-
-def report(robot: Robot, mae: Mae, preset: str, quick: bool) -> None:
-    """Print the measurements."""
-    commands = random_commands(robot, 8 if quick else 50, seed=0)
-    theta, tension, drift, tension_drift = rest_errors(robot, mae, preset, commands)
-    worst = theta.max(axis=1)
-    print(f'{len(commands)} commands over the range, preset {preset}:')
-    print(
-        f'  rest, from the nominal body: largest joint error {worst.mean():.4f} rad mean, '
-        f'{worst.max():.4f} rad max, within 0.05 rad {np.mean(worst <= 0.05):.0%}; '
-        f'tension {tension.mean():.2f} N mean, {tension.max():.1f} N max'
-    )
-    print(f'  held for 1000 steps: {drift.max():.2e} rad, {tension_drift.max():.2e} N at most')
-    if {FLEXED, FORCED} <= set(robot.joints):
-        print_responses(robot, mae, preset)
-
-
-def main(argv: list[str]) -> None:
-    """Print the measurements for a checkpoint."""
-    parser = Parser('simulation_nominal', 'The simulator beside the nominal body.')
-    parser.add_robot()
-    parser.add_argument('--checkpoint', required=True, help='trained network')
-    parser.add_preset('of the simulator')
-    parser.add_quick('fewer commands')
-    args = parser.parse_args(argv)
-
-    robot = Robot.load(args.robot)
-    report(robot, checkpoint.load(args.checkpoint, robot), args.preset, args.quick)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small bags of every kind a reader meets, for tests and for `fuzz`."""
+"""Small bags of every kind that a reader meets."""
 
 import random
 from pathlib import Path
@@ -10,7 +10,6 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_typestore
 
 from musculoskeletal_ae.bags import message_types
 from musculoskeletal_ae.bags.metadata import offered_qos
@@ -78,7 +77,7 @@ def _basic(name: str, rng: random.Random) -> Any:
 
 def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
     """Return `count` messages in order, over all topics of the interface in turn."""
-    rng = random.Random(seed)  # noqa: S311 - test data
+    rng = random.Random(seed)
     content = []
     for i, name in zip(range(count), list(TOPICS) * (count // len(TOPICS) + 1), strict=False):
         data = encode(filled(TOPICS[name].type, rng), TOPICS[name].type)
@@ -88,7 +87,9 @@ def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
     return content
 
 
-def write_ours(path: Path, content: list[Sample], compression: str, finish: bool) -> None:
+def write_ours(
+    path: Path, content: list[Sample], compression: str = 'zstd', finish: bool = True
+) -> None:
     """Write with our recorder's writer, chunks of ten messages; unfinished: as after SIGKILL."""
     writer = BagWriter(path, compression)
     for i, sample in enumerate(content):
@@ -104,31 +105,37 @@ def write_ours(path: Path, content: list[Sample], compression: str, finish: bool
         writer.flush()
 
 
-def write_mcap(path: Path, content: list[Sample], **options: Any) -> None:
+def write_mcap(
+    path: Path, content: list[Sample], with_definitions: bool = True, **options: Any
+) -> None:
     """Write a bare file with the mcap library, as other recorders may."""
     with path.open('wb') as file:
-        writer = Writer(file, chunk_size=2000, enable_data_crcs=True, **options)
+        writer = Writer(file, **({'chunk_size': 2000, 'enable_data_crcs': True} | options))
         writer.start(profile='ros2')
         schemas: dict[str, int] = {}
         channels: dict[str, int] = {}
         for topic, kind, log_time, publish_time, data in content:
             if kind not in schemas:
-                text = message_types.definition(kind).encode()
-                schemas[kind] = writer.register_schema(kind, message_types.ENCODING, text)
+                text = message_types.definition(kind).encode() if with_definitions else b''
+                encoding = message_types.MSG if with_definitions else ''
+                schemas[kind] = writer.register_schema(kind, encoding, text)
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, 'cdr', schemas[kind])
             writer.add_message(channels[topic], log_time, data, publish_time)
         writer.finish()
 
 
-def write_rosbags(path: Path, content: list[Sample]) -> None:
+def write_rosbags(
+    path: Path, content: list[Sample], storage: StoragePlugin = StoragePlugin.MCAP
+) -> None:
     """Write a directory with the rosbags library, which computes no checksums."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with RosbagsWriter(path, version=9, storage_plugin=storage) as writer:
         connections: dict[str, Any] = {}
         for topic, kind, log_time, _, data in content:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                connections[topic] = writer.add_connection(
+                    topic, kind, typestore=message_types.TYPESTORE
+                )
             writer.write(connections[topic], log_time, data)
 
 

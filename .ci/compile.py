@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fill numba's cache: take one step with both emulated bodies and with the simulator.
+
+A node that compiles while it runs can neither keep its rate nor be stopped.
+"""
+
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.simulation import Simulation
+
+robot = Robot.load('arm26')
+for reality in ('kin', 'foreign'):
+    make_arm(robot, seed=0, reality=reality).step(0.001)
+Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)

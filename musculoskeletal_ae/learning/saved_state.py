@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The content of a state file: what the learner has learned, as MessagePack behind a checksum."""
+
+import zlib
+
+import msgspec
+import numpy as np
+
+from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.exceptions import CheckpointError, StateError
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+CHECKSUM = 4  # [bytes] at the start
+
+Values = tuple[float, ...]
+
+
+class SavedSample(msgspec.Struct, frozen=True, array_like=True):
+    """One `Sample`, its number among all ever accepted, and which muscles it describes."""
+
+    number: int
+    theta: Values
+    tension: Values
+    length: Values
+    direction: Values
+    spread: Values
+    gravity: Values
+    known: tuple[bool, ...]
+
+
+class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Samples, the oldest first, and the newest network, as a checkpoint."""
+
+    joints: tuple[str, ...]
+    muscles: tuple[str, ...]
+    samples: tuple[SavedSample, ...]
+    network: bytes | None
+
+
+def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
+    """Return what is to be saved."""
+    stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
+    saved = tuple(
+        SavedSample(number, *(tuple(part.tolist()) for part in (*sample, known)))
+        for number, sample, known in stored
+    )
+    return SavedState(robot.joints, robot.muscles, saved, network)
+
+
+def to_bytes(state: SavedState) -> bytes:
+    """Return the content of a state file."""
+    content = msgspec.msgpack.encode(state)
+    return _checksum(content) + content
+
+
+def from_bytes(data: bytes, robot: Robot) -> SavedState:
+    """Return the state of a file's content.
+
+    Raises:
+        StateError: If it is damaged, or does not fit the robot: the robot must have its joints, in
+            this order, and all of its muscles.
+    """
+    checksum, content = data[:CHECKSUM], data[CHECKSUM:]
+    if checksum != _checksum(content):
+        raise StateError('damaged, or no state of a learner')
+    try:
+        state = msgspec.msgpack.decode(content, type=SavedState)
+    except msgspec.MsgspecError as error:
+        raise StateError(f'no state of this version of the learner ({error})') from error
+    if state.joints != robot.joints or not set(state.muscles) <= set(robot.muscles):
+        raise StateError(
+            f'of a robot with joints {", ".join(state.joints)} and muscles '
+            f'{", ".join(state.muscles)}; this one has {", ".join(robot.joints)} and '
+            f'{", ".join(robot.muscles)}'
+        )
+    for sample in state.samples:
+        if not _fits(sample, robot, len(state.muscles)):
+            raise StateError(f'sample {sample.number} does not fit the robot')
+    return state
+
+
+def _checksum(content: bytes) -> bytes:
+    return zlib.crc32(content).to_bytes(CHECKSUM, 'big')
+
+
+def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
+    joint_count, gravity_size = robot.joint_count, 3 * len(robot.kinematics.parent)
+    of_muscles = sample.tension, sample.length, sample.direction, sample.known
+    return (
+        len(sample.theta) == joint_count
+        and all(len(part) == muscle_count for part in of_muscles)
+        and len(sample.spread) in (0, joint_count)
+        and len(sample.gravity) in (0, gravity_size)
+    )
+
+
+def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
+    """Add the saved samples to a store; they say nothing about muscles that the robot has more."""
+    places = list(robot.muscle_indices(state.muscles))
+    for saved in state.samples:
+        theta = np.array(saved.theta)
+        # What was not measured, of an added muscle, is as the geometric model has it.
+        tension = robot.tension.bias.copy()
+        length = robot.muscle_lengths(np.nan_to_num(theta), tension)
+        direction = np.zeros(robot.muscle_count)
+        known: Bools = np.zeros(robot.muscle_count, dtype=bool)
+        tension[places] = saved.tension
+        length[places] = saved.length
+        direction[places] = saved.direction
+        known[places] = saved.known
+        spread, gravity = np.array(saved.spread), np.array(saved.gravity)
+        sample = Sample(theta, tension, length, direction, spread, gravity)
+        samples.add(sample, known, saved.number)
+
+
+def restore_network(state: SavedState, robot: Robot) -> Mae | None:
+    """Return the saved network, if there is one.
+
+    Raises:
+        StateError: If it does not fit the robot.
+    """
+    if added := [name for name in robot.muscles if name not in state.muscles]:
+        raise StateError(f'of the robot without {", ".join(added)}; only its samples are used')
+    if state.network is None:
+        return None
+    try:
+        return checkpoint.from_bytes(state.network, robot, 'the saved network')
+    except CheckpointError as error:
+        raise StateError(f'{error}; only the samples are used') from error

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executor that runs the callbacks of nodes and tools.
+
+rclpy's `SingleThreadedExecutor` builds its wait set anew, in Python, for every message, and runs
+each callback as a task: at 200 Hz that is half of what a node costs. `LeanExecutor` keeps the wait
+set until entities are created or destroyed, and calls callbacks directly. It uses private names of
+rclpy. It is therefore used only with versions of rclpy that it was tested with, and only if all of
+those names exist. Otherwise rclpy's own executors take its place, with one line in the log.
+
+The environment variable MUSCULOSKELETAL_AE_EXECUTOR chooses by hand: lean, events or single.
+"""
+
+import os
+import re
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib import import_module, metadata
+from inspect import iscoroutinefunction
+from typing import Any, NamedTuple
+
+from rclpy.constants import S_TO_NS
+from rclpy.context import Context
+from rclpy.event_handler import EventHandler
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import get_logger
+from rclpy.timer import Timer
+from rclpy.waitable import NumberOfEntities
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
+CHOICES = ('lean', 'events', 'single')
+#: first and last version of rclpy that LeanExecutor was tested with
+TESTED = (7, 1, 1), (7, 1, 11)
+#: first version whose EventsExecutor runs asynchronous callbacks; up to 7.1.7 it runs nothing
+EVENTS_SINCE = (7, 1, 11)
+#: what LeanExecutor uses of SingleThreadedExecutor, beyond what rclpy documents
+PRIVATE_NAMES = (
+    '_guard', '_is_shutdown', '_tasks',
+    '_take_client', '_take_service', '_take_subscription', '_take_timer',
+)  # fmt: skip
+FULL_ROUND_PERIOD = 1.0  # [s]
+
+
+class _Group(NamedTuple):
+    """Entities of one kind, and how they enter a wait set and are taken from."""
+
+    kind: str
+    entities: list[Any]
+    add: Callable[[Any], None]
+    take: Callable[[Any], Any]
+
+
+class LeanExecutor(SingleThreadedExecutor):
+    """Runs the callbacks of timers, subscriptions, services and clients without overhead.
+
+    Everything else is left to rclpy, in a *full round*: asynchronous callbacks and other tasks, and
+    actions, as soon as there are any; events of quality of service once a second.
+    """
+
+    def __init__(self, *, context: Context | None = None) -> None:
+        super().__init__(context=context)
+        self._wait_set: Any = None  # of rcl; None: to be built
+        self._groups: tuple[_Group, ...] = ()
+        self._actions: list[Any] = []
+        self._handles = ExitStack()  # keeps what is waited for from being destroyed
+        self._next_full_round = 0.0  # [s] of the monotonic clock
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Run every callback that is ready; wait at most `timeout_sec`, or for a full round."""
+        if self._wait_set is None:
+            self._build_wait_set()
+        wait_set, groups = self._wait_set, self._groups
+        wait_set.clear_entities()
+        for group in groups:
+            for entity in group.entities:
+                group.add(entity.handle)
+        for action in self._actions:
+            action.add_to_wait_set(wait_set)
+        wait_set.add_guard_condition(self._guard.handle)
+        longest = FULL_ROUND_PERIOD if timeout_sec is None else min(timeout_sec, FULL_ROUND_PERIOD)
+        wait_set.wait(int(longest * S_TO_NS))
+        if not self.context.ok():
+            raise ExternalShutdownException
+        # The guard condition says that entities have changed, or that there is a task.
+        is_changed = bool(wait_set.get_ready_entities('guard_condition'))
+        has_action = any(action.is_ready(wait_set) for action in self._actions)
+        for group in groups:
+            ready = wait_set.get_ready_entities(group.kind)
+            for entity in group.entities if ready else ():
+                if entity.handle.pointer in ready:
+                    self._run(entity, group.take)
+        is_due = time.monotonic() >= self._next_full_round
+        if (is_changed or has_action or is_due or self._tasks) and not self._is_shutdown:
+            self._run_full_round()
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Release the entities, then this executor's own."""
+        self._release()
+        return super().shutdown(timeout_sec)
+
+    def _run(self, entity: Any, take: Callable[[Any], Any]) -> None:
+        # A timer may have been cancelled since.
+        if isinstance(entity, Timer) and not entity.handle.is_timer_ready():
+            return
+        execute = take(entity)
+        if execute is None:
+            return
+        if iscoroutinefunction(getattr(entity, 'callback', None)):
+            self.create_task(execute)
+            return
+        try:
+            execute().send(None)  # ends at once: nothing in it waits
+        except StopIteration:
+            pass
+
+    def _run_full_round(self) -> None:
+        self._release()
+        try:
+            while True:
+                handler, _, _ = self.wait_for_ready_callbacks(0.0)
+                handler()
+                if handler.done():
+                    handler.result()  # raises what the callback raised
+        except TimeoutException:
+            self._next_full_round = time.monotonic() + FULL_ROUND_PERIOD
+
+    def _build_wait_set(self) -> None:
+        nodes = self.get_nodes()
+        subscriptions = [each for node in nodes for each in node.subscriptions]
+        timers = [each for node in nodes for each in node.timers]
+        clients = [each for node in nodes for each in node.clients]
+        services = [each for node in nodes for each in node.services]
+        waitables = [each for node in nodes for each in node.waitables]
+        self._actions = [each for each in waitables if not isinstance(each, EventHandler)]
+        entities: list[Any] = [*subscriptions, *timers, *clients, *services, self._guard]
+        for entity in entities:
+            self._handles.enter_context(entity.handle)
+        count = NumberOfEntities(len(subscriptions), 1, len(timers), len(clients), len(services))
+        for action in self._actions:
+            self._handles.enter_context(action)
+            count += action.get_num_entities()
+        new = self._wait_set = rclpy_implementation.WaitSet(
+            count.num_subscriptions, count.num_guard_conditions, count.num_timers,
+            count.num_clients, count.num_services, count.num_events, self.context.handle,
+        )  # fmt: skip
+        self._groups = (
+            _Group('timer', timers, new.add_timer, self._take_timer),
+            _Group('subscription', subscriptions, new.add_subscription, self._take_subscription),
+            _Group('service', services, new.add_service, self._take_service),
+            _Group('client', clients, new.add_client, self._take_client),
+        )
+
+    def _release(self) -> None:
+        self._wait_set, self._groups, self._actions = None, (), []
+        self._handles.close()
+
+
+def make_executor(context: Context | None = None) -> Executor:
+    """Return the executor that the environment asks for, or the best for this rclpy.
+
+    Raises:
+        MusculoskeletalError: If the environment asks for one that there is not, or that does not
+            work with this rclpy.
+    """
+    choice = os.environ.get(VARIABLE, '')
+    if choice not in ('', *CHOICES):
+        raise MusculoskeletalError(f'{VARIABLE}={choice!r}; legal: {", ".join(CHOICES)}')
+    version = _rclpy_version()
+    found = f'rclpy {_dotted(version) or "of unknown version"}'
+    if choice == 'events' and version < EVENTS_SINCE:
+        needed = _dotted(EVENTS_SINCE)
+        raise MusculoskeletalError(f'{VARIABLE}=events needs rclpy {needed}; this is {found}')
+    if choice == 'lean' or (not choice and TESTED[0] <= version <= TESTED[1]):
+        executor = LeanExecutor(context=context)
+        missing = [name for name in PRIVATE_NAMES if not hasattr(executor, name)]
+        if not missing:
+            return executor
+        executor.shutdown()
+        found += f', which has no {missing[0]}'
+    kind: Any = SingleThreadedExecutor
+    if choice != 'single' and version >= EVENTS_SINCE:
+        kind = import_module('rclpy.experimental').EventsExecutor
+    if choice not in ('events', 'single'):
+        get_logger('musculoskeletal_ae').info(
+            f'using {kind.__name__}: LeanExecutor was tested with rclpy {_dotted(TESTED[0])} to '
+            f'{_dotted(TESTED[1])}, and this is {found}'
+        )
+    stock: Executor = kind(context=context)
+    return stock
+
+
+def _rclpy_version() -> tuple[int, ...]:
+    try:
+        version = metadata.version('rclpy')
+    except metadata.PackageNotFoundError:
+        return ()
+    return tuple(map(int, re.findall(r'\d+', version)[:3]))
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return '.'.join(map(str, version))

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tools on the ROS graph share: `check_driver`, `record`, `render`, `replay`, `view`."""
+
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+import rclpy
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.nodes.executor import make_executor
+from musculoskeletal_ae.nodes.parameters import OF_RCLPY
+from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
+from musculoskeletal_ae.options import exit_status
+from musculoskeletal_ae.stop_signals import STOP, Reaction
+
+ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
+LONGEST_WAIT = 0.1  # [s] between looks at a condition, and at the stop signals
+
+
+def message_class(type_name: str) -> Any:
+    """Return the ROS class of a message type of ROS 2 Jazzy."""
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError) as error:
+        raise MusculoskeletalError(
+            f'message type {type_name} is not installed; install the ROS package {package}'
+        ) from error
+
+
+class Spinner:
+    """Runs the callbacks of a tool's node while the tool waits; an exception in one ends the tool.
+
+    Inside rclpy a stop signal is only remembered (`stop_signals.Reaction`).
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._executor = make_executor(node.context)
+        self._executor.add_node(node)
+
+    def __enter__(self) -> 'Spinner':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+
+    def spin_once(self, longest: float) -> None:
+        """Run what is ready, or wait at most so long [s] for something."""
+        with STOP.reacting(Reaction.REMEMBER):
+            self._executor.spin_once(longest)
+
+    def spin_until(self, condition: Callable[[], object], longest: float) -> None:
+        """Run callbacks until a condition holds, at most so long [s].
+
+        Raises:
+            KeyboardInterrupt: After a stop signal.
+        """
+        end = time.monotonic() + longest
+        while not condition() and (left := end - time.monotonic()) > 0.0:
+            self.spin_once(min(LONGEST_WAIT, left))
+            STOP.raise_if_received()
+
+
+def start_ros(arguments: list[str]) -> None:
+    """Start ROS without its signal handlers, which would end publishers before the tool's work."""
+    with _clear_ros_arguments(arguments):
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+
+
+def run_tool(
+    name: str,
+    parse: Callable[[list[str]], Namespace],
+    work: Callable[[Namespace, list[str]], int],
+    argv: list[str] | None = None,
+) -> int:
+    """Parse options, work with them and with all arguments, and return the exit status.
+
+    `argv` are the arguments, those for ROS included; None for those of the process. Status 1 says
+    that something cannot be used, 2 that an option is wrong.
+    """
+    arguments = [name, *(sys.argv[1:] if argv is None else argv)]
+    with _clear_ros_arguments(arguments):
+        options = parse(remove_ros_args(arguments)[1:])
+    for parameter in parameters_given(arguments):
+        if parameter not in OF_RCLPY:
+            problem = f'{parameter!r} is no parameter: options of {name} stand before --ros-args'
+            print(printable(f'{name}: error: {problem}'), file=sys.stderr)
+            return 2
+    refused = (InvalidTopicNameException, rclpy_implementation.RCLError, *PARAMETER_ERRORS)
+    try:
+        return exit_status(lambda: _interruptible(work, options, arguments), *refused)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _interruptible(
+    work: Callable[[Namespace, list[str]], int], options: Namespace, arguments: list[str]
+) -> int:
+    """Work; once a stop signal was received, any error is taken to be its consequence."""
+    try:
+        return work(options, arguments)
+    except ExternalShutdownException as error:
+        raise KeyboardInterrupt from error
+    except Exception as error:
+        if STOP.received:
+            raise KeyboardInterrupt from error
+        raise
+
+
+@contextmanager
+def _clear_ros_arguments(arguments: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The format of muscles.yaml (doc/interface.md describes it for users).
+
+What depends on robot.urdf, or on values of all muscles, `description` checks afterwards.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import UNSET, Meta, UnsetType
+
+from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.schema import Strict
+
+LARGEST = 1e8  # [SI units] of any number
+LONGEST_LIST = 1000  # muscles, points of a route, joints
+SHORTEST_AXIS = 1e-6  # a shorter vector gives no direction
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
+
+
+class ElasticEntry(Strict, frozen=True):
+    """Constants of a series elastic element; those left out are the default."""
+
+    force: Positive | UnsetType = UNSET
+    rate: Positive | UnsetType = UNSET
+    wire_stretch: NotNegative | UnsetType = UNSET
+
+
+class TensionEntry(Strict, frozen=True):
+    """Tensions of a muscle [N]; those left out are the default."""
+
+    bias: Positive | UnsetType = UNSET
+    limit: Positive | UnsetType = UNSET
+    max: Positive | UnsetType = UNSET
+
+
+class RouteEntry(Strict, frozen=True):
+    """A point of a route or, with `wrap`, a surface that the tendon wraps around."""
+
+    link: Name
+    xyz: Vector
+    wrap: Literal['sphere', 'cylinder'] | None = None
+    axis: Vector | None = None
+    radius: Positive | None = None
+    side: Vector | None = None
+
+    def __post_init__(self) -> None:
+        """Check which keys belong to which kind, and the geometry of a cylinder."""
+        if self.wrap is None:
+            if any(value is not None for value in (self.axis, self.radius, self.side)):
+                raise ValueError('axis, radius and side need wrap: sphere or wrap: cylinder')
+            return
+        if self.radius is None:
+            raise ValueError("key 'radius' is missing")
+        if self.wrap == 'sphere':
+            if self.axis is not None:
+                raise ValueError("unknown key 'axis'; a sphere has link, xyz, radius, side")
+            return
+        if self.axis is None:
+            raise ValueError("key 'axis' is missing")
+        axis = np.array(self.axis)
+        length = float(np.linalg.norm(axis))
+        if length < SHORTEST_AXIS:
+            raise ValueError(f'axis: expected a direction, got {list(self.axis)}')
+        if self.side is not None:
+            out = np.array(self.side) - np.array(self.xyz)
+            beside = np.linalg.norm(np.cross(axis / length, out))
+            if beside < 1e-9 and np.linalg.norm(out) >= self.radius:
+                raise ValueError('side: expected a point beside the axis, got one on it')
+
+
+class MuscleEntry(Strict, frozen=True):
+    """A muscle; what is left out is that of all muscles."""
+
+    name: Name
+    route: Annotated[tuple[RouteEntry, ...], Meta(min_length=2, max_length=LONGEST_LIST)]
+    series_elastic: ElasticEntry | None = None
+    stiffness: Positive | UnsetType = UNSET
+    tension: TensionEntry = TensionEntry()
+
+    def __post_init__(self) -> None:
+        """Check the name, which lists of muscles must hold, and the order of the route."""
+        if self.name != self.name.strip() or ',' in self.name:
+            problem = 'name: expected a name without a comma and without spaces around it'
+            raise ValueError(f'{problem}, got {self.name!r}')
+        if printable(self.name) != self.name:
+            raise ValueError('name: expected characters that can be printed')
+        is_wrap = [entry.wrap is not None for entry in self.route]
+        if is_wrap[0] or is_wrap[-1] or any(map(all, pairwise(is_wrap))):
+            raise ValueError('route: expected a point before and after each wrap')
+
+
+class CouplingEntry(Strict, frozen=True):
+    """A joint that follows another: q = ratio · q_master + offset."""
+
+    joint: Name
+    master: Name
+    ratio: Number = 1.0
+    offset: Number = 0.0
+
+
+class MuscleFile(Strict, frozen=True):
+    """The whole file."""
+
+    joints: Names
+    muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
+    series_elastic: ElasticEntry | None = None
+    stiffness: Positive = 10000.0  # K_stiff of muscle stiffness control [N/m]
+    tension: TensionEntry = TensionEntry()
+    end_effector: Name | None = None
+    end_effectors: Names | None = None
+    couplings: Annotated[tuple[CouplingEntry, ...], Meta(max_length=LONGEST_LIST)] = ()
+
+    def __post_init__(self) -> None:
+        """Check that names are unique."""
+        _check_unique('joints', self.joints)
+        _check_unique('muscles', (muscle.name for muscle in self.muscles))
+        _check_unique('end_effectors', self.end_effectors or ())
+        _check_unique('couplings', (coupling.joint for coupling in self.couplings))
+        if self.end_effector is not None and self.end_effectors is not None:
+            raise ValueError('expected end_effector or end_effectors, got both')
+
+
+def _check_unique(key: str, names: Iterable[str]) -> None:
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise ValueError(f'{key}: {name!r} is listed twice; names must be unique')

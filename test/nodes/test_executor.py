@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every executor runs a node; asynchronous callbacks work; one that does not fit is refused."""
+
+import os
+import signal
+import subprocess
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from graph import executable
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes import executor
+from musculoskeletal_ae.nodes.bringup_status import BringupStatus
+
+
+@pytest.fixture
+def version(monkeypatch):
+    """Return what sets the version of rclpy that is found."""
+    monkeypatch.delenv(executor.VARIABLE, raising=False)
+    return lambda *numbers: monkeypatch.setattr(executor, '_rclpy_version', lambda: numbers)
+
+
+def events_executor_works():
+    return executor._rclpy_version() >= executor.EVENTS_SINCE
+
+
+@pytest.mark.parametrize('choice', executor.CHOICES)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_node_runs_and_ends_with_status_0_under_every_executor(
+    graph, monkeypatch, choice, number
+):
+    if choice == 'events' and not events_executor_works():
+        pytest.skip('the EventsExecutor of this rclpy does not run what nodes need')
+    monkeypatch.setenv(executor.VARIABLE, choice)
+    graph.listen(DiagnosticArray, '/diagnostics')
+    process = graph.start('estimator', robot='arm26')
+    graph.wait(lambda: graph.report('estimator').values, 'its diagnostics')
+    status, output = graph.ended(process, number)
+    assert status == 0 and 'Traceback' not in output, output
+
+
+@pytest.mark.parametrize('choice', ['lean', 'single'])
+def test_an_exception_that_escapes_a_callback_is_counted_and_the_node_goes_on(
+    graph, monkeypatch, choice
+):
+    monkeypatch.setenv(executor.VARIABLE, choice)
+    graph.listen(DiagnosticArray, '/diagnostics')
+    graph.start('estimator', robot='arm26')
+    graph.wait(lambda: graph.report('estimator').values, 'its diagnostics')
+    # rclpy's own callback for this service raises ValueError.
+    from rcl_interfaces.msg import Parameter, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    request = SetParameters.Request(
+        parameters=[Parameter(name='explore', value=ParameterValue(type=99))]
+    )
+    graph.call(SetParameters, 'estimator/set_parameters', request)
+    graph.wait(
+        lambda: any('ValueError' in key for key in graph.report('estimator').values), 'the count'
+    )
+
+
+def test_an_exception_of_a_node_s_callback_is_counted_by_topic(graph):
+    node = graph.host(BringupStatus, robot='arm26')
+
+    def fails(message):
+        raise ValueError(message.data)
+
+    async def fails_later(message):
+        raise KeyError(message.data)
+
+    for topic, callback in (('sync', fails), ('async', fails_later)):
+        node.create_subscription(String, topic, callback, 10)
+        graph.publisher(String, topic).publish(String(data='a'))
+    graph.wait(lambda: sum(node.rejected.values()) == 2, 'both')
+    place = graph.namespace
+    assert node.rejected == {f'{place}/sync: ValueError': 1, f'{place}/async: KeyError': 1}
+
+
+def test_a_callback_that_awaits_a_future_goes_on_when_it_is_done(graph):
+    answers = []
+    graph.node.create_service(Trigger, 'ask', lambda _, response: response)
+    client = graph.node.create_client(Trigger, 'ask')
+    graph.wait(client.service_is_ready, 'the service')
+
+    async def ask(_):
+        answers.append(await client.call_async(Trigger.Request()))
+
+    graph.node.create_subscription(String, 'begin', ask, 10)
+    graph.publisher(String, 'begin').publish(String())
+    graph.wait(lambda: answers, 'the answer', 10.0)
+    assert isinstance(answers[0], Trigger.Response)
+
+
+def test_messages_are_handled_while_a_callback_awaits(graph):
+    heard, future = [], Future()
+
+    async def waits(_):
+        heard.append(await future)
+
+    graph.node.create_subscription(String, 'slow', waits, 10)
+    graph.node.create_subscription(String, 'quick', lambda m: heard.append(m.data), 10)
+    graph.publisher(String, 'slow').publish(String())
+    quick = graph.publisher(String, 'quick')
+    quick.publish(String(data='meanwhile'))
+    graph.wait(lambda: heard, 'the message')
+    future.set_result('done')
+    quick.publish(String(data='again'))
+    graph.wait(lambda: 'done' in heard, 'the end', 10.0)
+    assert heard[0] == 'meanwhile'
+
+
+@pytest.mark.parametrize('numbers', [(7, 1, 0), (7, 2, 0), (9, 0, 0), ()])
+def test_an_untested_rclpy_gets_one_of_its_own_executors(context, version, numbers):
+    version(*numbers)
+    chosen = executor.make_executor(context)
+    assert not isinstance(chosen, executor.LeanExecutor)
+    chosen.shutdown()
+
+
+@pytest.mark.parametrize('numbers', [(7, 1, 1), (7, 1, 6), (7, 1, 11)])
+def test_a_tested_rclpy_gets_ours(context, version, numbers):
+    version(*numbers)
+    chosen = executor.make_executor(context)
+    assert isinstance(chosen, executor.LeanExecutor)
+    chosen.shutdown()
+
+
+def test_an_rclpy_without_a_name_that_ours_needs_gets_its_own(context, version, monkeypatch):
+    version(7, 1, 6)
+    monkeypatch.setattr(executor, 'PRIVATE_NAMES', ('_take_nothing',))
+    chosen = executor.make_executor(context)
+    assert type(chosen) is SingleThreadedExecutor
+    chosen.shutdown()
+
+
+@pytest.mark.parametrize(
+    ('choice', 'expected'), [('fast', 'legal: lean, events, single'), ('events', 'needs rclpy')]
+)
+def test_a_choice_that_cannot_be_met_is_one_line(choice, expected):
+    if choice == 'events' and events_executor_works():
+        pytest.skip('it can be met with this rclpy')
+    done = subprocess.run(
+        [*executable('estimator'), '--ros-args', '-p', 'robot:=arm26'],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, executor.VARIABLE: choice},
+    )
+    assert done.returncode == 1
+    assert expected in done.stderr and done.stderr.count('\n') == 1
+
+
+@pytest.fixture
+def context(graph):
+    return graph.context
+
+
+def test_the_choice_is_named_in_the_error(context, monkeypatch):
+    monkeypatch.setenv(executor.VARIABLE, 'fast')
+    with pytest.raises(MusculoskeletalError, match=f"{executor.VARIABLE}='fast'"):
+        executor.make_executor(context)

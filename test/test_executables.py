@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every executable: help at once, a clean end by Ctrl-C and SIGTERM, no option that is ignored."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from graph import executable
+
+from musculoskeletal_ae import executables
+from musculoskeletal_ae.experiments import NAMES
+from musculoskeletal_ae.nodes.parameters import COMBINED, PARAMETERS
+
+ROOT = Path(__file__).resolve().parent.parent
+NODES = [*PARAMETERS, *COMBINED]
+TOOLS = {
+    'check_driver': ['--robot', 'arm26'],
+    'check_robot': ['arm26'],
+    'experiment': ['all', '--quick', '--robot', 'arm26', '--out', '{folder}/results'],
+    'fit_series_elastic': ['config/testbed/one_muscle.csv'],
+    'import_robot': ['config/arm26/robot.urdf', '--out', '{folder}/arm'],
+    'record': ['-o', '{folder}/bag'],
+    'render': ['--out', '{folder}/arm.png'],
+    'replay': ['bags/rupture'],
+    'train': ['--robot', 'arm26', '--out', '{folder}/mae.safetensors'],
+    'view': ['--robot', 'arm26', '--port', '8765'],
+}
+#: moments [s] after the start: while modules are imported, while nodes are constructed, later
+MOMENTS = (0.3, 0.9, 2.0)
+
+
+def run(name, *arguments, before=''):
+    """Run an executable in a process of its own, after other statements."""
+    code = (
+        f'import sys\nfrom musculoskeletal_ae import executables\n'
+        f'sys.argv[0] = {name!r}\n{before}\nsys.exit(executables.{name}())'
+    )
+    return subprocess.run(
+        [sys.executable, '-c', code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
+    )
+
+
+def signalled(name, number, moment, *arguments):
+    """Run an executable that sends itself a signal at a moment [s] after its start."""
+    timer = f'threading.Timer({moment}, os.kill, (os.getpid(), {number.value}))'
+    start = f'import os, threading\ntimer = {timer}\ntimer.daemon = True\ntimer.start()'
+    return run(name, *arguments, before=start)
+
+
+def test_there_is_an_executable_for_every_node_and_tool():
+    assert all(callable(getattr(executables, name)) for name in (*NODES, *TOOLS))
+    assert all(executable(name) for name in (*NODES, *TOOLS))
+
+
+@pytest.mark.parametrize('name', [*NODES, *TOOLS])
+def test_help_loads_nothing_that_takes_long(name):
+    # All of them together take 0.1 to 0.4 s of CPU.
+    heavy = "{'numba', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
+    done = run(
+        name, '--help', before=f'import atexit\natexit.register(lambda: print("heavy", *{heavy}))'
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == 'heavy'
+    assert len(done.stdout) > 300
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('moment', MOMENTS)
+@pytest.mark.parametrize('name', ['combined', 'learner', 'sim'])
+def test_a_signal_ends_a_node_with_status_0_at_any_moment(name, moment, number):
+    done = signalled(name, number, moment, '--ros-args', '-p', 'robot:=arm26')
+    output = done.stdout + done.stderr
+    assert done.returncode == 0, output
+    assert not any(word in output for word in ('Traceback', 'Exception ignored', 'error')), output
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('name', TOOLS)
+def test_a_signal_ends_a_tool_without_a_traceback(name, number, tmp_path):
+    arguments = [text.format(folder=tmp_path) for text in TOOLS[name]]
+    done = signalled(name, number, MOMENTS[number == signal.SIGTERM], *arguments)
+    output = done.stdout + done.stderr
+    assert not any(word in output for word in ('Traceback', 'Exception ignored')), output
+    assert done.returncode in (0, 130), output  # some are done before
+
+
+@pytest.mark.parametrize('arguments', [['-p', 'robot:=arm26'], ['robot:=arm26']])
+def test_an_option_that_no_node_has_is_an_error(arguments):
+    done = run('estimator', *arguments)
+    assert done.returncode == 2
+    assert repr(arguments[0]) in done.stderr
+    assert '--ros-args -p NAME:=VALUE' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('command', 'expected'),
+    [
+        ('estimator --ros-args -p robto:=arm26', "a parameter 'robto'; nearest: robot"),
+        ('estimator --ros-args -p explore:=true', 'controller has'),
+        ('estimator --ros-args -p rate:=fast', 'rate'),
+        ('estimator --ros-args -p rate:=', 'rate:='),
+        ('estimator --ros-args -p robot:=nowhere', "'nowhere'"),
+        ('replay bag --ros-args -p out:=arm.png', 'options of replay stand before --ros-args'),
+    ],
+)
+def test_a_parameter_that_cannot_be_used_is_one_line(command, expected):
+    name, *arguments = command.split()
+    done = run(name, *arguments)
+    assert done.returncode in (1, 2)
+    assert expected in done.stderr and done.stderr.count('\n') == 1
+
+
+def test_a_file_of_parameters_for_all_nodes_may_name_no_unknown_one(tmp_path):
+    file = tmp_path / 'nodes.yaml'
+    file.write_text('/**: {ros__parameters: {explore: true, temprature_limit: 50.0}}')
+    done = run('estimator', '--ros-args', '--params-file', str(file))
+    assert done.returncode == 1
+    assert "'temprature_limit'; nearest: temperature_limit" in done.stderr
+
+
+def test_the_experiments_are_those_that_the_help_names():
+    from musculoskeletal_ae.experiments.runner import EXPERIMENTS
+
+    assert tuple(EXPERIMENTS) == NAMES
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason='only root can be somebody else')
+def test_a_checkout_of_somebody_else_is_told_apart(tmp_path):
+    clone = tmp_path / 'clone'
+    (clone / '.ci').mkdir(parents=True)
+    for name in ('.ci/environment.sh', 'requirements.txt'):
+        (clone / name).write_bytes((ROOT / name).read_bytes())
+    for folder in (*tmp_path.parents, tmp_path, clone, clone / '.ci'):
+        if str(folder).startswith('/tmp/'):
+            folder.chmod(0o755)
+    script = f'set -u; repository={clone}; . {clone}/.ci/environment.sh; environment_setup'
+    done = subprocess.run(
+        ['setpriv', '--reuid', '65534', '--clear-groups', 'bash', '-c', script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, 'HOME': '/nonexistent'},
+    )
+    assert done.returncode == 1
+    assert f'{clone} belongs to root' in done.stderr
+    assert 'unbound' not in done.stderr
