@@ -1,96 +1,186 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control as a whole: targets in, safe commands out.
 
-    target     ─→ posture (lengths) or torque (tensions) ─┐
-    trajectory ─→ motion (lengths) ───────────────────────┴─→ safety ─→ command
+    target, pose, trajectory ─► planner ─► activity ─┐
+                                 causes ─► supervisor ┤─► limiter ─► command
+                                            safe stop ┘
 
-An isolated muscle has no tension in any plan, and its module is told to hold it slack. The robot in
-here is the controller's own: its isolated muscles are those of which it was told. A muscle that is
-isolated while there is an anomaly is the suspect: the stopped arm winds it in a little, and goes on
-when the anomaly is over.
+The supervisor decides what the arm does (`supervisor`, `stops`), one object for each activity says
+how (`follower`, `ramps`, `torque`, `exploration`, `calibrating`), and the limiter is the last thing
+before publishing. This class connects them and holds no rules of its own.
 
-A stop latches on what `watch` finds, an unfit checkpoint, a fault of control's own, or on request
-(doc/interface.md, stop and resume). `reset` clears it once no cause is left; then the last target,
-which may be a trajectory's end, is resumed by a ramp from where the arm is. Exploration is not
-resumed. Data that is late, but back before the stop pays out, is no reason to latch: after RESUME
-of it the arm goes on by itself, exploring or not.
+An isolated muscle has no tension in any plan, and its module is told to hold it slack. A muscle
+that is isolated while there is an anomaly is the suspect: the stopped arm winds it in a little, and
+goes on when the anomaly is over.
 
 `now` is a steady clock [s], `time` that of the messages.
 """
 
-import copy
+from __future__ import annotations
+
 import math
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach
-from musculoskeletal_ae.control.exploration import Exploration, GentleMotion, gentle_limit
-from musculoskeletal_ae.control.hand import Hand
-from musculoskeletal_ae.control.methods import FloatControl, TorqueControl, msc_compensation
-from musculoskeletal_ae.control.motion import MotionControl, slowness
-from musculoskeletal_ae.control.posture import PostureControl, Pull
-from musculoskeletal_ae.control.safety import LENGTH, TENSION, Command, Muscles, SafetyFilter
-from musculoskeletal_ae.control.settings import BY_TENSION, Settings
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
-from musculoskeletal_ae.control.watch import Watch
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
+from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
+from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull, msc_compensation
+from musculoskeletal_ae.control.exploration import Exploration, Exploring
+from musculoskeletal_ae.control.follower import Follower
+from musculoskeletal_ae.control.limiter import CommandLimiter
+from musculoskeletal_ae.control.planner import Plan, Planner
+from musculoskeletal_ae.control.ramps import LengthRamps, PaperMethods
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.stopping import SafeStop
+from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.control.supervisor import Activity, Supervisor
+from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
+from musculoskeletal_ae.control.trajectory import Points, Setpoint
+from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
-from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream
 
+WINDOW = 3  # messages of the median against glitches
 RESTORE = 'estimator/restore uses isolated muscles again'
-RESUME = 0.2  # [s] of fresh data after which a stop that may pass ends
-#: of the way from tension.limit to tension.max that may be demanded; `watch` stops at a half
-FED_BACK = 1.0 / 3.0
+#: of the way from tension.limit to tension.max that may be demanded; the watchdog stops at a half
+DEMANDED = 1.0 / 3.0
 EASED = 0.9  # of tension.limit, demanded at most of a muscle that has been above it for long
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
-#: causes of a stop that may be a broken muscle's doing
-BY_MUSCLE = ('anomaly', 'muscle_states', 'estimate')
 APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
-SAME = 1e-6  # poses that differ by less are one
-ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
+
+
+@dataclass
+class Target:
+    """What was asked for last.
+
+    Attributes:
+        theta: Posture [rad], (D,); None while there is none.
+        effort: Torque beyond holding the weight [N·m], (D,).
+        clamped: Joints whose target lay beyond the limits.
+        unreachable_reason: Why the arm goes elsewhere than was asked, or ''.
+        approaches_left: How often an arm that falls on its way sets out again.
+    """
+
+    effort: Array
+    theta: Array | None = None
+    clamped: tuple[str, ...] = ()
+    unreachable_reason: str = ''
+    approaches_left: int = 0
+
+
+class Activities:
+    """One object for each activity, and which of them commands the arm."""
+
+    def __init__(self, robot: Robot, settings: Settings, seed: int) -> None:
+        self.ramps = LengthRamps(robot, settings)
+        self.follower = Follower(robot, settings)
+        self.paper_methods = PaperMethods(self.ramps, robot, settings)
+        exploration = Exploration(robot, seed, PRESETS[settings.preset].to_limits)
+        self.exploring = Exploring(exploration, self.ramps)
+        self.calibrating = Calibrating(robot, settings, seed)
+        self.torque = TorqueControl(robot, settings)
+        self.gravity_compensation = GravityCompensation(robot, settings)
+        #: the one that has commanded last, unless it was interrupted since
+        self.entered: ActivityControl | None = None
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Control this robot, whose isolated muscles pull nothing, by these settings."""
+        for part in (
+            self.ramps,
+            self.follower,
+            self.paper_methods,
+            self.calibrating,
+            self.torque,
+            self.gravity_compensation,
+        ):
+            part.use(robot, settings)
+        self.exploring.stream.use(robot, PRESETS[settings.preset].to_limits)
+
+    def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
+        """Return the object that carries out an activity; None for none."""
+        if activity in (Activity.HOLDING, Activity.MOVING):
+            return self.follower if by_follower(settings) else self.paper_methods
+        return {
+            Activity.EXPLORING: self.exploring,
+            Activity.CALIBRATING: self.calibrating,
+            Activity.TORQUE: self.torque,
+            Activity.GRAVITY_COMPENSATION: self.gravity_compensation,
+        }.get(activity)
+
+    def leave(self) -> None:
+        """End what commands the arm: something else follows, or a stop."""
+        if self.entered is not None:
+            self.entered.leave()
+        self.entered = None
+
+    def step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
+        """Let one of them command the arm."""
+        if control is not self.entered:
+            if self.entered is not None:
+                self.entered.leave()
+            control.enter(inputs)
+            self.entered = control
+        return control.step(inputs)
+
+
+class Suspicion:
+    """Which muscle the estimator suspects: the one that is isolated for the present anomaly."""
+
+    def __init__(self) -> None:
+        self._isolated: tuple[int, float] | None = None  # the last muscle, and when [s]
+        self._anomaly_at = math.inf
+
+    def note_anomaly(self, now: float) -> None:
+        """Take that an anomaly was detected."""
+        self._anomaly_at = now
+
+    def note_isolated(self, muscle: int, now: float) -> None:
+        """Take that a muscle was isolated."""
+        self._isolated = muscle, now
+
+    def suspect(self, has_anomaly: bool, isolated: tuple[int, ...]) -> int | None:
+        """Return the suspect, whichever of the two messages came first; None for none."""
+        if not has_anomaly or self._isolated is None:
+            return None
+        muscle, at = self._isolated
+        return muscle if muscle in isolated and at > self._anomaly_at - AT_ONCE else None
+
+
+def by_follower(settings: Settings) -> bool:
+    """Return whether targets are gone to by trajectories; by ramps of lengths otherwise."""
+    solved = settings.method == 'proposed' and PRESETS[settings.preset].equilibrium
+    return solved or settings.method == 'stiffness'
 
 
 class Controller:
-    """Steps everything between a target and a command."""
+    """Connects everything between a target and a command."""
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
-        self.robot, self.settings = copy.copy(robot), settings or Settings()
-        robot = self.robot
-        self.posture = PostureControl(robot, self.settings)
-        self.torque = TorqueControl(robot, self.settings)
-        self.motion = MotionControl(robot, self.settings)
-        self.follows = False  # a trajectory, or holds where one ended
-        #: the last pose, whether its orientation counts, and the way to it
-        self._posed: tuple[pin.SE3, bool, Trajectory | None] = pin.SE3.Identity(), True, None
-        self._approaches = 0  # of a target that are left, if the arm falls
-        self._hand = Hand(robot)
-        self.short = ''  # what the last target was out of reach by
-        self.floating = FloatControl(robot, self.settings)
-        self.safety = SafetyFilter(robot, self.settings)
-        self.watch = Watch(robot, self.settings)
-        self.clamped: tuple[str, ...] = ()  # joints whose target lay beyond the limits
+        self.robot, self.settings = robot, settings or Settings()
         self.mae: Mae | None = None
-        # One stream for the life of the controller: after a pause it brings new postures.
-        self._exploration = Exploration(robot, seed, PRESETS[self.settings.preset].to_limits)
-        self.gentle = GentleMotion(robot, seed)
-        self.estimate: Array | None = None
-        self._direction = FrictionDirection()
-        self._pull = Pull(robot.tension.bias, robot.tension.bias)
+        self.stream = MuscleStream(robot, window=WINDOW)
+        self.sample: MuscleSample | None = None
+        self.estimate: Array | None = None  # θ [rad], (D,)
+        self.target_state = Target(np.zeros(robot.joint_count))
+        self.supervisor = Supervisor()
+        self.watchdog = Watchdog(robot, self.settings)
+        self.planner = Planner(robot, self.settings)
+        self.activities = Activities(robot, self.settings, seed)
+        self.limiter = CommandLimiter(robot, self.settings)
+        self.stopping = SafeStop(robot, self.settings, self.limiter)
         self.sent_at = 0.0  # when the last command went out; its user says so
-        self._fresh = 0.0  # [s] of data since it was late
-        # whether it explored when it was stopped; whether a suspect is verified; whether the arm is
-        # to go on by itself, and may
-        self._explored = self._verifies = self._resumes = self._may_resume = False
-        self._isolated_at, self._anomaly_at = (-1, -math.inf), math.inf
-        # Whether the next command starts a method anew, from how the muscles pull then.
-        self._starts = True
+        self._estimate_problem = Persistence()
+        self._suspicion = Suspicion()
 
     # -- what comes in --------------------------------------------------------------------------
 
@@ -102,150 +192,146 @@ class Controller:
         before, radian = self.settings, self.robot.kinematics.radian
         stiffness = settings.desired_stiffness(radian)
         self.settings = settings
-        self.posture.settings = self.torque.settings = self.safety.settings = settings
-        self.motion.settings = self.floating.settings = self.watch.settings = settings
+        self._use_parts()
+        is_other = (settings.method, settings.preset) != (before.method, before.preset)
         if settings.method == 'float':
-            self.explore(False)
-        another = (settings.method, settings.preset) != (before.method, before.preset)
-        self._exploration.to_limits = PRESETS[settings.preset].to_limits
-        if another and not self.posture.exploring:
-            self._starts, self.follows = True, False
-        elif settings.method == 'stiffness' and stiffness != before.desired_stiffness(radian):
-            (self.motion.plan_anew if self.follows else self.posture.start)()
+            self._request(Activity.GRAVITY_COMPENSATION)
+        elif is_other and not self.supervisor.explores:
+            self._hold()
+        if settings.method == 'stiffness' and stiffness != before.desired_stiffness(radian):
+            self.activities.follower.plan_anew()
 
     def use(self, mae: Mae) -> None:
         """Take a checked network."""
-        self.mae, self.watch.checkpoint = mae, True
-        self.posture.use(mae)
-        self.motion.use(mae)
+        self.mae, self.watchdog.has_checkpoint = mae, True
+        self.stream.use_friction(mae.friction)
+        self.activities.follower.use_network(mae)
+        if self.activities.entered is self.activities.paper_methods:
+            self.activities.ramps.solve_again()
 
-    def muscles(self, muscles: Muscles, now: float) -> None:
-        """Take muscle_states; a MessageError says that no muscles of this arm can be so."""
-        self.watch.muscles(muscles, self.safety.zeroed, now)
-        length, tension, _ = self.safety.muscles(muscles)
-        self.watch.pulled(tension, now)
-        friction = 0.0 if self.mae is None else self.mae.friction
-        self._pull = Pull(tension, self._direction.end_tension(friction, tension, length))
+    def muscles(self, states: Array, now: float) -> None:
+        """Take l as it was read [m], T [N] and temperature [°C], (3, M).
+
+        A MessageError says that no muscles of this arm can be so.
+        """
+        self.sample = self.stream.take_states(np.asarray(states), now)
+        self.watchdog.take_sample(self.sample, now)
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
-        if not self.safety.zeroed:
+        known = self.stream.body.offsets.known
+        if not known:  # a guess of the offsets may make any posture
             theta = np.clip(theta, self.robot.lower, self.robot.upper)
-        self.watch.estimated(theta, now)
+        try:
+            check_posture(self.robot, theta, LIMITS.estimate_outside)
+        except MessageError as error:
+            self._estimate_problem.note(str(error), now)
+            raise
+        self._estimate_problem.note('', now)
+        self.watchdog.take_estimate(now)
         self.estimate = theta
 
-    def zeros(self, known: bool, less: Array) -> None:
-        """Take whether zeros are known, and how much less [m] (M,) lengths are from now on."""
-        self.safety.shift(less)
-        self.watch.forget()
-        self._direction.reset()
-        if known != self.safety.zeroed or less.any():
-            self._starts, self.follows = True, False
-        self.safety.zeroed = known
-        self.gentle.start()
+    def use_body(self, body: BodyState) -> None:
+        """Take which muscles are isolated, and the length offsets."""
+        before = self.stream.body
+        if body.offsets is not before.offsets:
+            self._use_offsets(body)
+        self.stream.use_body(body)
+        if body.isolated == before.isolated:
+            return
+        self.robot = self.robot.without(body.isolated)
+        self.target_state.unreachable_reason = ''
+        self._use_parts()
+        if self.mae is not None:
+            self.activities.follower.plan_anew()
+        if added := set(body.isolated) - set(before.isolated):
+            self._suspicion.note_isolated(max(added), self.watchdog.age.stepped_at)
+        self._note_suspect()
+
+    def _use_offsets(self, body: BodyState) -> None:
+        before = self.stream.body.offsets
+        self.limiter.shift(body.offsets.offset - before.offset)
+        if self.sample is not None:
+            self.sample = self.sample.shifted(body.offsets.offset - before.offset)
+        is_known = body.offsets.known
+        if is_known != before.known or (body.offsets.offset != before.offset).any():
+            self.activities.leave()
+        self.limiter.offsets_known = is_known
+        self.supervisor.on_offsets(is_known)
+
+    def _use_parts(self) -> None:
+        """Hand robot and settings to all parts: the only place where that happens."""
+        for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
+            part.use(self.robot, self.settings)
 
     def anomaly(self, detected: bool) -> None:
         """Take anomaly_detected; once a suspect was verified, the arm goes on when it is over."""
-        if detected and not self.watch.anomaly:
-            self._anomaly_at = self.watch.stepped_at
-        self._resumes |= self._verifies and not detected
-        self._verifies, self.watch.anomaly = self._verifies and detected, detected
+        if detected and not self.watchdog.has_anomaly:
+            self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
+        self.watchdog.has_anomaly = detected
         if detected:
-            self.stop('anomaly_detected')
-        self._note_suspect()
-
-    def isolate(self, muscles: Iterable[int]) -> None:
-        """Go on without these muscles, places in T and l, and with all others."""
-        muscles, before = set(muscles), set(self.robot.isolated)
-        self.robot.isolate(muscles)
-        if muscles != before:
-            self.short = ''
-        if added := muscles - before:
-            self._isolated_at = max(added), self.watch.stepped_at
-        if self.mae is not None:
-            self.use(self.mae)
+            self.supervisor.on_event(StopCause.ANOMALY)
+        else:
+            self.supervisor.on_verified()
         self._note_suspect()
 
     def _note_suspect(self) -> None:
-        muscle, at = self._isolated_at  # whichever was told first
-        here = self.watch.anomaly and at > self._anomaly_at - AT_ONCE
-        here = here and muscle in self.robot.isolated
-        self.safety.suspect = muscle if here else None
-        self._verifies |= here
+        isolated = self.stream.body.isolated
+        suspect = self._suspicion.suspect(self.watchdog.has_anomaly, isolated)
+        self.stopping.suspect = suspect
+        self.supervisor.on_suspect(suspect is not None)
+
+    def clock_jumped_back(self) -> None:
+        """Count the messages' time from here."""
+        self.watchdog.age.clock_jumped_back()
+        self.stream.reset()
+
+    # -- what is asked --------------------------------------------------------------------------
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
-        self._refuse_floating()
-        robot = self.robot
-        kept = self.posture.theta if self.posture.theta is not None else self.estimate
+        self._refuse_gravity_compensation()
+        robot, state = self.robot, self.target_state
+        kept = self.estimate if state.theta is None else state.theta
         if kept is None and len(joints) < robot.joint_count:
             raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
-        before = zip(np.zeros(robot.joint_count) if kept is None else kept, self.posture.effort)
+        before = zip(np.zeros(robot.joint_count) if kept is None else kept, state.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
-        inside = np.clip(theta, robot.lower, robot.upper)
-        inside, self.short = self._within_reach(inside, self._nearest)
-        self.clamped = tuple(n for n, a, b in zip(robot.joints, theta, inside) if a != b)
-        chosen = self.settings
-        solved = chosen.method == 'proposed' and PRESETS[chosen.preset].equilibrium
-        if solved and chosen.target_duration > 0.0 and not self.safety.cause:
-            with suppress(MessageError):  # not ready: then by a ramp, once it is
-                self._approach(inside, effort, APPROACHES)
-                return
-        self._starts |= self.posture.exploring or self.follows
-        self.follows = self._explored = False
-        self.posture.set_target(inside, effort)
-
-    def _approach(self, theta: Array, effort: Array, left: int) -> None:
-        kept, (start, mae) = (self.clamped, self.short), self._ready()
-        way = reach.way(self.robot, mae, start.theta, theta)
-        planned = Trajectory.to(start, way, self.settings.target_duration)
-        self._follow(*self._within_limits(mae, planned), effort=effort)
-        (self.clamped, self.short), self._approaches = kept, left
+        goal = np.clip(theta, robot.lower, robot.upper)
+        reason = ''
+        if self.mae is not None and self.estimate is not None:
+            nearest = self.planner.takes_nearest
+            goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
+        clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
+        self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
+        if self.supervisor.is_running and by_follower(self.settings) and self._is_ready:
+            self._approach(self.settings.target_duration or self.settings.first_duration)
+        else:  # it is gone to as soon as the arm may move
+            self._hold()
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
         """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
 
         A MessageError says why not: nothing changes then.
         """
-        robot = self.robot
-        if points is not None:
-            low, high = robot.lower[points.joints], robot.upper[points.joints]
-            beyond = (points.position < low - ROUNDING) | (points.position > high + ROUNDING)
-            if beyond.any():
-                k, j = np.argwhere(beyond)[0]
-                told = f'{robot.joints[points.joints[j]]} {points.position[k, j]:.3f}'
-                unit = robot.units[points.joints[j]].theta
-                limits = f'legal: {low[j]:.3f} to {high[j]:.3f} {unit}'
-                raise MessageError('beyond the joint limits', f'{told}, {limits}')
         start, mae = self._ready(max(delay, 0.0))
         if points is None:
-            self._follow(Trajectory.stopping(start, robot))
+            self._follow(self.planner.to_rest(start))
         else:
-            planned = Trajectory.through(start, points, max(-delay, 0.0))
-            slower = self._slowed(mae, planned)
-            self._within_reach(planned.end, nearest=False)
-            self._follow(planned, slower, max(delay, 0.0))
+            plan = self.planner.through(mae, start, points, max(-delay, 0.0))
+            self._follow(plan, max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Bring the end effector to a pose in the root link's frame, or to its position only.
 
         A MessageError says why not: nothing changes then.
         """
-        (start, mae), chosen = self._ready(), self.settings
-        if self._goes_to(pose, whole):
-            self._hand.again(now)
+        start, mae = self._ready()
+        follower = self.activities.follower
+        if follower.is_moving and self.planner.is_under_way(pose, whole, follower.latest):
+            self.planner.repeat_pose(now)
             return
-        theta, short = self._hand.posture(mae, pose, whole, start.theta, self._nearest)
-        planned = self._hand.towards(start, theta, chosen.hand_speed, now)
-        self._follow(*self._within_limits(mae, planned))
-        self._posed = pose, whole, self.motion.latest
-        self.short = short and f'{short}; nearest approached'
-
-    def _goes_to(self, pose: pin.SE3, whole: bool) -> bool:
-        """Whether the hand is on its way to a pose already."""
-        before, whole_before, way = self._posed
-        going = self.motion.moving and self.motion.latest is way and whole == whole_before
-        return going and bool(before.isApprox(pose, SAME))
+        self._follow(self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
         """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
@@ -253,145 +339,43 @@ class Controller:
         A MessageError says why not: nothing changes then.
         """
         start, mae = self._ready()
-        self._follow(*self._within_limits(mae, self._hand.moved(mae, start, twist)))
-
-    def _slowed(self, mae: Mae, planned: Trajectory) -> float:
-        """Return how many times longer a way has to take.
-
-        A MessageError says that it then leaves the joint limits: one that is slowed and starts in
-        motion is another way.
-        """
-        slower = slowness(self.robot, mae, planned, self.settings)
-        planned.scaled(slower).check(self.robot)
-        return slower
-
-    def _within_limits(self, mae: Mae, planned: Trajectory) -> tuple[Trajectory, float]:
-        """Return a way within the joint limits, and how many times longer it has to take.
-
-        A MessageError says that there is none.
-        """
-        try:
-            return planned, self._slowed(mae, planned)
-        except MessageError:
-            planned = planned.after_rest(self.robot)
-            return planned, self._slowed(mae, planned)
-
-    def _within_reach(self, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return where to go for θ [rad] (D,) without the isolated muscles, and what θ lacks.
-
-        A MessageError says that they are needed, unless the `nearest` posture is wished.
-        """
-        if self.robot.used.all() or self.mae is None or self.estimate is None:
-            return theta, ''
-        held, short = reach.nearest_held(self.robot, self.mae, self.estimate, theta)
-        if not short:
-            return theta, ''
-        short = f'{short} without {self._left_out}; nearest posture held: {self.robot.told(held)}'
-        if not nearest:
-            raise MessageError('out of reach', short)
-        return held, f'{short}; nearest approached'
-
-    @property
-    def _nearest(self) -> bool:
-        return self.settings.unreachable == 'nearest'
-
-    @property
-    def _left_out(self) -> str:
-        return self.robot.names(self.robot.isolated)
-
-    def _refuse_floating(self) -> None:
-        if self.settings.method == 'float':
-            raise MessageError('floating', 'a hand moves the arm; set another method first')
-
-    def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
-        """Return where a trajectory starts in `delay` [s], and the network.
-
-        A MessageError says why none may start.
-        """
-        self._refuse_floating()
-        if self.estimate is None or self.mae is None:
-            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
-        if cause := self.safety.cause or self.watch.present_cause(self.watch.stepped_at):
-            raise MessageError('stopped', cause)
-        if not self.safety.zeroed:
-            raise MessageError('length zeros are unknown', 'find them by estimator/zero')
-        if self.follows and not self._starts:
-            return self.motion.ahead(delay), self.mae
-        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
-        return Setpoint.resting(inside), self.mae
-
-    def _follow(
-        self,
-        planned: Trajectory,
-        slower: float | None = None,
-        delay: float = 0.0,
-        effort: Array | None = None,
-    ) -> None:
-        if not self.follows or self._starts:
-            self._explore(False)
-            self.motion.start()
-            if delay > 0.0:
-                self.motion.follow(Trajectory.stopping(self._ready()[0], self.robot))
-        self.follows, self._starts, self.clamped, self.short = True, False, (), ''
-        self._approaches = 0
-        try:
-            self.motion.follow(planned, delay, slower)
-            self.motion.exert(np.zeros(self.robot.joint_count) if effort is None else effort)
-        except Exception as error:  # noqa: BLE001 (as in `step`)
-            self.stop(f'fault of control: {type(error).__name__}: {error}')
-        self.posture.theta, self.posture.effort = planned.end, self.motion.effort
-
-    # -- what is asked --------------------------------------------------------------------------
+        self._follow(self.planner.by_twist(mae, start, twist))
 
     def explore(self, wanted: bool) -> str:
         """Explore, or end it and hold; return why not, or ''."""
-        if wanted and self.safety.cause:
-            return f'stopped: {self.safety.cause}'
+        condition = self.supervisor.condition
+        if wanted and condition is not None:
+            return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
             return 'method float: a hand moves the arm; set another method first'
-        if wanted and len(self.robot.isolated) == self.robot.muscle_count:
+        if wanted and not self.stream.body.used.any():
             return f'all muscles are isolated; {RESTORE}'
-        self._explored = False
-        self._explore(wanted)
+        if wanted != self.supervisor.explores:
+            self.target_state = Target(np.zeros(self.robot.joint_count))
+            known = self.stream.body.offsets.known
+            exploring = Activity.EXPLORING if known else Activity.CALIBRATING
+            self._request(exploring if wanted else Activity.IDLE)
         return ''
 
-    def _explore(self, wanted: bool) -> None:
-        if wanted != self.posture.exploring:
-            self.short, self.clamped = '', ()
-            self.posture.explore(iter(self._exploration) if wanted else None)
-            self.posture.theta = None
-            self._starts, self.follows = True, False
-
-    def stop(self, cause: str) -> None:
+    def stop(self, cause: StopCause, detail: str = '') -> None:
         """Latch a safe stop."""
-        if not self.safety.cause or self.safety.passing:
-            self._may_resume, self._explored = True, False
-        self._may_resume &= cause.startswith(BY_MUSCLE)
-        self._explored |= self.posture.exploring
-        self._explore(False)
-        self.safety.stop(cause)
+        self.supervisor.on_event(cause, detail)
 
-    def clock_jumped_back(self) -> None:
-        """Count the messages' time from here."""
-        self.watch.clock_jumped_back()
-        self._direction.reset()
-
-    def reset(self, now: float) -> str:
-        """Clear a stop and go on to the last target; return why not, or ''."""
-        cause = self.watch.present_cause(now)
-        if not cause and self.safety.cause:
-            self.safety.cause, self.safety.passing = '', False
-            self._starts = True
-        return cause
+    def reset(self, now: float) -> Condition | None:
+        """End a stop and go on to the last target; return the cause that is present, if any."""
+        return self.supervisor.on_reset(self.conditions(now))
 
     # -- time -----------------------------------------------------------------------------------
 
-    @property
-    def by_tension(self) -> TorqueControl | None:
-        """What commands tensions now; None where lengths are commanded."""
-        if self.settings.method not in BY_TENSION or self.posture.exploring:
-            return None
-        return self.floating if self.settings.method == 'float' else self.torque
+    def conditions(self, now: float) -> list[Condition]:
+        """Return the causes to stop that are present, the most severe first."""
+        present = self.watchdog.conditions(now)
+        if why := self.stream.implausible(now):
+            present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, why))
+        if why := self._estimate_problem.lasting(now):
+            present.append(Condition(StopCause.IMPLAUSIBLE_ESTIMATE, why))
+        order = list(StopCause)
+        return sorted(present, key=lambda condition: order.index(condition.cause))
 
     def step(self, now: float, time: float | None = None) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded.
@@ -399,112 +383,211 @@ class Controller:
         `time` is the messages' [s], that of the steady clock if it is not given.
         """
         # What computing took is over when a command goes out: it may bring no change with it.
-        computing = max(self.sent_at - self.watch.stepped_at, 0.0)
-        stopped = bool(self.safety.cause)
-        dt, awake, paused = self.watch.step(now, now if time is None else time, stopped)
-        self._starts |= paused
-        late, cause = self.watch.late(now), self.watch.present_cause(now)
-        # An estimator that starts anew knows of no suspect, and says that there is no anomaly.
-        self._verifies &= not late.startswith('estimated')
-        # Before the first command there is nothing to stop.
-        self.follows &= not (cause or self.safety.cause)
-        if cause and self.safety.command is not None:
-            if cause == late:
-                self._may_resume &= bool(self.safety.cause)
-                self.safety.stop(cause, passing=True)
-            else:
-                self.stop(cause)
-        self._fresh = 0.0 if cause else self._fresh + awake
-        if self.safety.passing and self._fresh > RESUME:
-            self.safety.cause, self.safety.passing, self._starts = '', False, True
-        self.watch.limit_by_heat(self.safety.most_change(TENSION, dt))
-        if self._resumes and (not self._may_resume or not self.reset(now)):
-            self._resumes = False
-            if self._may_resume and self._explored:
-                self.explore(True)
-            cause = self.watch.present_cause(now)
+        computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
+        time = now if time is None else time
+        step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
+        if step.has_paused:  # the arm may be elsewhere by now: on from there
+            self.activities.entered = None
+        present = self.conditions(now)
+        stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
+        if stale_estimate:  # an estimator that starts anew knows of no suspect
+            self.supervisor.on_suspect(False)
+        was_running = self.supervisor.is_running
+        if self.limiter.command is not None or not was_running:  # else there is nothing to stop
+            is_released = not was_running and self.stopping.is_releasing
+            self.supervisor.on_conditions(present, step.elapsed, is_released)
+        fall = self.limiter.largest_change(TENSION, step.dt)
+        self.watchdog.heat.lower(self.settings.temperature_limit, fall)
+        dt = max(step.dt - computing, 0.0)
         desired = None
-        if not cause and not self.safety.cause:
-            try:
-                desired = self._slack(self._command(dt))
-            except RobotDescriptionError as error:  # too little is left to explore with
-                self._explore(False)
-                self.short = str(error)
-                if without := self._left_out:
-                    self.short = f'what is left without {without} holds too few postures; {RESTORE}'
-            except Exception as error:  # noqa: BLE001 (any fault of control's own stops the arm)
-                self.stop(f'fault of control: {type(error).__name__}: {error}')
-        waits = self.safety.passing and not cause  # until RESUME: neither hold nor release goes on
-        fresh = not late.startswith('muscle')
-        limit = self.watch.most
-        if not self.safety.zeroed:
-            limit = np.minimum(limit, gentle_limit(self.robot))
-        passed = 0.0 if waits else max(dt - computing, 0.0)
-        command = self.safety.step(desired, limit, passed, fresh)
-        if self.safety.cause and not self.safety.passing:
-            self._explore(False)
+        if self.supervisor.is_running and not present:
+            desired = self._desired(step.dt)
+        if not self.supervisor.is_running:
+            desired = self._stopped(was_running, present, now, dt)
+        command = self._limited(desired, dt)
+        if command is None and desired is not None and self.supervisor.is_running:
+            self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
+            command = self._limited(self._stopped(True, present, now, dt), dt)
+        return command if command is not None else self.limiter.command
+
+    def _desired(self, dt: float) -> Command | None:
+        """Return what the activity wants; any fault of it stops the arm."""
+        control = self.activities.of(self.supervisor.activity, self.settings)
+        if control is None:
+            self.activities.leave()
+            return None
+        try:
+            return self._slack(self._bounded(self._step(control, self._inputs(dt))))
+        except RobotDescriptionError as error:  # too little is left to explore with
+            self._request(Activity.IDLE)
+            reason = str(error)
+            if isolated := self.robot.names(self.robot.isolated):
+                reason = f'what is left without {isolated} holds too few postures; {RESTORE}'
+            self.target_state.unreachable_reason = reason
+        except Exception as error:  # noqa: BLE001 (whatever it is, the arm must stop)
+            self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
+        return None
+
+    def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
+        activities, state = self.activities, self.target_state
+        follower = activities.follower
+        if control is follower and follower.trajectory is None and state.theta is not None:
+            # After a stop or another method: on to the target, from where the arm is.
+            self._approach(self.settings.first_duration)
+        elif control is follower and follower.has_fallen and state.approaches_left:
+            state.approaches_left -= 1
+            follower.leave()
+            self._approach(self.settings.target_duration or self.settings.first_duration)
+        command = activities.step(control, inputs)
+        if control is activities.gravity_compensation:
+            # Where it is left is held by the method that comes next.
+            inside = np.clip(inputs.theta, self.robot.lower, self.robot.upper)
+            self.target_state = Target(np.zeros_like(inside), inside)
+        if control is activities.exploring:
+            state.theta = activities.exploring.theta
+        if control is follower and not follower.is_moving:
+            self.supervisor.on_arrival()
         return command
 
-    def _slack(self, command: Command | None) -> Command | None:
-        """Return a command that gives isolated muscles all the length, or no tension."""
-        if command is None or not self.robot.isolated:
-            return command
-        nothing = self.safety.longest if command.kind == LENGTH else 0.0
-        return Command(command.kind, np.where(self.robot.used, command.value, nothing))
+    def _inputs(self, dt: float) -> Inputs:
+        # Without a present cause all of them are there.
+        assert self.mae is not None and self.sample is not None and self.estimate is not None
+        sample = self.sample
+        pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
+        return Inputs(
+            mae=self.mae,
+            sample=sample,
+            pull=pull,
+            theta=self.estimate,
+            length=self.limiter.last(LENGTH, sample).value,
+            tension=self.limiter.last(TENSION, sample).value,
+            limit=np.minimum(self.watchdog.heat.planned, self.robot.tension.limit),
+            dt=dt,
+        )
 
-    def _bounded(self, length: Array, muscles: Muscles) -> Command:
-        """Return lengths that demand no tension for which `watch` would stop the arm.
+    def _bounded(self, command: Command | None) -> Command | None:
+        """Return a command that demands no tension for which the watchdog would stop the arm.
 
         Plans of `proposed` stay within tension.limit; feedback, an arm that does not come along,
         `second` and preset `paper` demand more. Stiffness is as was asked for, whatever pushes the
         arm.
         """
-        if self.settings.method != 'stiffness' or self.posture.exploring:
-            limits, strained = self.robot.tension, self.watch.strained
-            most = limits.limit + FED_BACK * (limits.max - limits.limit)
-            if np.count_nonzero(strained):
-                most = np.where(strained, EASED * limits.limit, most)
-            length = np.maximum(length, muscles.length + msc_compensation(self.robot, most))
-        return Command(LENGTH, length)
+        if command is None or command.kind != LENGTH or self.sample is None:
+            return command
+        activity = self.supervisor.activity
+        if activity is Activity.CALIBRATING or (
+            self.settings.method == 'stiffness' and activity is not Activity.EXPLORING
+        ):
+            return command
+        age, limits = self.watchdog.age, self.robot.tension
+        largest = limits.limit + DEMANDED * (limits.max - limits.limit)
+        strained = self.watchdog.overload.strained(
+            age.awake(age.stepped_at), self.settings.overload_time
+        )
+        largest = np.where(strained, EASED * limits.limit, largest)
+        shortest = self.sample.length + msc_compensation(self.robot, largest)
+        return Command(LENGTH, np.maximum(command.value, shortest))
 
-    def _command(self, dt: float) -> Command | None:
-        mae, muscles, estimate = self.mae, self.safety.now, self.estimate
-        # No present cause: all are there.
-        assert mae is not None and muscles is not None and estimate is not None
-        posture, by_tension = self.posture, self.by_tension
-        if not self.safety.zeroed:
-            if not posture.exploring:
-                return None
-            now = muscles.tension, muscles.length, estimate, self.safety.last(LENGTH).value
-            return Command(LENGTH, self.gentle.step(mae, *now, dt))
-        planned = np.minimum(self.watch.limit, self.robot.tension.limit)
-        if self._starts and self.follows:  # after a pause: on from where it was
-            self._starts = False
-            self.motion.start()
-        again = self._approaches and self.settings.target_duration > 0.0
-        if self.follows and again and self.motion.fallen:
-            assert posture.theta is not None  # what is followed has led there
-            self._starts = True
-            self._approach(posture.theta, posture.effort, self._approaches - 1)
-        if self._starts:
-            self._starts = False
-            kind = TENSION if by_tension else LENGTH
-            (by_tension or posture).start_from(self.safety.last(kind).value)
-        if self.follows:
-            sent = self.safety.last(LENGTH).value
-            length = self.motion.step(muscles.length, self._pull, estimate, sent, planned, dt)
-            return self._bounded(length, muscles)
-        if by_tension is None:
-            goal = posture.step(self._pull, estimate, planned, dt)
-            return None if goal is None else self._bounded(goal, muscles)
-        if self.settings.method == 'float':
-            nothing = np.zeros_like(estimate)
-            tension = self.floating.step(mae, estimate, estimate, nothing, planned, dt)
-            # Where it is left is held by the method that comes next.
-            inside = np.clip(estimate, self.robot.lower, self.robot.upper)
-            posture.theta, posture.effort = inside, nothing
-            return Command(TENSION, tension)
-        if posture.theta is None:
+    def _slack(self, command: Command | None) -> Command | None:
+        """Return a command that gives isolated muscles all the length, or no tension."""
+        if command is None or not self.robot.isolated:
+            return command
+        released = self.limiter.slack_length if command.kind == LENGTH else 0.0
+        return Command(command.kind, np.where(self.robot.used, command.value, released))
+
+    def _stopped(
+        self, begins: bool, present: list[Condition], now: float, dt: float
+    ) -> Command | None:
+        """Return the command of a stopped arm."""
+        if begins:
+            self.activities.leave()
+            self.stopping.enter()
+        if self.sample is None:
             return None
-        target, effort = posture.theta, posture.effort
-        return Command(TENSION, self.torque.step(mae, estimate, target, effort, planned, dt))
+        # A paused arm whose data is back waits for a moment: neither hold nor release goes on.
+        waits = not self.supervisor.is_latched and not present
+        stale = {condition.cause for condition in present}
+        is_fresh = StopCause.STALE_MUSCLE_STATES not in stale
+        may_wind = self.supervisor.may_wind_suspect
+        return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind)
+
+    def _limited(self, desired: Command | None, dt: float) -> Command | None:
+        if desired is None or self.sample is None:
+            return None
+        limit = self.watchdog.heat.momentary
+        if not self.stream.body.offsets.known:
+            limit = np.minimum(limit, gentle_limit(self.robot))
+        return self.limiter.limit(desired, self.sample, limit, dt)
+
+    # -- requests -------------------------------------------------------------------------------
+
+    def _request(self, activity: Activity) -> None:
+        if activity is not self.supervisor.activity:
+            self.activities.leave()
+        self.supervisor.on_request(activity)
+
+    def _hold(self) -> None:
+        """Go to the target by the method that is set now, from how the muscles pull."""
+        state = self.target_state
+        if self.settings.method == 'tension':
+            activity = Activity.TORQUE
+        else:
+            activity = Activity.IDLE if state.theta is None else Activity.HOLDING
+        self.activities.leave()
+        if state.theta is not None:
+            self.activities.torque.set_target(state.theta, state.effort)
+            self.activities.paper_methods.set_target(state.theta, state.effort)
+        self.supervisor.on_request(activity)
+
+    def _approach(self, duration: float) -> None:
+        """Set out to the target on a way that can be held."""
+        state = self.target_state
+        assert state.theta is not None
+        start, mae = self._ready()
+        plan = self.planner.to_posture(mae, start, state.theta, duration)
+        self._begin(plan, 0.0, state.effort)
+
+    def _follow(self, plan: Plan, delay: float = 0.0) -> None:
+        """Follow a trajectory that was asked for."""
+        nothing = np.zeros(self.robot.joint_count)
+        end = plan.trajectory.end
+        self.target_state = Target(nothing, end, (), plan.unreachable_reason)
+        self._begin(plan, delay, nothing)
+
+    def _begin(self, plan: Plan, delay: float, effort: Array) -> None:
+        follower = self.activities.follower
+        if follower.trajectory is None and delay > 0.0:
+            start, _ = self._ready()
+            follower.follow(self.planner.to_rest(start).trajectory)
+        follower.follow(plan.trajectory, delay)
+        follower.exert(effort)
+        self.supervisor.on_request(Activity.MOVING)
+
+    @property
+    def _is_ready(self) -> bool:
+        known = self.stream.body.offsets.known
+        return known and self.estimate is not None and self.mae is not None
+
+    def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
+        """Return where a trajectory starts in `delay` [s], and the network.
+
+        A MessageError says why none may start.
+        """
+        self._refuse_gravity_compensation()
+        if self.estimate is None or self.mae is None:
+            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
+        present = self.conditions(self.watchdog.age.stepped_at)
+        condition = self.supervisor.condition or next(iter(present), None)
+        if condition is not None:
+            raise MessageError('stopped', str(condition))
+        if not self.stream.body.offsets.known:
+            raise MessageError('length offsets are unknown', 'find them by estimator/zero')
+        follower = self.activities.follower
+        if follower.trajectory is not None:
+            return follower.ahead(delay), self.mae
+        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
+        return Setpoint.resting(inside), self.mae
+
+    def _refuse_gravity_compensation(self) -> None:
+        if self.settings.method == 'float':
+            raise MessageError('floating', 'a hand moves the arm; set another method first')

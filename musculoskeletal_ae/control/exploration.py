@@ -16,12 +16,15 @@ there most.
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import msc_compensation
-from musculoskeletal_ae.control.posture import Ramp, Step
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
+from musculoskeletal_ae.control.ramps import Goal, LengthRamps, Ramp
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import shown
@@ -33,13 +36,16 @@ TRIES = 1000
 SMALL = 1e-9  # [N·m]
 PRESSES = 10  # T_const, of which the one is taken that presses most towards limits
 
-# of gentle motion
-SPEED = 0.05  # [m/s] of a command, at most
-DURATION, REST = 1.5, 0.25  # [s] of a step and after it
-REACH = 0.7  # [rad] of a step, each joint; times RACK [m] of what slides
-INSIDE = 0.1  # of the joint range that goals keep from its ends
-GOALS = 20  # goals, of which the first is taken that can be held
-SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
+
+class Step(NamedTuple):
+    """One step of the exploration."""
+
+    method: str  # 'first' or 'second'
+    theta: Array  # θ_target [rad], (D,)
+    # T_const [N] of `first`, (M,); of `second`, which takes the tension of the moment, what the
+    # geometric model expects that to be
+    tension: Array
+    duration: float  # [s]
 
 
 class Exploration:
@@ -50,10 +56,14 @@ class Exploration:
         self._robot, self._rng = robot, np.random.default_rng([seed, 0xE8])
         self.to_limits = to_limits
 
+    def use(self, robot: Robot, to_limits: float) -> None:
+        """Draw targets that this robot can hold without its isolated muscles."""
+        self._robot, self.to_limits = robot, to_limits
+
     def __iter__(self) -> Iterator[Step]:
-        robot = self._robot
-        bias = np.full(robot.muscle_count, robot.tension.bias)
         while True:
+            robot = self._robot
+            bias = np.full(robot.muscle_count, robot.tension.bias)
             postures = (self._posture() for _ in range(TRIES))
             ((theta, holding),) = holdable_postures(robot, postures, 1)
             constant = self._constant_tension(theta)
@@ -104,59 +114,30 @@ def holdable_postures(
     )
 
 
-def gentle_limit(robot: Robot) -> Array:
-    """Return the tension [N] (M,) that no muscle exceeds while zeros are unknown."""
-    return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
+class Exploring:
+    """The activity of exploring: one random step after the other, by ramps of lengths."""
 
+    def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
+        self.stream, self.ramps = exploration, ramps
+        self._steps: Iterator[Step] | None = None
+        self.theta: Array | None = None  # the target of the moment [rad], (D,)
 
-class GentleMotion:
-    """Gentle motion while the zeros of the lengths are unknown: slow, near, on differences only.
+    def enter(self, inputs: Inputs) -> None:
+        """Begin with a new posture, or go on after a pause, from how the muscles pull now."""
+        self.ramps.start_from(inputs.length)
+        self._steps = self._steps or iter(self.stream)
 
-        l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command; a RobotDescriptionError says that too little can be held."""
+        assert self._steps is not None
+        if self.ramps.is_over_after(inputs.dt):
+            step = next(self._steps)
+            self.theta = step.theta
+            constant = step.tension if step.method == 'first' else None
+            effort = np.zeros_like(step.theta)
+            self.ramps.pursue([Goal(step.method, step.theta, effort, step.duration, constant)])
+        return self.ramps.step(inputs)
 
-    uses lengths only relative to those of the moment, so that zeros cancel; θ_est may be off, and G
-    with it, which muscle stiffness control takes as some more or less tension, below the limit.
-    Goals lie all over the joint range, but each is approached by a short step and held by random
-    tensions: the muscles see many postures and tensions, from different sides, as finding the zeros
-    needs, since how G turns tension into torque tells the posture.
-    """
-
-    def __init__(self, robot: Robot, seed: int = 0) -> None:
-        self._robot, self._rng = robot, np.random.default_rng([seed, 0x6E])
-        self.start()
-
-    def start(self) -> None:
-        """Begin anew, from wherever the arm is."""
-        self._ramp: Ramp | None = None
-        self._rest = 0.0
-
-    def step(
-        self, mae: Mae, tension: Array, length: Array, theta: Array, command: Array, dt: float
-    ) -> Array:
-        """Return the next command, after the last one; T [N], l [m] (M,), estimated θ (D,)."""
-        if self._ramp is None or (self._ramp.done and self._rest >= REST):
-            goal = self._goal(mae, tension, length, theta)
-            self._ramp, self._rest = Ramp(command, goal, DURATION, SPEED), 0.0
-        if self._ramp.done:
-            self._rest += dt
-        return self._ramp.step(dt)
-
-    def _goal(self, mae: Mae, tension: Array, length: Array, theta: Array) -> Array:
-        robot, limits = self._robot, (self._robot.tension.bias, gentle_limit(self._robot))
-        best, pull, least = theta, tension, np.inf
-        radian = robot.kinematics.radian
-        for goal in robot.random_postures(GOALS, self._rng, -INSIDE):
-            near = theta + np.clip(goal - theta, -REACH * radian, REACH * radian)
-            programme = TensionProgramme(
-                mae.muscle_jacobian(near, tension), robot.kinematics.holding_torque(near), *limits
-            )
-            try:
-                pull = programme.nearest(self._rng.uniform(*limits, robot.muscle_count))
-                best = near
-                break
-            except InfeasibleError:
-                exertion = programme.compromise()
-                if (missing := float(np.abs(radian * exertion.missing_torque).max())) < least:
-                    best, pull, least = near, exertion.tension, missing
-        now = length - mae.lengths(theta, tension)
-        return now + mae.lengths(best, pull) + msc_compensation(robot, pull)
+    def leave(self) -> None:
+        """End; the next time begins with another posture."""
+        self._steps = self.theta = None

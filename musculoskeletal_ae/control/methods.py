@@ -9,7 +9,7 @@
 
 (paper, section "Control"). MSC holds T = T_bias + max(0, K_stiff (l − l_target)), so l_comp is how
 far the command must lie below the length for the muscle to carry T there. `stiffness` chooses T for
-a joint stiffness (`stiffness_command`), `tension` commands tensions, no lengths (`TorqueControl`).
+a joint stiffness (`stiffness_command`); `tension` commands tensions, no lengths (`torque`).
 
 `proposed` of preset `paper` is as printed: descend from z = ①(θ_target, T_current) on
 
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
 from musculoskeletal_ae.mae.mae import Mae
@@ -55,14 +55,6 @@ LEVELS = 8  # tensions between T_bias and limit at which the elongation is read
 # [rad] for the slope of G; small against the bends of a route, large against errors of the MAE.
 STEP = 0.05
 
-# `tension`
-SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
-
-# `float`; as of a pinion of radius RACK where a joint slides
-BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
-DAMPING = 1.0  # [N·m·s/rad]
-WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
-
 
 class JointStiffness(NamedTuple):
     """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad]."""
@@ -79,11 +71,6 @@ class Solution(NamedTuple):
     tension: Array  # T [N], (M,)
     missing_torque: Array  # torque that no tension within its limits gives [N·m], (D,)
     stiffness: JointStiffness | None = None  # of the method `stiffness` alone
-
-
-def msc_compensation(robot: Robot, tension: Array) -> Array:
-    """Return l_comp(T) [m], shape (..., M); zero at T_bias, negative above it."""
-    return -(tension - robot.tension.bias) / robot.stiffness
 
 
 def geometric_command(robot: Robot, theta: Array) -> Array:
@@ -281,79 +268,3 @@ def _extreme(
             break
         best, tension = values[k], steps[k]
     return sign * best
-
-
-class TorqueControl:
-    """Joint torque by muscle tension, moment by moment: the method `tension`.
-
-        τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
-        T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
-
-    with G from the MAE at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the
-    estimate, smoothed. Where a joint slides, K_p and K_d are those of a pinion of radius RACK. With
-    both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
-    floats and keeps no posture.
-    """
-
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self._robot, self.settings = robot, settings
-        #: what the tensions of the last step do not deliver [N·m], (D,)
-        self.missing_torque: Array = np.zeros(robot.joint_count)
-        self.start_from(np.full(robot.muscle_count, robot.tension.bias))
-
-    def start_from(self, tension: Array) -> None:
-        """Continue from tensions [N] (M,), at the start, after a stop or another method."""
-        self._command: Array = np.maximum(tension, self._robot.tension.bias)
-        self._smooth: Array | None = None
-
-    def step(
-        self, mae: Mae, theta: Array, target: Array, effort: Array, limit: Array, dt: float
-    ) -> Array:
-        """Return the tensions to command [N], at most `limit` (M,), dt [s] after the last ones.
-
-        θ is estimated, the target and it [rad] (D,); effort is torque beyond the weight [N·m] (D,).
-        """
-        chosen, robot = self.settings, self._robot
-        before = theta if self._smooth is None else self._smooth
-        self._smooth = smooth = before + dt / (dt + SMOOTHING) * (theta - before)
-        velocity = (theta - smooth) / SMOOTHING
-        torque = robot.kinematics.holding_torque(smooth) + effort
-        torque = torque + self._feedback(smooth, velocity, target)
-        jacobian = mae.muscle_jacobian(smooth, self._command)
-        tension, self.missing_torque = least_tension(jacobian, torque, robot.tension.bias, limit)
-        # All muscles change by the same share: between two tensions that hold the arm, it is held.
-        change = tension - self._command
-        fastest = robot.stiffness * chosen.rate_limit * dt
-        share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
-        self._command = self._command + change * share
-        return self._command.copy()
-
-    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        """Return the torque by posture and velocity [N·m], (D,)."""
-        chosen, radian = self.settings, self._robot.kinematics.radian
-        torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
-        return torque / radian**2
-
-
-class FloatControl(TorqueControl):
-    """The arm's weight is carried, and a hand moves the arm: the method `float`.
-
-        τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
-        θ_held ← clip(θ_held, θ − BAND, θ + BAND)
-
-    The spring to θ_held, which comes along once it is stretched by BAND, is friction as of a joint:
-    what gravity's model leaves does not make the arm creep. Clip is to WALL_AT inside the limits.
-    """
-
-    def start_from(self, tension: Array) -> None:
-        """Hold where the arm is at the next step, from tensions [N] (M,)."""
-        super().start_from(tension)
-        self.held: Array | None = None  # θ_held [rad], (D,)
-
-    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian
-        band, edge = BAND * radian, WALL_AT * radian
-        held = target if self.held is None else np.clip(self.held, theta - band, theta + band)
-        self.held = np.clip(held, low, high)
-        wall = np.clip(theta, low + edge, high - edge) - theta
-        return (HOLD * (held - theta) - DAMPING * velocity + WALL * wall) / radian**2

@@ -84,6 +84,7 @@ class LengthRamps:
         self._remaining = 0.0  # [s] of its time
         self._ramp: Ramp | None = None
         self._command: Array = np.zeros(robot.muscle_count)
+        self._tension: Array = robot.tension.bias  # that the goal began with [N], (M,)
         self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
         self.solution: Solution | None = None
 
@@ -91,10 +92,9 @@ class LengthRamps:
         """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
         self._robot, self._settings = robot, settings
 
-    @property
-    def is_over(self) -> bool:
-        """Whether the time of the last goal has passed."""
-        return self._remaining <= 0.0 and not self._goals
+    def is_over_after(self, dt: float) -> bool:
+        """Return whether the time of the last goal will have passed in dt [s]."""
+        return self._remaining - dt <= 0.0 and not self._goals
 
     def start_from(self, command: Array) -> None:
         """Continue from a command [m] (M,), without a goal."""
@@ -108,13 +108,11 @@ class LengthRamps:
 
     def solve_again(self) -> None:
         """Solve the goal that is held anew, as with another network, and ramp to it."""
-        if self._goal is None or self._goals or self.solution is None:
+        if self._goal is None or self._ramp is None or self._goals:
             return
-        held = self._goal._replace(
-            duration=self._settings.second_duration, tension=self.solution.tension
-        )
-        self._goals = [held]
-        if self._ramp is not None and self._ramp.done:
+        duration = self._settings.second_duration
+        self._goals = [self._goal._replace(duration=duration, tension=self._tension)]
+        if self._ramp.done:
             self._remaining = 0.0
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -136,10 +134,10 @@ class LengthRamps:
         return Command(LENGTH, self._command.copy())
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
-        tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._tension = inputs.pull.motor if goal.tension is None else goal.tension
         self._goal, self._limit = goal, inputs.limit
         self.solution = None  # if the next line fails there is none
-        self.solution = self._solve(goal, inputs.mae, tension)
+        self.solution = self._solve(goal, inputs.mae, self._tension)
         length = np.where(self._robot.used, self.solution.length, self._command)
         rate_limit = self._settings.rate_limit
         self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)

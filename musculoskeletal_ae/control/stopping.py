@@ -50,13 +50,16 @@ class SafeStop:
         """Whether the last command is no longer held."""
         return self._held > self._settings.hold_time
 
-    def step(self, sample: MuscleSample, dt: float, is_fresh: bool) -> Command | None:
+    def step(
+        self, sample: MuscleSample, dt: float, is_fresh: bool, may_wind: bool
+    ) -> Command | None:
         """Return the desired command, dt [s] after the last one; None before the first.
 
         Args:
             sample: The newest muscle states.
             dt: How long the stop has gone on since the last call [s].
             is_fresh: Whether the sample still tells where the muscles are.
+            may_wind: Whether the suspect may be wound in.
         """
         last = self._limiter.command
         if last is None:
@@ -66,6 +69,7 @@ class SafeStop:
             return last
         winds = (
             self.suspect is not None
+            and may_wind
             and is_fresh
             and self._held > self._settings.hold_time + PAYING_OUT
         )

@@ -53,8 +53,12 @@ class Event(Enum):
     RESET = 'controller/reset without a cause present'
 
 
-#: activities that a latched stop ends for good: afterwards the arm holds instead
-ENDED_BY_A_STOP = (Activity.MOVING, Activity.EXPLORING, Activity.CALIBRATING)
+#: activities that a latched stop ends for good, and what the arm does afterwards instead
+AFTER_A_STOP = {
+    Activity.MOVING: Activity.HOLDING,
+    Activity.EXPLORING: Activity.IDLE,
+    Activity.CALIBRATING: Activity.IDLE,
+}
 
 _S, _E = StopState, Event
 #: the complete table: (state, event) → state; any other event leaves the state as it is
@@ -110,6 +114,11 @@ class Supervisor:
         return self.state in (StopState.STOPPED, StopState.VERIFYING, StopState.RESUMING)
 
     @property
+    def may_wind_suspect(self) -> bool:
+        """Whether a suspect muscle may be wound in; an operator's stop outranks that."""
+        return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
+
+    @property
     def explores(self) -> bool:
         """Whether random targets are being generated."""
         return self.activity in (Activity.EXPLORING, Activity.CALIBRATING)
@@ -122,8 +131,8 @@ class Supervisor:
         The arm does not start to move or explore with the end of a stop: it holds its last target.
         Nor does it explore again after the stop, once something else was requested.
         """
-        if self.is_latched and activity in ENDED_BY_A_STOP:
-            activity = Activity.HOLDING
+        if self.is_latched:
+            activity = AFTER_A_STOP.get(activity, activity)
         self.activity, self._explored = activity, False
 
     def on_offsets(self, known: bool) -> None:
@@ -207,8 +216,8 @@ class Supervisor:
             self._causes.clear()
             if resumed:
                 self.activity = Activity.EXPLORING
-        elif self.is_latched and self.activity in ENDED_BY_A_STOP:
-            self.activity = Activity.HOLDING
+        elif self.is_latched:
+            self.activity = AFTER_A_STOP.get(self.activity, self.activity)
 
 
 def diagram() -> str:

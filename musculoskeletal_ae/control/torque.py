@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tensions that exert a joint torque, moment by moment: methods `tension` and `float`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import TENSION, Command
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+
+SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
+
+# Gravity compensation; as of a pinion of radius RACK where a joint slides.
+BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
+DAMPING = 1.0  # [N·m·s/rad]
+WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
+
+
+class TorqueControl:
+    """Joint torque by muscle tension: the method `tension`.
+
+        τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
+        T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
+
+    with G from the network at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the
+    estimate, smoothed. Where a joint slides, K_p and K_d are those of a pinion of radius RACK. With
+    both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
+    keeps no posture.
+
+    Attributes:
+        missing_torque: What the tensions of the last step do not deliver [N·m], (D,).
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        self._command: Array = robot.tension.bias
+        self._smooth: Array | None = None  # θ [rad], (D,)
+        self.use(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Control this robot, whose isolated muscles pull nothing, by these settings."""
+        self._robot, self._settings = robot, settings
+
+    def set_target(self, theta: Array, effort: Array) -> None:
+        """Go to a posture [rad] (D,) and exert a torque beyond the weight [N·m] (D,)."""
+        self._target = theta, effort
+
+    def enter(self, inputs: Inputs) -> None:
+        """Begin from how the muscles pull now."""
+        self._command = np.maximum(inputs.tension, self._robot.tension.bias)
+        self._smooth = None
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the tensions to command, or None without a target."""
+        if self._target is None:
+            return None
+        return self._command_towards(*self._target, inputs)
+
+    def leave(self) -> None:
+        """End; the target stays, for the next time."""
+
+    def _command_towards(self, target: Array, effort: Array, inputs: Inputs) -> Command:
+        robot, dt = self._robot, inputs.dt
+        before = inputs.theta if self._smooth is None else self._smooth
+        self._smooth = smooth = before + dt / (dt + SMOOTHING) * (inputs.theta - before)
+        velocity = (inputs.theta - smooth) / SMOOTHING
+        torque = robot.kinematics.holding_torque(smooth) + effort
+        torque = torque + self._feedback(smooth, velocity, target)
+        jacobian = inputs.mae.muscle_jacobian(smooth, self._command)
+        tension, self.missing_torque = least_tension(
+            jacobian, torque, robot.tension.bias, inputs.limit
+        )
+        # All muscles change by the same share: between two tensions that hold the arm, it is held.
+        change = tension - self._command
+        fastest = robot.stiffness * self._settings.rate_limit * dt
+        share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
+        self._command = self._command + change * share
+        return Command(TENSION, self._command.copy())
+
+    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
+        """Return the torque by posture and velocity [N·m], (D,)."""
+        chosen, radian = self._settings, self._robot.kinematics.radian
+        torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
+        return torque / radian**2
+
+
+class GravityCompensation(TorqueControl):
+    """The arm's weight is carried, and a hand moves the arm: the method `float`.
+
+        τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
+        θ_held ← clip(θ_held, θ − BAND, θ + BAND)
+
+    The spring to θ_held, which comes along once it is stretched by BAND, acts as the friction of a
+    joint: what the model of gravity leaves does not make the arm creep. Clip is to WALL_AT inside
+    the limits.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        super().__init__(robot, settings)
+        self._held: Array | None = None  # θ_held [rad], (D,)
+
+    def enter(self, inputs: Inputs) -> None:
+        """Hold where the arm is, from how the muscles pull now."""
+        super().enter(inputs)
+        self._held = None
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the tensions to command."""
+        return self._command_towards(inputs.theta, np.zeros_like(inputs.theta), inputs)
+
+    def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
+        low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian
+        band, edge = BAND * radian, WALL_AT * radian
+        held = target if self._held is None else np.clip(self._held, theta - band, theta + band)
+        self._held = np.clip(held, low, high)
+        wall = np.clip(theta, low + edge, high - edge) - theta
+        return (HOLD * (self._held - theta) - DAMPING * velocity + WALL * wall) / radian**2
