@@ -183,9 +183,12 @@ say "logs in $logs"
 declare -A name_of=() # by pid
 
 launch() { # NAME ARGUMENT…
-  # If this script is killed with SIGKILL, the kernel ends what it started. The interpreter is named,
-  # because a #! line cannot name a path with a space in it.
-  setpriv --pdeathsig TERM "$python" "$executables/$1" "${@:2}" </dev/null &
+  # If this script is killed with SIGKILL, the kernel ends what it started, or sh does, if that
+  # happened before the kernel knew. The interpreter is named, because a #! line cannot name a path
+  # with a space in it.
+  # shellcheck disable=SC2016  # it is for sh to expand
+  setpriv --pdeathsig TERM sh -c '[ "$PPID" = "$0" ] && exec "$@"' $$ \
+    "$python" "$executables/$1" "${@:2}" </dev/null &
   name_of[$!]=$1
 }
 
