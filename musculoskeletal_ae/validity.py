@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which messages are used: the rules of validity (doc/interface.md), without ROS.
+"""What a message must be to be used (doc/interface.md): one function for each kind, without ROS.
 
-Messages are told by their fields, so that the rules hold for a live message and for one of a bag
-alike. What breaks a rule raises `MessageError` with a short reason; who reads counts it and lives
-on. A JointState is matched by name in any order, a Float64MultiArray by length and, where given,
-layout.
+A function takes a message by its fields alone, a live one or one of a bag, and returns numbers.
+A message that breaks a rule raises a `MessageError` with a short reason; the caller counts it and
+goes on.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,32 +17,54 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 
-# Far more than any arm has; what is longer is refused before it is looked at.
-MOST_ENTRIES = 10_000
-# What a hand can take [N], [N·m]: a third of what the emulated arms do, any axis and posture.
-MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
-MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the hand
+MOST_ENTRIES = 10_000  # far more than any arm has; a longer message is refused unread
+MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
+MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the end effector
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] that an accelerometer reads on an arm
 LAST_VELOCITY = 1e-6  # [rad/s] at which a trajectory ends
 MOST_EFFORT = 1000.0  # [N·m] asked of one joint
-MOST_IGNORED = 1e6  # of what does not count; a power of more overflows
+MOST_ISOLATED = 1e6  # of a value of an isolated muscle; powers of a larger one overflow
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
-def read_array(
-    message: Any,
-    rows: int,
-    columns: int,
-    ignored: Sequence[int] | Ints = (),
-    unknown: float = 0.0,
-) -> Array:
-    """Return the data of a Float64MultiArray as (rows, columns); rows = 1 gives (columns,).
+def read_array(message: Any, rows: int, columns: int) -> Array:
+    """Return the data of a Float64MultiArray, all finite, as (rows, columns).
 
-    Three rows are the `QUANTITIES`, of which a temperature may be NaN, where it is not measured.
-    Of ignored columns nothing counts: what is not finite there, or as good as infinite, is returned
-    as `unknown`, a temperature as NaN.
+    One row gives (columns,). The layout may be empty; what it states must match.
     """
+    values = _values(message, rows, columns)
+    finite = np.isfinite(values)
+    if not finite.all():
+        raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')
+    return values[0] if rows == 1 else values
+
+
+def read_muscle_states(
+    message: Any, muscles: int, isolated: Sequence[int] | Ints = (), unknown: float = 0.0
+) -> Array:
+    """Return the rows `QUANTITIES` of a Float64MultiArray, (3, M).
+
+    A temperature that is not measured is NaN. What isolated muscles say does not count: what is
+    not finite there, or beyond MOST_ISOLATED, is returned as `unknown`, a temperature as NaN.
+    """
+    values = _values(message, len(QUANTITIES), muscles)
+    usable = np.isfinite(values)
+    if len(isolated) == 0 and usable.all():
+        return values
+    replaced = ~(np.abs(values) < MOST_ISOLATED) & np.isin(np.arange(muscles), isolated)
+    values[replaced] = unknown
+    values[2, replaced[2]] = np.nan
+    usable |= replaced
+    usable[2] |= np.isnan(values[2])
+    if not usable.all():
+        row, muscle = np.argwhere(~usable)[0]
+        raise MessageError('not finite', f'{QUANTITIES[row]} of muscle {muscle}')
+    return values
+
+
+def _values(message: Any, rows: int, columns: int) -> Array:
+    """Return the data of a Float64MultiArray (rows, columns) whose size and layout are right."""
     count = len(message.data)
     if count > MOST_ENTRIES:
         raise MessageError('oversized', f'{count} values, at most {MOST_ENTRIES}')
@@ -50,44 +72,67 @@ def read_array(
         raise MessageError('empty', f'no values, expected {rows * columns}')
     if count != rows * columns:
         raise MessageError('wrong length', f'{count} values, not {rows * columns}')
-    given = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
+    stated = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
     legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
-    # Without labels or strides the sizes alone say the layout; what is given must match.
-    fits = len(given) == len(legal) and all(
-        label in ('', name) and size == count and stride in (0, step)
-        for (label, size, stride), (name, count, step) in zip(given, legal)
+    fits = len(stated) == len(legal) and all(
+        label in ('', name) and size == length and stride in (0, step)
+        for (label, size, stride), (name, length, step) in zip(stated, legal)
     )
-    if given and not fits:
-        raise MessageError('wrong layout', f'{given}; expected {legal}')
+    if stated and not fits:
+        raise MessageError('wrong layout', f'{stated}; expected {legal}')
     if message.layout.data_offset != 0:
         raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
-    values = np.array(message.data, dtype=float)
-    finite = np.isfinite(values)
-    shape = (rows, columns) if rows > 1 else columns
-    if not len(ignored) and np.count_nonzero(finite) == count:
-        return values.reshape(shape)
-    sound = np.abs(values) < MOST_IGNORED
-    left_out = ~sound & np.tile(np.isin(np.arange(columns), ignored), rows)
-    values[left_out], finite[left_out] = unknown, True
-    if rows == len(QUANTITIES):  # a module without a thermometer says NaN: not known
-        values[2 * columns :][left_out[2 * columns :]] = np.nan
-        finite[2 * columns :] |= np.isnan(values[2 * columns :])
-    if not finite.all():
-        raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')
-    return values.reshape(shape)
+    return np.array(message.data, dtype=float).reshape(rows, columns)
 
 
-def read_joints(
-    message: Any, joints: Sequence[str], foreign_allowed: bool, some: bool = False
-) -> dict[str, tuple[float, float]]:
-    """Return name → (position, effort) of the listed joints in a JointState; no effort is 0.
+def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
+    """Return θ [rad] (D,) of a measured JointState; joints are matched by name, others ignored.
 
-    Where foreign joints are allowed (`joint_states`), those the robot does not list are ignored,
-    and all that it lists are asked for, unless `some` are enough; else (targets) they are refused,
-    and a subset will do.
+    All listed joints must be there; with `some` one is enough, and the others are NaN. Velocities
+    and efforts do not count: drivers say NaN where they measure none.
     """
-    names, efforts, speeds = list(message.name), message.effort, message.velocity
-    counts = len(names), len(message.position), len(efforts), len(speeds)
+    names = _joint_names(message)
+    index = {name: i for i, name in enumerate(names)}
+    known = [name for name in joints if name in index]
+    if len(index) < len(names):
+        for name in known:
+            if names.count(name) > 1:
+                raise MessageError('duplicate joint', repr(name))
+    if len(known) < (1 if some else len(joints)):
+        missing = ', '.join(name for name in joints if name not in index)
+        raise MessageError('missing joint', missing)
+    position = [message.position[index[name]] if name in index else np.nan for name in joints]
+    theta = np.array(position, dtype=float)
+    if np.count_nonzero(np.isfinite(theta)) < len(known):
+        raise MessageError('not finite', 'a position')
+    return theta
+
+
+def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return name → (position, effort) of a JointState that asks for a posture of some joints.
+
+    Without efforts they are 0.
+    """
+    names = _joint_names(message)
+    listed = set(joints)
+    if unknown := [name for name in names if name not in listed]:
+        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise MessageError('duplicate joint', repr(name))
+    efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
+    if len(too_large := efforts[np.abs(efforts) > MOST_EFFORT]):
+        raise MessageError('oversized', f'effort {too_large[0]:g}, at most {MOST_EFFORT:g}')
+    for values in (message.position, efforts, message.velocity):
+        if not np.isfinite(np.asarray(values, dtype=float)).all():
+            raise MessageError('not finite', 'a position, effort or velocity')
+    return dict(zip(names, zip(message.position, efforts.tolist())))
+
+
+def _joint_names(message: Any) -> list[str]:
+    """Return the names in a JointState whose arrays have matching lengths."""
+    names = list(message.name)
+    counts = len(names), len(message.position), len(message.effort), len(message.velocity)
     if max(counts) > MOST_ENTRIES:
         raise MessageError('oversized', f'{max(counts)} entries, at most {MOST_ENTRIES}')
     if not names:
@@ -96,58 +141,21 @@ def read_joints(
         raise MessageError(
             'wrong length', '{} names, {} positions, {} efforts, {} velocities'.format(*counts)
         )
-    listed = set(joints)
-    unknown = [name for name in names if name not in listed]
-    if unknown and not foreign_allowed:
-        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
-    values: dict[str, tuple[float, float]] = {}
-    for i, name in enumerate(names):
-        if name not in listed:
-            continue
-        if name in values:
-            raise MessageError('duplicate joint', repr(name))
-        # Drivers say NaN for a velocity or effort they do not measure; only a target's counts.
-        effort = efforts[i] if len(efforts) and not foreign_allowed else 0.0
-        if abs(effort) > MOST_EFFORT:
-            raise MessageError('oversized', f'effort {effort:g}, at most {MOST_EFFORT:g}')
-        values[name] = (message.position[i], effort)
-    if foreign_allowed and len(values) < (1 if some else len(joints)):
-        missing = [name for name in joints if name not in values]
-        raise MessageError('missing joint', ', '.join(missing))
-    if not np.isfinite(list(values.values())).all() or not (
-        foreign_allowed or np.isfinite(np.asarray(speeds, dtype=float)).all()
-    ):
-        raise MessageError('not finite', 'a position, effort or velocity')
-    return values
-
-
-def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
-    """Return θ [rad] (D,) of a JointState that has all listed joints, others ignored.
-
-    Where `some` are enough, the others are NaN.
-    """
-    count, others = len(joints), {len(message.velocity), len(message.effort)}
-    # As nearly all messages are; the other way says what is wrong, and takes its time.
-    if [*message.name] == [*joints] and len(message.position) == count and others <= {0, count}:
-        theta = np.array(message.position, dtype=float)
-        if np.count_nonzero(np.isfinite(theta)) == count:
-            return theta
-    values = read_joints(message, joints, foreign_allowed=True, some=some)
-    return np.array([values[name][0] if name in values else np.nan for name in joints])
+    return names
 
 
 def read_names(message: Any) -> list[str]:
-    """Return the names in a String, with commas between; they may have spaces within."""
+    """Return the names in a String: separated by commas, with spaces only inside a name."""
     return [name for part in message.data.split(',') if (name := part.strip())]
 
 
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
     """Return the link and the acceleration [m/s²] (3,) of an Imu, whose frame is that link."""
-    link, read = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
+    link, vector = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
     if link not in links:
-        told = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
-        raise MessageError('wrong frame', told)
-    acceleration = np.array([read.x, read.y, read.z])
+        problem = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
+        raise MessageError('wrong frame', problem)
+    acceleration = np.array([vector.x, vector.y, vector.z])
     if not np.isfinite(acceleration).all():
         raise MessageError('not finite', 'an acceleration')
     norm = float(np.linalg.norm(acceleration))
@@ -181,8 +189,8 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     """
     names, points = list(message.joint_names), list(message.points)
     if len(names) * max(len(points), 1) > MOST_ENTRIES:
-        told = f'{len(points)} points of {len(names)} joints, at most {MOST_ENTRIES} values'
-        raise MessageError('oversized', told)
+        problem = f'{len(points)} points of {len(names)} joints, at most {MOST_ENTRIES} values'
+        raise MessageError('oversized', problem)
     if not points:
         return None
     if not names:
@@ -197,8 +205,8 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
         lengths = {len(row) for row in rows}
         legal = {len(names)} if what == 'positions' else {0, len(names)}
         if len(lengths) > 1 or not lengths <= legal:
-            told = f'{what} of {sorted(lengths)} values at the points, for {len(names)} joints'
-            raise MessageError('wrong length', told)
+            problem = f'{what} of {sorted(lengths)} values at the points, for {len(names)} joints'
+            raise MessageError('wrong length', problem)
         columns[what] = None if 0 in lengths else np.array([list(row) for row in rows], dtype=float)
     position, velocity, acceleration, effort = columns.values()
     assert position is not None

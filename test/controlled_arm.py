@@ -10,7 +10,7 @@ from musculoskeletal_ae.control.watch import LONGEST_STEP
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_array, read_muscle_states
 
 RATE_LIMIT = 0.2  # [m/s]
 NODES = {
@@ -85,7 +85,7 @@ class ControlledArm:
         return np.array(self.graph.next('joint_states').position)
 
     def tension(self):
-        return read_array(self.graph.next('muscle_states'), 3, self.robot.muscle_count)[1]
+        return read_muscle_states(self.graph.next('muscle_states'), self.robot.muscle_count)[1]
 
     def goes_to(self, theta, within=0.3):
         theta = np.asarray(theta)

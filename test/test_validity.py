@@ -17,10 +17,11 @@ from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.validity import (
     read_array,
     read_imu,
-    read_joints,
+    read_muscle_states,
     read_names,
     read_pose,
     read_posture,
+    read_target,
     read_trajectory,
     read_twist,
     read_wrench,
@@ -60,44 +61,57 @@ def test_names_have_commas_between_and_may_have_spaces_within():
     ('message', 'reason'),
     [
         (muscle_array([]), 'empty'),
-        (muscle_array([1.0]), 'wrong length'),
         (muscle_array([1.0] * 7), 'wrong length'),
         (muscle_array([0.0] * 1_000_000), 'oversized'),
-        (muscle_array([1.0, 2.0, 3.0, float('nan'), 5.0, 6.0]), 'not finite'),
-        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('inf')]), 'not finite'),
-        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, float('-inf')]), 'not finite'),
+        (muscle_array([1.0, 2.0, 3.0, math.nan, 5.0, 6.0]), 'not finite'),
+        (muscle_array([1.0, 2.0, 3.0, 4.0, 5.0, math.inf]), 'not finite'),
         (muscle_array([0.0] * 6, [2, 3]), 'wrong layout'),
-        (muscle_array([0.0] * 6, [6]), 'wrong layout'),
         (muscle_array([0.0] * 6, [3, 2], [6, 3]), 'wrong layout'),
         (muscle_array([0.0] * 6, offset=1), 'wrong layout'),
+        (array_message(np.zeros((3, 2)), 'muscle', 'quantity'), 'wrong layout'),
     ],
 )
 def test_a_wrong_array_is_rejected_by_reason(message, reason):
-    with pytest.raises(MessageError) as error:
-        read_array(message, 3, 2)
-    assert error.value.reason == reason
+    for read in (lambda: read_array(message, 3, 2), lambda: read_muscle_states(message, 2)):
+        with pytest.raises(MessageError) as error:
+            read()
+        assert error.value.reason == reason
+
+
+def test_labels_of_a_layout_may_be_empty():
+    assert read_array(array_message(np.zeros((3, 3)), '', ''), 3, 3).shape == (3, 3)
 
 
 def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
-    values = [1.0, 2.0, 3.0, 4.0, float('nan'), 25.0]
-    np.testing.assert_array_equal(read_array(muscle_array(values), 3, 2).ravel(), values)
+    values = [1.0, 2.0, 3.0, 4.0, math.nan, 25.0]
+    np.testing.assert_array_equal(read_muscle_states(muscle_array(values), 2).ravel(), values)
+    with pytest.raises(MessageError, match='tension of muscle 1'):
+        read_muscle_states(muscle_array([1.0, 2.0, 3.0, math.nan, 25.0, 25.0]), 2)
+
+
+@pytest.mark.parametrize('unknown', [0.0, math.nan])
+def test_what_isolated_muscles_say_does_not_count(unknown):
+    legal = [[unknown, 2.0], [3.0, 4.0], [math.nan, 25.0]]
+    broken = muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0])
+    np.testing.assert_array_equal(read_muscle_states(broken, 2, [0], unknown), legal)
+    absurd = muscle_array([1e80, 2.0, 3.0, 4.0, -1e300, 25.0])
+    np.testing.assert_array_equal(read_muscle_states(absurd, 2, [0], unknown), legal)
+    np.testing.assert_array_equal(read_muscle_states(absurd, 2).ravel(), absurd.data)
     with pytest.raises(MessageError, match='not finite'):
-        read_array(muscle_array([float('nan'), 2.0]), 1, 2)
-    ignored = read_array(muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0]), 3, 2, [0])
-    np.testing.assert_array_equal(ignored, [[0.0, 2.0], [3.0, 4.0], [math.nan, 25.0]])
-    absurd = muscle_array([1e80, 2.0, -1e300, 4.0, 1e7, 25.0])
-    np.testing.assert_array_equal(read_array(absurd, 3, 2, [0]), ignored * [[1, 1], [0, 1], [1, 1]])
-    np.testing.assert_array_equal(read_array(absurd, 3, 2).ravel(), absurd.data)
+        read_muscle_states(broken, 2, [1])
 
 
-def test_joints_are_matched_by_name_and_foreign_ones_ignored():
-    message = JointState(name=['b', 'x', 'a'], position=[2.0, float('nan'), 1.0])
+def test_measured_joints_are_matched_by_name_and_foreign_ones_ignored():
+    message = JointState(name=['b', 'x', 'a'], position=[2.0, math.nan, 1.0])
+    message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3  # measured by nobody
     assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
 
 
-def test_an_effort_nobody_measures_does_not_reject_a_measurement():
-    message = JointState(name=['a', 'b'], position=[1.0, 2.0], effort=[float('nan')] * 2)
-    assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
+def test_a_measurement_of_some_joints_leaves_the_others_open():
+    message = JointState(name=['x', 'b'], position=[1.0, 2.0])
+    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
+    with pytest.raises(MessageError, match='a, b'):
+        read_posture(JointState(name=['x'], position=[1.0]), JOINTS, some=True)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +122,9 @@ def test_an_effort_nobody_measures_does_not_reject_a_measurement():
         (JointState(name=['a', 'b', 'a'], position=[1.0, 2.0, 3.0]), 'duplicate joint'),
         (JointState(name=['a', 'b'], position=[1.0]), 'wrong length'),
         (JointState(name=['a', 'b'], position=[1.0, 2.0], effort=[1.0]), 'wrong length'),
-        (JointState(name=['a', 'b'], position=[1.0, float('inf')]), 'not finite'),
+        (JointState(name=['a', 'b'], position=[1.0, math.inf]), 'not finite'),
         (JointState(name=['x'] * 20_000, position=[0.0] * 20_000), 'oversized'),
+        (JointState(name=['a', 'b'], position=[0.0] * 2, velocity=[0.0] * 20_000), 'oversized'),
     ],
 )
 def test_a_wrong_measurement_is_rejected_by_reason(message, reason):
@@ -118,69 +133,39 @@ def test_a_wrong_measurement_is_rejected_by_reason(message, reason):
     assert error.value.reason == reason
 
 
-def test_a_measurement_of_some_joints_leaves_the_others_open():
-    message = JointState(name=['x', 'b'], position=[1.0, 2.0])
-    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
-    with pytest.raises(MessageError, match='a, b'):
-        read_posture(JointState(name=['x'], position=[1.0]), JOINTS, some=True)
-
-
 def test_a_target_may_name_a_subset_and_effort():
     message = JointState(name=['b'], position=[2.0], effort=[3.0])
-    assert read_joints(message, JOINTS, foreign_allowed=False) == {'b': (2.0, 3.0)}
+    assert read_target(message, JOINTS) == {'b': (2.0, 3.0)}
+    assert read_target(JointState(name=['b'], position=[2.0]), JOINTS) == {'b': (2.0, 0.0)}
 
 
 @pytest.mark.parametrize(
     ('message', 'reason'),
     [
+        (JointState(), 'empty'),
         (JointState(name=['x'], position=[1.0]), 'unknown joint'),
         (JointState(name=['a', 'a'], position=[1.0, 1.0]), 'duplicate joint'),
-        (JointState(name=['a'], position=[1.0], effort=[float('nan')]), 'not finite'),
-        (JointState(), 'empty'),
+        (JointState(name=['a'], position=[math.nan]), 'not finite'),
+        (JointState(name=['a'], position=[1.0], effort=[math.nan]), 'not finite'),
+        (JointState(name=['a'], position=[1.0], velocity=[math.nan]), 'not finite'),
+        (JointState(name=['a'], position=[1.0], effort=[-2000.0]), 'oversized'),
     ],
 )
 def test_a_wrong_target_is_rejected_by_reason(message, reason):
     with pytest.raises(MessageError) as error:
-        read_joints(message, JOINTS, foreign_allowed=False)
+        read_target(message, JOINTS)
     assert error.value.reason == reason
 
 
-def test_labels_that_are_given_must_match():
-    rows = np.zeros((3, 3))
-    assert read_array(array_message(rows, '', ''), 3, 3).shape == (3, 3)
-    with pytest.raises(MessageError, match='wrong layout'):
-        read_array(array_message(rows, 'muscle', 'quantity'), 3, 3)
-
-
-def test_velocities_are_counted_and_a_target_s_are_finite():
-    many = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[math.nan] * 100_000)
+@pytest.mark.parametrize(('part', 'value'), [('force', -2000.0), ('torque', 1000.0)])
+def test_a_wrench_that_no_arm_outlives_is_refused(part, value):
+    message = WrenchStamped()
+    getattr(message.wrench, part).x = value
     with pytest.raises(MessageError, match='oversized'):
-        read_joints(many, ['a', 'b'], foreign_allowed=True)
-    one = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[0.0])
-    with pytest.raises(MessageError, match='wrong length'):
-        read_joints(one, ['a', 'b'], foreign_allowed=True)
-    unmeasured = JointState(name=['a', 'b'], position=[0.0, 0.0], velocity=[math.nan] * 2)
-    assert len(read_joints(unmeasured, ['a', 'b'], foreign_allowed=True)) == 2
-    with pytest.raises(MessageError, match='not finite'):
-        read_joints(unmeasured, ['a', 'b'], foreign_allowed=False)
+        read_wrench(message, 'torso')
 
 
-def test_a_wrench_that_no_arm_outlives_is_refused():
-    for part, value in (('force', 1e6), ('force', -2000.0), ('torque', 1000.0)):
-        message = WrenchStamped()
-        getattr(message.wrench, part).x = value
-        with pytest.raises(MessageError, match='oversized'):
-            read_wrench(message, 'torso')
-
-
-def test_an_effort_that_no_joint_has_is_refused():
-    for effort in (1e308, -2000.0):
-        message = JointState(name=['a'], position=[0.0], effort=[effort])
-        with pytest.raises(MessageError, match='oversized'):
-            read_joints(message, JOINTS, foreign_allowed=False)
-
-
-def test_messages_are_told_by_their_fields_whatever_library_made_them():
+def test_messages_are_known_by_their_fields_whatever_library_made_them():
     from bags.arm_bag import ARRAY
     from bags.arm_bag import JOINTS as JOINT_STATE
     from bags.arm_bag import array as bag_array
@@ -190,9 +175,7 @@ def test_messages_are_told_by_their_fields_whatever_library_made_them():
 
     values = np.arange(6.0).reshape(3, 2)
     recorded = decode(bag_array(values), ARRAY)
-    np.testing.assert_array_equal(read_array(recorded, 3, 2), values)
-    with pytest.raises(MessageError, match='wrong length'):
-        read_array(recorded, 2, 2)
+    np.testing.assert_array_equal(read_muscle_states(recorded, 2), values)
     recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
     assert read_posture(recorded, JOINTS).tolist() == [1.0, 2.0]
 
@@ -226,12 +209,10 @@ def test_a_trajectory_is_matched_by_name_and_an_empty_one_is_none():
         (trajectory(('a', 'a')), 'duplicate joint'),
         (trajectory((), rows=((), ())), 'empty'),
         (trajectory(rows=((1.0, 2.0), (3.0,))), 'wrong length'),
-        (trajectory(rows=((), ())), 'wrong length'),
         (trajectory(velocities=((0.0, 0.0), ())), 'wrong length'),
         (trajectory(accelerations=((0.0, 0.0), (0.0, 0.0))), 'wrong length'),
         (trajectory(effort=((0.0, 0.0), (0.0, 0.0))), 'effort'),
         (trajectory(times=(1.0, 1.0)), 'times do not increase'),
-        (trajectory(times=(2.0, 1.0)), 'times do not increase'),
         (trajectory(times=(-1.0, 1.0)), 'times do not increase'),
         (trajectory(rows=((1.0, math.nan), (3.0, 4.0))), 'not finite'),
         (trajectory(velocities=((math.inf, 0.0), (0.0, 0.0))), 'not finite'),
@@ -276,7 +257,7 @@ def test_a_twist_is_in_the_root_link_finite_and_not_absurd():
 
 @pytest.mark.parametrize(
     ('acceleration', 'reason'),
-    [(math.nan, 'not finite'), (math.inf, 'not finite'), (0.1, 'no gravity'), (40.0, 'no gravity')],
+    [(math.nan, 'not finite'), (0.1, 'no gravity'), (40.0, 'no gravity')],
 )
 def test_an_acceleration_that_is_no_gravity_is_refused_with_the_reason(acceleration, reason):
     message = Imu()

@@ -20,7 +20,7 @@ from musculoskeletal_ae.bags.mcap_file import BagMessage
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.validity import MOST_ENTRIES, read_joints
+from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
 
 # A player that was suspended goes on instead of catching up on more than this.
 LONGEST_LAG = 1.0  # [s]
@@ -115,7 +115,7 @@ def shown(bag: Bag, topic: str, start: int, stop: int) -> Shown:
     for message in bag.messages([topic], start, stop):
         said = bag.decode(message)
         with suppress(MessageError):  # left out, as a node would
-            values = read_joints(said, names := sorted(said.name), foreign_allowed=False)
+            values = read_target(said, names := sorted(said.name))
             theta = np.array([values[name][0] for name in names])
             found[tuple(names)].append(((message.log_time - start) / 1e9, theta))
     joints = max(found, key=lambda names: len(found[names]), default=())

@@ -20,7 +20,7 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
 
 class Series(NamedTuple):
@@ -106,7 +106,7 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     def states(message: Any, came: float) -> Array:
         last = isolated.values and isolated.values[_latched(isolated.times, came)]
         ignored = np.flatnonzero(last)
-        return read_array(message, len(QUANTITIES), muscles, ignored)
+        return read_muscle_states(message, muscles, ignored)
 
     def rows(count: int) -> Callable[[Any, float], Array]:
         return lambda message, _: read_array(message, count, muscles)

@@ -18,7 +18,7 @@ from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.plausibility import length_range
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_posture
+from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states, read_posture
 
 RATE_TOLERANCE = 0.2
 LONGEST_GAP = 0.2  # [s], the controller's `max_age`
@@ -70,7 +70,7 @@ class Listening:
         """Take a message of muscle_states."""
         self._times.append(now)
         with self._rejecting('muscle_states'):
-            states = read_array(message, len(QUANTITIES), self._robot.muscle_count)
+            states = read_muscle_states(message, self._robot.muscle_count)
             self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:

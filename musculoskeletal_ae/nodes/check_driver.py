@@ -93,7 +93,7 @@ class CheckDriver:
         muscles = self.robot.muscle_indices(self.options.muscles or [])
         kind = load('musculoskeletal_ae.driver.winding').Winding
         winding = kind(verdict, muscles, self.options.tension)
-        read = load('musculoskeletal_ae.validity').read_array
+        read = load('musculoskeletal_ae.validity').read_muscle_states
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
@@ -105,7 +105,7 @@ class CheckDriver:
             nonlocal last, trying
             now = time.monotonic()
             try:
-                states = read(message, 3, self.robot.muscle_count)
+                states = read(message, self.robot.muscle_count)
             except MusculoskeletalError:
                 return
             last, target = now, winding.step(states, now)

@@ -35,8 +35,8 @@ from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import SETTLED
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.validity import (
-    read_joints,
     read_pose,
+    read_target,
     read_trajectory,
     read_twist,
     without_orientation,
@@ -139,7 +139,7 @@ class Controller(Shell):
         self._step()
 
     def _target(self, message: JointState) -> None:
-        self.core.target(read_joints(message, self.robot.joints, foreign_allowed=False))
+        self.core.target(read_target(message, self.robot.joints))
         warn = self.get_logger().warning
         if cause := self.core.safety.cause:
             warn(f'stopped ({cause}): the target waits for controller/reset')

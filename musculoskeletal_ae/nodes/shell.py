@@ -49,7 +49,13 @@ from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.validity import (
+    QUANTITIES,
+    read_array,
+    read_muscle_states,
+    read_names,
+    read_posture,
+)
 
 if TYPE_CHECKING:  # it needs what writes bags
     from musculoskeletal_ae.nodes.stop_recording import StopRecording
@@ -349,7 +355,7 @@ class Shell(Node):
 
         def from_one(message: Float64MultiArray) -> None:
             try:
-                states = read_array(message, *shape, self.left_out, unknown)
+                states = read_muscle_states(message, shape[1], self.left_out, unknown)
             except MessageError:
                 if unread and not intruders and len(message.data) == math.prod(shape):
                     unread(np.reshape(message.data, shape))

@@ -22,7 +22,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_joints
+from musculoskeletal_ae.validity import read_target
 
 TEMPERATURE = 25.0  # [°C]
 
@@ -80,7 +80,7 @@ class Sim(Arm):
         fixed = np.full(self.robot.joint_count, np.nan)
         if message.name or message.position or message.velocity or message.effort:
             joints = self.robot.joints
-            for name, (angle, _) in read_joints(message, joints, foreign_allowed=False).items():
+            for name, (angle, _) in read_target(message, joints).items():
                 fixed[joints.index(name)] = angle
         self.fixed = fixed
 

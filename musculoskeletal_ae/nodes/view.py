@@ -40,7 +40,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.start import load
-from musculoskeletal_ae.validity import QUANTITIES, read_array, read_names, read_posture
+from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -103,8 +103,7 @@ class View(Node):
         robot, joints = self.robot, self.robot.joints
 
         def muscles(message: Any) -> Array:
-            size = len(QUANTITIES), robot.muscle_count
-            return read_array(message, *size, self._isolated(), math.nan)
+            return read_muscle_states(message, robot.muscle_count, self._isolated(), math.nan)
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))

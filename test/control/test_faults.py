@@ -14,7 +14,7 @@ from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]
@@ -58,7 +58,7 @@ class Loop:
         try:
             data = np.concatenate(reading[1:])
             message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
-            states = read_array(message, 3, ROBOT.muscle_count)
+            states = read_muscle_states(message, ROBOT.muscle_count)
             self.controller.muscles(Muscles(*states), self.now)
             estimate = self.estimator.step(reading.tension, reading.length, self.now, self.now)
             if estimate is not None:

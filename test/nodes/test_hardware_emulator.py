@@ -15,7 +15,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def arm(graph):
 
 
 def rows(graph, robot):
-    return read_array(graph.next('muscle_states'), 3, robot.muscle_count)
+    return read_muscle_states(graph.next('muscle_states'), robot.muscle_count)
 
 
 def drive(graph, command, condition, what):

@@ -17,7 +17,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.validity import read_muscle_states
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_before_a_command_it_rests_at_the_bias(arm, arm26, core):
         ('quantity', 3, 18),
         ('muscle', 6, 6),
     ]
-    _, tension, temperature = read_array(message, 3, 6)
+    _, tension, temperature = read_muscle_states(message, 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     np.testing.assert_array_equal(temperature, 25.0)
     assert tuple(arm.next('sim/joint_states').name) == arm26.joints
@@ -134,7 +134,7 @@ def test_what_cannot_be_reached_is_said_and_bad_commands_change_nothing(arm, arm
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
-    _, tension, _ = read_array(arm.next('sim/muscle_states'), 3, 6)
+    _, tension, _ = read_muscle_states(arm.next('sim/muscle_states'), 6)
     assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
@@ -183,7 +183,7 @@ def test_as_the_robot_it_pulls_what_others_leave_out(graph, arm26, trained_file)
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
     graph.wait(lambda: shell.left_out == (1,), 'the isolation')
     graph.next('muscle_states', 2)
-    _, tension, _ = read_array(graph.received['muscle_states'][-1], 3, 6)
+    _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
     assert shell.longest_step == 1.0  # or at 2 Hz it would fall behind
 
