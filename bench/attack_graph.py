@@ -161,7 +161,7 @@ class Attack:
         own = {
             'controller': ['max_age:=1.0', 'explore:=true'],
             'learner': [f'state_directory:={self.folder / "state"}'],
-            'hardware_emulator': ['marker_rate:=10.0'],
+            'hardware_emulator': ['marker_pose_rate:=10.0'],
         }
         parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]
         if 'checkpoint' in PARAMETERS[name]:

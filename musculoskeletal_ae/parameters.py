@@ -10,9 +10,12 @@ Settings that a user may choose are a frozen dataclass whose fields say all of t
 `nodes/parameters.py` collects them into the tables of the nodes.
 """
 
-import math
+import sys
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
@@ -64,17 +67,17 @@ class Parameter:
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
         if self.is_number_list:
+            low, high = self.within or (-sys.float_info.max, sys.float_info.max)
+            legal = f'a list of finite numbers, {self.legal_values}'.removesuffix(', ')
+            # ROS makes the byte array b'' of an empty list.
+            numbers = [] if value == b'' else value
+            if hasattr(numbers, 'tolist'):  # ROS keeps lists of numbers as arrays
+                numbers = numbers.tolist()
             try:
-                # Text has digits, bytes have codes: no numbers, but for ROS's empty list, b''.
-                whole = value == b'' or not isinstance(value, str | bytes)
-                numbers = tuple(map(float, value)) if whole else (math.nan,)
-            except (TypeError, ValueError):
-                numbers = (math.nan,)
-            low, high = self.within or (-math.inf, math.inf)
-            if not all(math.isfinite(number) and low <= number <= high for number in numbers):
-                legal = f'a list of finite numbers, {self.legal_values}'.removesuffix(', ')
-                raise MusculoskeletalError(f'{value!r}; legal: {legal}')
-            return numbers
+                kind = tuple[Annotated[float, Meta(ge=low, le=high)], ...]
+                return msgspec.convert(numbers, kind)
+            except msgspec.ValidationError as error:
+                raise MusculoskeletalError(f'{value!r}; legal: {legal}') from error
         return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
 
 

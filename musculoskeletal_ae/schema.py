@@ -54,6 +54,7 @@ def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
     if 'missing required field' in problem:
         return f'{place}: key {problem.rpartition(" ")[2]!r} is missing'
     if message['key']:
+        problem = problem[0].lower() + problem[1:]
         return f'{place}: wrong key: {problem}' + f'; legal: {legal}' * bool(legal)
     if _INVALID_WORD in problem:
         return f'{place}: expected one of {legal}, got {problem.removeprefix(_INVALID_WORD)[1:]}'

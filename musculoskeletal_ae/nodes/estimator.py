@@ -118,8 +118,6 @@ class Estimator(Shell):
         detector.settings = replace(detector.settings, **{name: value})
 
     def _take_posture(self, posture: tuple[float, ...]) -> None:
-        if posture == (0.0,) and self.robot.joint_count > 1:
-            posture = ()  # what was the default once stands in files
         self.core.check_posture(posture)
         self.posture = posture
 

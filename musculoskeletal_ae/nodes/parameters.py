@@ -161,32 +161,29 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 #: executables that are several nodes in one process
 COMBINED = {'combined': ('estimator', 'controller')}
 
-#: old names of parameters, read for one version: by 0.3 they are gone
-RENAMED = {'marker_rate': 'marker_pose_rate'}
-
 #: what every node of rclpy has
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
 
-def check_names(given: Iterable[str], node: str = '') -> None:
+def check_names(names: Iterable[str], node: str = '') -> None:
     """Refuse a parameter that nothing would read.
 
     That is one that no node has or, where it is given to one `node` or executable, that only
     another one has: a file is for all nodes.
     """
     own = COMBINED.get(node, (node,) if node else ())
-    every = [*RENAMED, *OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
-    for name in given:
+    every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
+    for name in names:
         users = [user for user, table in PARAMETERS.items() if name in table]
-        told = ''
+        problem = ''
         if name.split('.')[0] not in every:
             legal = [key for one in own for key in PARAMETERS[one]] or every
             near = get_close_matches(name, legal, 1) or ['none, see --help']
-            told = f'no node has a parameter {name!r}; nearest: {near[0]}'
+            problem = f'no node has a parameter {name!r}; nearest: {near[0]}'
         elif own and len(users) == 1 and users[0] not in own:
-            told = f'{node} has no parameter {name!r}; {users[0]} has'
-        if told:
-            raise MusculoskeletalError(printable(told))
+            problem = f'{node} has no parameter {name!r}; {users[0]} has'
+        if problem:
+            raise MusculoskeletalError(printable(problem))
 
 
 HELP_TAIL = """\
@@ -202,7 +199,7 @@ def help_text(executable: str) -> str:
     for name, parameter in table.items():
         mark = '*' if parameter.settable else ' '
         lines.append(f' {mark} {name} (default: {json.dumps(parameter.default)})')
-        lines.append(f'       {_told(parameter)}')
+        lines.append(f'       {_description(parameter)}')
     return '\n'.join([*lines, '', HELP_TAIL])
 
 
@@ -224,11 +221,11 @@ def yaml_text() -> str:
         lines.append(f'    # {section}')
         for name, parameter in table.items():
             entry = f'    {name}: {json.dumps(parameter.default)}'
-            lines.append(f'{entry:<40} # {_told(parameter)}')
+            lines.append(f'{entry:<40} # {_description(parameter)}')
     return '\n'.join(lines) + '\n'
 
 
-def _told(parameter: Parameter) -> str:
+def _description(parameter: Parameter) -> str:
     return f'{parameter.meaning}; {parameter.legal_values}'.removesuffix('; ')
 
 

@@ -9,7 +9,6 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +42,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, RENAMED, check_names
+from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
 from musculoskeletal_ae.nodes.running import give_way
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
@@ -86,7 +85,6 @@ class Shell(Node):
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
             self.parameter(key)  # refuses what is not legal
-        self._take_old_names()
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
@@ -99,7 +97,6 @@ class Shell(Node):
         self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
-        self.add_post_set_parameters_callback(self._keep_old_names)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.create_timer(PERIOD, self._report, clock=STEADY)
@@ -205,20 +202,8 @@ class Shell(Node):
                 self._setters[name](self.parameter(name))
             raise
 
-    def _take_old_names(self) -> None:
-        """Read parameters by the names that they had a version ago, and say so."""
-        given: dict[str, RosParameter] = getattr(self, '_parameter_overrides', {})
-        for old, new in RENAMED.items():
-            if new not in self._table:
-                continue
-            if old in given and new not in given:
-                self.get_logger().warning(f'parameter {old} is called {new} now')
-                self.set_parameters([RosParameter(new, value=given[old].value)])
-            told = _descriptor(replace(self._table[new], meaning=f'old name of {new}'))
-            self.declare_parameter(old, self.get_parameter(new).value, told)
-
     def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        self._proposed = {RENAMED.get(p.name, p.name): p.value for p in parameters}
+        self._proposed = {p.name: p.value for p in parameters}
         try:
             self._take(self._proposed)
         except MusculoskeletalError as error:
@@ -226,14 +211,6 @@ class Shell(Node):
         finally:
             self._proposed = {}
         return SetParametersResult(successful=True)
-
-    def _keep_old_names(self, parameters: list[RosParameter]) -> None:
-        """Let a parameter be the same by its old name and by its new one."""
-        others = RENAMED | {new: old for old, new in RENAMED.items()}
-        for parameter in parameters:
-            other = others.get(parameter.name, '')
-            if self.has_parameter(other) and self.get_parameter(other).value != parameter.value:
-                self.set_parameters([RosParameter(other, value=parameter.value)])
 
     # -- checkpoints ----------------------------------------------------------------------------
 

@@ -183,18 +183,6 @@ def test_without_joint_sensors_there_are_no_joint_states(graph):
     assert graph.node.count_publishers('joint_states') == 0
 
 
-def test_a_parameter_is_read_by_its_old_name_for_a_version(graph):
-    graph.listen(PoseStamped, 'marker_pose')
-    emulator = graph.host(HardwareEmulator, robot='arm26', marker_rate=30.0)
-    assert emulator.parameter('marker_pose_rate') == 30.0
-    graph.next('marker_pose', 2)
-    for name, other in ('marker_pose_rate', 'marker_rate'), ('marker_rate', 'marker_pose_rate'):
-        for rate in 10.0, 0.0:
-            assert graph.set_parameter('hardware_emulator', name, rate)[0]
-            assert emulator.get_parameter(other).value == rate
-    assert emulator.marker_pose_rate == 0.0
-
-
 def test_the_second_body_plays_behind_the_same_topics(graph, arm26):
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(JointState, 'joint_states')

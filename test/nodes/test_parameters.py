@@ -86,15 +86,13 @@ def test_every_parameter_that_is_settable_is_followed(graph, monkeypatch, tmp_pa
     ('node', 'name', 'value'),
     [
         ('learner', 'update_steps', '-5'),
-        ('learner', 'update_steps', str(2**63 - 1)),
-        ('controller', 'joint_stiffness', '[1.0e+300, 1.0e+300]'),
         ('controller', 'joint_stiffness', '[-1.0, -1.0]'),
         ('controller', 'max_age', '.nan'),
-        ('hardware_emulator', 'length_offset', '[1.0e+308]'),
         ('hardware_emulator', 'faults', '[melt]'),
+        ('hardware_emulator', 'marker_rate', '10.0'),  # the nearest name is marker_pose_rate
     ],
 )
-def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
+def test_a_value_that_is_not_legal_is_refused_at_the_start(node, name, value):
     done = subprocess.run(
         [*executable(node), '--ros-args', '-p', 'robot:=arm26', '-p', f'{name}:={value}'],
         capture_output=True,
@@ -106,13 +104,7 @@ def test_a_number_beyond_its_range_is_refused_at_the_start(node, name, value):
 
 
 @pytest.mark.parametrize(
-    ('kind', 'name'),
-    [
-        (HardwareEmulator, 'faults'),
-        (Estimator, 'isolate_muscles'),
-        (Estimator, 'zero_posture'),
-        (Controller, 'joint_stiffness'),
-    ],
+    ('kind', 'name'), [(HardwareEmulator, 'faults'), (Controller, 'joint_stiffness')]
 )
 def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path):
     file = tmp_path / 'nodes.yaml'
@@ -130,9 +122,6 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     assert graph.host(Estimator, robot=robot).posture == ()
     graph.end(graph.hosted[0])
     assert graph.host(Estimator, robot=robot, zero_posture=[0.0]).posture == (0.0,)
-    for nothing in ([], [0.0]):  # of two joints, as the file of parameters had it once
-        graph.end(graph.hosted[0])
-        assert graph.host(Estimator, robot='arm26', zero_posture=nothing).posture == ()
 
 
 @pytest.mark.parametrize(
@@ -189,7 +178,7 @@ def test_an_empty_list_of_numbers_is_the_byte_array_that_ros_makes_of_it():
 
 @pytest.mark.parametrize(
     'value',
-    [None, 3.0, '', '11', b'\x01', 'word', ['word'], [float('nan')], [float('inf')]],
+    [None, 3.0, '11', b'\x01', ['word'], [True], [float('nan')], [float('inf')]],
 )
 def test_what_is_no_list_of_finite_numbers_is_refused(value):
     with pytest.raises(MusculoskeletalError, match='finite numbers'):
