@@ -183,9 +183,12 @@ say "logs in $logs"
 declare -A name_of=() # by pid
 
 launch() { # NAME ARGUMENT…
-  # If this script is killed with SIGKILL, the kernel ends what it started. The interpreter is named,
-  # because a #! line cannot name a path with a space in it.
-  setpriv --pdeathsig TERM "$python" "$executables/$1" "${@:2}" </dev/null &
+  # If this script is killed with SIGKILL, the kernel ends what it started, or sh does, if that
+  # happened before the kernel knew. The interpreter is named, because a #! line cannot name a path
+  # with a space in it.
+  # shellcheck disable=SC2016  # it is for sh to expand
+  setpriv --pdeathsig TERM sh -c '[ "$PPID" = "$0" ] && exec "$@"' $$ \
+    "$python" "$executables/$1" "${@:2}" </dev/null &
   name_of[$!]=$1
 }
 
@@ -270,10 +273,10 @@ train_once() {
 
 # --- The system ----------------------------------------------------------------------------------
 
-# What config/nodes.yaml says or, if it says something, the last of --params-file.
-value_in_files() { # NAME
-  cat "$repository/config/nodes.yaml" "${parameter_files[@]}" |
-    sed -n "s/^ *$1: *\([a-z0-9.]*\).*/\1/p" | tail -n 1
+# What config/nodes.yaml says or, if they say something, the last of --params-file and -p.
+chosen_value() { # NAME
+  { cat "$repository/config/nodes.yaml" "${parameter_files[@]}" && printf '%s\n' "${parameters[@]}"; } |
+    sed -n -e "s/^[^#]*\b$1: \+\([A-Za-z0-9.]\+\).*/\1/p" -e "s/^[a-z_]*:$1:=//p" | tail -n 1
 }
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
@@ -289,8 +292,8 @@ common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
 
 if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
-  check=(--robot "$robot" --wait --seconds 3 --rate "$(value_in_files rate)")
-  [ "$(value_in_files zero_at_start)" != true ] || check+=(--unzeroed)
+  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)")
+  [[ ! $(chosen_value zero_at_start) =~ ^([Tt]rue|yes|on)$ ]] || check+=(--unzeroed)
   launch check_driver "${check[@]}" --ros-args "${under[@]}"
   wait_for check_driver || exit 1
 elif [ -z "$bag" ]; then

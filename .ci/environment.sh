@@ -191,6 +191,7 @@ environment_setup() { # [test]
     build_package
     compile_package
   ) 9>"$repository/log/setup.lock" || exit 1
+  trap - INT
 
   export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
   # colcon's scripts read variables that are not set, and call a Python that they do not quote.

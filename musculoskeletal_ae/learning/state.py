@@ -76,8 +76,10 @@ class StateStore:
         lock = (self.directory / LOCK).open('w')
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except OSError as error:
             lock.close()
+            if isinstance(error, BlockingIOError):
+                raise BlockingIOError('another learner uses the directory') from error
             raise
         self._lock = lock
         # A learner that was killed while it saved leaves its temporary file.

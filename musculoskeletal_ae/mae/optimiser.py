@@ -6,7 +6,7 @@
 (Muon: Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks".) At the same
 number of steps it leaves a third of Adam's error on this network, for small matrix products more.
 `torch.optim.Muon` works in bfloat16 and by another polynomial, less exactly: the network's
-lengths are then 4 to 7 % worse after 1500 mini-batches, and a step takes three times as long.
+lengths are then 4 to 7 % worse after 1500 mini-batches, and a step is no cheaper.
 """
 
 import math
