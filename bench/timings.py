@@ -22,7 +22,8 @@ from torch import Tensor
 from bench.eager_simulation import EagerSimulation
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
-from musculoskeletal_ae.control.methods import first_command, msc_compensation, stiffness_command
+from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.methods import first_command, stiffness_command
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.mae.mae import Mae

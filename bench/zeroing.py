@@ -21,7 +21,6 @@ import torch
 from bench.learned_arm import learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.experiments.recording import (
@@ -35,6 +34,8 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LEAST, MOST = 0.05, 0.13  # [m]
 MINUTES, HELD_OUT, AFTER = 10.0, 300.0, 30.0  # [s] but for the first
@@ -55,7 +56,7 @@ class Loop:
         self.controller.use(mae)
         self._zeros = self.estimator.zeros
 
-    def step(self, joints: bool) -> Muscles:
+    def step(self, joints: bool) -> MuscleSample | None:
         """Let a hundredth of a second pass; return what the modules read."""
         self.time += SAMPLE_TIME
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
@@ -64,11 +65,11 @@ class Loop:
         estimate = estimator.step(read.tension, read.length, now, now)
         zeros = estimator.zeros
         if zeros is not self._zeros:
-            control.zeros(zeros.known, zeros.offset - self._zeros.offset)
+            offsets = LengthOffsets(zeros.offset, zeros.deviation)
+            control.use_body(control.stream.body.with_offsets(offsets))
             self._zeros = zeros
-        muscles = Muscles(read.length - zeros.offset, read.tension, read.temperature)
         if estimate is not None:
-            control.muscles(muscles, now)
+            control.muscles(np.array([read.length, read.tension, read.temperature]), now)
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1
@@ -77,7 +78,7 @@ class Loop:
                 self.arm.command_length(command.value + zeros.offset)
                 estimator.commanded(now, length=command.value)
         self.arm.step(SAMPLE_TIME)
-        return muscles
+        return control.sample
 
 
 def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[str, Any]:
@@ -99,11 +100,13 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     while loop.time < LONGEST and not loop.estimator.zeros.known:
         muscles = loop.step(how == 'sensors')
         seen.append(arm.theta)
-        length = muscles.length + loop.estimator.zeros.offset
+        if muscles is None:
+            continue
+        length = muscles.length_read
         if last is not None and len(seen) % 10 == 0:
             speed = max(speed, float(np.abs(length - last).max()) / (10 * SAMPLE_TIME))
         last = length if len(seen) % 10 == 0 or last is None else last
-        pull = max(pull, float(muscles.tension.max()))
+        pull = max(pull, float(muscles.motor_tension.max()))
     zeros, took, alarms = loop.estimator.zeros, loop.time, loop.alarms
     part = held_out.part(np.s_[::5])
     tension = end_tensions(mae, held_out)[::5]
@@ -122,7 +125,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
         'worst_zero_m': float(np.abs(zeros.offset - offset).max()),
         'alarms': alarms,
         'alarms_after': loop.alarms - alarms,
-        'stopped': loop.controller.safety.cause,
+        'stopped': str(loop.controller.supervisor.condition or ''),
         'fastest_m_s': speed,
         'highest_n': pull,
         'range_rad': float(np.ptp(seen, axis=0).mean()),

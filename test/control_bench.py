@@ -7,16 +7,41 @@ import numpy as np
 from exact_mae import ExactMae, rest_readings
 
 from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import LENGTH, Pull, unchanging
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 
 ROBOT = Robot.load('arm26')
 DT = 0.01
 REST = np.array([-0.3, -1.0])
 OTHER = np.array([0.1, -0.5])
 COLD = np.full(ROBOT.muscle_count, 30.0)
+
+
+def sample(length, tension, robot=ROBOT, temperature=30.0):
+    """Return muscle states as the stream gives them out; numbers are for all muscles."""
+    rows = [np.broadcast_to(row, robot.muscle_count) for row in (length, tension, temperature)]
+    return MuscleStream(robot).take_states(np.array(rows, dtype=float), 0.0)
+
+
+def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
+    """Return what an activity knows of an arm at rest."""
+    tension = robot.tension.bias if tension is None else tension
+    now = sample(mae.lengths(theta, tension), tension, robot)
+    return Inputs(
+        mae=mae,
+        sample=now,
+        pull=Pull(tension, tension),
+        theta=theta,
+        length=unchanging(robot, LENGTH, now).value,
+        tension=tension,
+        limit=limit,
+        dt=dt,
+    )
 
 
 class Bench:
@@ -38,7 +63,7 @@ class Bench:
             self.now += self.dt
             if 'muscles' not in self.blind:
                 length, tension = rest_readings(ROBOT, self.theta, self.tension)
-                self.core.muscles(Muscles(length, tension, self.temperature), self.now)
+                self.core.muscles(np.array([length, tension, self.temperature]), self.now)
             if 'estimate' not in self.blind:
                 self.core.estimated(self.theta, self.now)
             sent.append(self.core.step(self.now))
@@ -49,6 +74,23 @@ class Bench:
 
     def target(self, theta, effort=(0.0, 0.0)):
         self.core.target(dict(zip(ROBOT.joints, zip(theta, effort))))
+
+    def isolate(self, muscles):
+        self.core.use_body(self.core.stream.body.with_isolated(muscles))
+
+    def stop(self):
+        self.core.stop(StopCause.OPERATOR)
+
+    @property
+    def cause(self):
+        """The identifier of the stop cause, or ''."""
+        condition = self.core.supervisor.condition
+        return '' if condition is None else condition.cause.identifier
+
+    @property
+    def condition(self):
+        """The stop cause with its details, for people, or ''."""
+        return str(self.core.supervisor.condition or '')
 
     def report(self):
         return status.report(self.core, self.now)

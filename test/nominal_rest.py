@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import msc_compensation
+from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.emulator.arm import STOP_STIFFNESS, EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError

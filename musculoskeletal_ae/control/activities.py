@@ -27,10 +27,10 @@ class Inputs(NamedTuple):
 class ActivityControl(Protocol):
     """Commands the arm as long as one activity goes on."""
 
-    def enter(self, inputs: Inputs) -> None:
+    def enter(self, inputs: Inputs, /) -> None:
         """Begin, or begin again after a pause, from how the muscles pull now."""
 
-    def step(self, inputs: Inputs) -> Command | None:
+    def step(self, inputs: Inputs, /) -> Command | None:
         """Return the desired command; None keeps the last one."""
 
     def leave(self) -> None:

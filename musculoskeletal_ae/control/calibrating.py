@@ -45,11 +45,11 @@ class Calibrating:
         self._rested = 0.0  # [s]
         self.use(robot, settings)
 
-    def use(self, robot: Robot, settings: Settings) -> None:
+    def use(self, robot: Robot, _: Settings) -> None:
         """Move this robot, whose isolated muscles pull nothing."""
         self._robot = robot
 
-    def enter(self, inputs: Inputs) -> None:
+    def enter(self, _: Inputs) -> None:
         """Begin anew, from wherever the arm is."""
         self._ramp, self._rested = None, 0.0
 

@@ -109,12 +109,13 @@ class Activities:
         """Return the object that carries out an activity; None for none."""
         if activity in (Activity.HOLDING, Activity.MOVING):
             return self.follower if by_follower(settings) else self.paper_methods
-        return {
+        others: dict[Activity, ActivityControl] = {
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
             Activity.TORQUE: self.torque,
             Activity.GRAVITY_COMPENSATION: self.gravity_compensation,
-        }.get(activity)
+        }
+        return others.get(activity)
 
     def leave(self) -> None:
         """End what commands the arm: something else follows, or a stop."""
@@ -403,17 +404,18 @@ class Controller:
         if self.supervisor.is_running and not present:
             desired = self._desired(step.dt)
         if not self.supervisor.is_running:
-            desired = self._stopped(was_running, present, now, dt)
+            desired = self._stopped(was_running, present, dt)
         command = self._limited(desired, dt)
         if command is None and desired is not None and self.supervisor.is_running:
             self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
-            command = self._limited(self._stopped(True, present, now, dt), dt)
+            command = self._limited(self._stopped(True, present, dt), dt)
         return command if command is not None else self.limiter.command
 
     def _desired(self, dt: float) -> Command | None:
         """Return what the activity wants; any fault of it stops the arm."""
         control = self.activities.of(self.supervisor.activity, self.settings)
-        if control is None:
+        known = self.stream.body.offsets.known
+        if control is None or not (known or control is self.activities.calibrating):
             self.activities.leave()
             return None
         try:
@@ -495,9 +497,7 @@ class Controller:
         released = self.limiter.slack_length if command.kind == LENGTH else 0.0
         return Command(command.kind, np.where(self.robot.used, command.value, released))
 
-    def _stopped(
-        self, begins: bool, present: list[Condition], now: float, dt: float
-    ) -> Command | None:
+    def _stopped(self, begins: bool, present: list[Condition], dt: float) -> Command | None:
         """Return the command of a stopped arm."""
         if begins:
             self.activities.leave()
@@ -562,6 +562,14 @@ class Controller:
         follower.follow(plan.trajectory, delay)
         follower.exert(effort)
         self.supervisor.on_request(Activity.MOVING)
+
+    @property
+    def is_following(self) -> bool:
+        """Whether the follower commands the arm: it moves to a target, or holds one."""
+        activity = self.supervisor.activity
+        follower = self.activities.follower
+        is_used = self.activities.of(activity, self.settings) is follower
+        return is_used and follower.trajectory is not None
 
     @property
     def _is_ready(self) -> bool:

@@ -22,14 +22,12 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import Inputs
-from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
-from musculoskeletal_ae.control.ramps import Goal, LengthRamps, Ramp
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.command import Command
+from musculoskeletal_ae.control.ramps import Goal, LengthRamps
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import TensionProgramme, holding_tension
+from musculoskeletal_ae.robot.tension import holding_tension
 
 DURATIONS = (5.0, 2.0, 3.0)  # [s]
 TRIES = 1000

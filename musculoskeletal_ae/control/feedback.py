@@ -12,7 +12,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 REPLAN = 5.0  # [N] change of a tension limit that a plan depends on, for which it is made anew
 CORRECTION = 0.3  # [rad] at most, or times RACK [m]
-#: [m] at most: by how much lengths can be off, and what friction keeps of a tendon that was wound in
+#: [m] at most: by how much lengths can be off, and what friction keeps of a tendon wound in
 RELIEF = 0.01
 #: [rad] of estimated error that is left alone, or times RACK [m]: about the error of the estimate
 #: itself, after which an arm with friction would creep for ever

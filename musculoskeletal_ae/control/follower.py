@@ -118,13 +118,18 @@ class Follower:
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
         self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
-        self._start()
+        self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
+        self._blend: Ramp | None = None
+        # T at the bones and at the motors [N], and s of each tendon, (M,)
+        self.tension: Array = robot.tension.bias.copy()
+        self._motor: Array = self.tension
+        self._sliding: Array = np.zeros(robot.muscle_count)
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
         self._robot, self._settings = robot, settings
-        for part in (self.winches, self.feedback):
-            part.use(robot)
+        self.winches.use(robot)
+        self.feedback.use(robot)
         self.stiffening.use(robot, settings)
 
     def use_network(self, mae: Mae) -> None:
@@ -186,7 +191,7 @@ class Follower:
 
     # -- the activity ---------------------------------------------------------------------------
 
-    def enter(self, inputs: Inputs) -> None:
+    def enter(self, _: Inputs) -> None:
         """Begin, or go on after a pause, from how the muscles pull now."""
         self._start()
 
@@ -227,14 +232,12 @@ class Follower:
         return Command(LENGTH, length + self._blend.step(dt))
 
     def _start(self) -> None:
-        self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
-        self._blend: Ramp | None = None
+        self._resting = self._blend = None
         if self.trajectory is not None:  # held, or held anew: its tensions are planned again
             self.time = min(self.time, self.trajectory.duration)
-        # T at the bones and at the motors [N], and s of each tendon, (M,)
-        self.tension: Array = self._robot.tension.bias.copy()
-        self._motor: Array = self.tension
-        self._sliding: Array = np.zeros(self._robot.muscle_count)
+        self.tension = self._robot.tension.bias.copy()
+        self._motor = self.tension
+        self._sliding = np.zeros(self._robot.muscle_count)
         self.stiffening.reset()
         self.feedback.reset()
         self.winches.forget()

@@ -41,23 +41,24 @@ class FollowedGoal:
 
         To come within the latter it has so much time after its end [s]; 0 is for ever.
         """
-        self._core, self._trajectory = core, core.motion.latest
+        self._core, self._trajectory = core, core.activities.follower.latest
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
 
     def outcome(self) -> tuple[int, str] | None:
         """Return an error code and what happened, or None while the goal is pursued."""
-        core, motion, trajectory = self._core, self._core.motion, self._trajectory
-        if cause := core.safety.cause:
-            return INVALID, f'stopped: {cause}'
-        if not core.follows or motion.latest is not trajectory or trajectory is None:
+        core, trajectory = self._core, self._trajectory
+        follower, condition = core.activities.follower, core.supervisor.condition
+        if condition is not None:
+            return INVALID, f'stopped: {condition}'
+        if not core.is_following or follower.latest is not trajectory or trajectory is None:
             return INVALID, 'replaced by another target'
-        if motion.trajectory is not trajectory:
+        if follower.trajectory is not trajectory:
             return None  # it is still to begin
-        off = np.abs(motion.error)
-        if motion.time < trajectory.duration:
+        off = np.abs(follower.error)
+        if follower.time < trajectory.duration:
             return self._beyond(BEYOND_PATH, off, self._path)
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
-            return missed if 0.0 < self._patience < motion.over else None
+            return missed if 0.0 < self._patience < follower.over else None
         return SUCCESSFUL, ''
 
     def _beyond(self, code: int, off: Array, bounds: Array) -> tuple[int, str] | None:

@@ -102,12 +102,12 @@ class GravityCompensation(TorqueControl):
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         super().__init__(robot, settings)
-        self._held: Array | None = None  # θ_held [rad], (D,)
+        self.held: Array | None = None  # θ_held [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
         """Hold where the arm is, from how the muscles pull now."""
         super().enter(inputs)
-        self._held = None
+        self.held = None
 
     def step(self, inputs: Inputs) -> Command | None:
         """Return the tensions to command."""
@@ -116,7 +116,7 @@ class GravityCompensation(TorqueControl):
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian
         band, edge = BAND * radian, WALL_AT * radian
-        held = target if self._held is None else np.clip(self._held, theta - band, theta + band)
-        self._held = np.clip(held, low, high)
+        held = target if self.held is None else np.clip(self.held, theta - band, theta + band)
+        self.held = np.clip(held, low, high)
         wall = np.clip(theta, low + edge, high - edge) - theta
-        return (HOLD * (self._held - theta) - DAMPING * velocity + WALL * wall) / radian**2
+        return (HOLD * (self.held - theta) - DAMPING * velocity + WALL * wall) / radian**2

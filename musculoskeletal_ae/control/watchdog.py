@@ -55,7 +55,7 @@ class DataAge:
         return now - self._asleep
 
     def received(self, what: StopCause, now: float) -> float:
-        """Note that data came that `what` would stop the arm for; return the time since the last."""
+        """Note that data came whose age `what` is about; return the time since the last [s]."""
         awake, before = self.awake(now), self._came_at[what]
         self._came_at[what] = awake
         return awake - before if before > -math.inf else 0.0
@@ -109,7 +109,7 @@ class Overload:
         self._since = np.where(tension > self._levels, since, math.inf)
 
     def strained(self, awake: float, overload_time: float) -> Bools:
-        """Return which muscles have used up half of the time after which they stop the arm, (M,)."""
+        """Return which muscles have used half of the time after which they stop the arm, (M,)."""
         strained: Bools = awake - self._since[0] > 0.5 * overload_time
         return strained
 

@@ -79,12 +79,12 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
                 preset = preset or 'default'
                 loop = ClosedLoop(arm, networks['default'])
                 loop.approach(start, STARTING)
-                if loop.core.safety.cause:  # the start is then where it stopped
+                if not loop.core.supervisor.is_running:  # the start is then where it stopped
                     loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
                 loop.approach(theta, DURATION)
-                stops[name] += bool(loop.core.safety.cause)
+                stops[name] += not loop.core.supervisor.is_running
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
                 there[name][p, s] = _bound(arm)

@@ -36,7 +36,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.hand import POSITION
-from musculoskeletal_ae.control.posture import RAMP_SHARE
+from musculoskeletal_ae.control.ramps import RAMP_SHARE
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
@@ -114,8 +114,9 @@ def follow(loop: ClosedLoop, start: Array, goal: Array, method: str, duration: f
     planned = Trajectory.to(Setpoint.resting(start), goal, duration)
     if method == OURS:
         core.trajectory(planned.points)
-        assert core.motion.trajectory is not None
-        planned = core.motion.trajectory
+        followed = core.activities.follower.trajectory
+        assert followed is not None
+        planned = followed
     elif method != 'tension':
         loop.target(goal)
     theta, tension = [], []

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.exploration import Exploration, Step
 from musculoskeletal_ae.control.methods import first_command
-from musculoskeletal_ae.control.posture import RAMP_SHARE, Step
-from musculoskeletal_ae.control.safety import LENGTH, Command, Muscles
+from musculoskeletal_ae.control.ramps import RAMP_SHARE
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -74,7 +74,7 @@ class ClosedLoop:
         """Let a message's time pass; return the columns of a recording."""
         arm, core, read, now = self.arm, self.core, self._read, self._now
         with suppress(MessageError):  # which nodes count, and control waits for better ones
-            core.muscles(Muscles(read.length, read.tension, read.temperature), now)
+            core.muscles(np.array([read.length, read.tension, read.temperature]), now)
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
         self.commanded(command, now)
@@ -98,9 +98,10 @@ class ClosedLoop:
     def explore(self) -> tuple[Array, ...]:
         """Make a step of exploring; what stopped the arm is reset once its cause is gone."""
         core = self.core
-        if core.safety.cause and not core.reset(self._now):
+        supervisor = core.supervisor
+        if not supervisor.is_running and core.reset(self._now) is None:
             self.stops += 1
-        if not core.safety.cause and not core.posture.exploring:
+        if supervisor.is_running and not supervisor.explores:
             core.explore(True)
         return self.step()
 
@@ -120,8 +121,9 @@ class ClosedLoop:
 
     def check(self) -> None:
         """Raise a MusculoskeletalError if the controller has stopped."""
-        if self.core.safety.cause:
-            raise MusculoskeletalError(f'control stopped: {self.core.safety.cause}')
+        condition = self.core.supervisor.condition
+        if condition is not None:
+            raise MusculoskeletalError(f'control stopped: {condition}')
 
     def target(self, theta: Array) -> None:
         """Let θ [rad] (D,) be the target."""

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.command import Command
 from musculoskeletal_ae.control.exploration import TRIES
-from musculoskeletal_ae.control.motion import FALLEN
-from musculoskeletal_ae.control.safety import Command
+from musculoskeletal_ae.control.follower import FALLEN
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -86,7 +86,8 @@ class Guarded(ClosedLoop):
                 self.found.append((core.robot.isolated, core.verified))
         if core.robot.isolated != self.isolated:
             self.isolated = core.robot.isolated
-            self.core.isolate(self.isolated)
+            body = self.core.stream.body.with_isolated(self.isolated)
+            self.core.use_body(body)
         self.error = float(np.linalg.norm(estimate.state.theta - true))
         return estimate.state.theta
 
@@ -166,7 +167,7 @@ def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> Reached:
                     break
                 loop.run(1.0)
                 still = np.abs(loop.arm.theta - before).max() < STILL
-                rested = rested + 1 if still and not loop.core.motion.moving else 0
+                rested = rested + 1 if still and not loop.core.activities.follower.is_moving else 0
                 before = loop.arm.theta
             distance = float(np.linalg.norm(before - theta))
             ended.append(distance)
@@ -192,7 +193,7 @@ def healthy(arm: Arm, mae: Mae, seed: int, duration: float) -> list[tuple[int, .
             wrench[:3] = rng.uniform(*PUSH) * way / np.linalg.norm(way) if n % every == 0 else 0.0
             arm.set_wrench(wrench)
         loop.explore()
-        if loop.core.watch.anomaly and not loop.isolated:
+        if loop.core.watchdog.has_anomaly and not loop.isolated:
             loop.estimator.reset()  # as somebody would: acquitted twice, the arm stays stopped
     return [isolated for isolated, _ in loop.found]
 

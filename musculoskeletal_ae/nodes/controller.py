@@ -3,8 +3,8 @@
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
 muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
-with method `tension`; controller_state. Action follow_joint_trajectory, where control_msgs is
-installed.
+with method `tension`; controller_state, controller_mode. Action follow_joint_trajectory, where
+control_msgs is installed.
 """
 
 import time
@@ -18,22 +18,24 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import RELIABLE, array_message, serve
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
-from musculoskeletal_ae.plausibility import SETTLED
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
     read_pose,
     read_target,
@@ -50,8 +52,10 @@ class Controller(Shell):
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
         self.recording: StopRecording = StopRecording(self.resolve_topic_name)
-        self.latched = False  # the stop, as of the last step
+        self.recorded: StopCause | None = None  # the stop that the last recording is of
         self.logged: list[str] = []
+        self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
+        self.published_mode = ''
         self.publishers_of = {
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
@@ -60,11 +64,14 @@ class Controller(Shell):
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name), checks.get(name))
         self.follow_checkpoints(
-            self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
+            self.core.use, lambda reason: self.core.stop(StopCause.UNFIT_CHECKPOINT, reason)
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
-        self.follow_zeros(self._shift)
-        self.follow_muscle_states(self._muscles, partial(setattr, self.core.watch, 'intruder'))
+        self.follow_zeros(self._use_offsets)
+        watchdog = self.core.watchdog
+        self.follow_muscle_states(
+            self._muscles, partial(setattr, watchdog, 'second_publisher'), as_read=True
+        )
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
@@ -115,19 +122,21 @@ class Controller(Shell):
             raise MusculoskeletalError(f'{told}; or let it follow muscle_tension_command, too')
         return value
 
-    def _shift(self, known: bool, less: Array) -> None:
-        self.core.zeros(known, less)
+    def _use_offsets(self, *_: object) -> None:
+        offsets = LengthOffsets(self.zeros.offset, self.zeros.deviation)
+        self.core.use_body(self.core.stream.body.with_offsets(offsets))
         self.gate.forget()
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         self.gate.isolated = muscles
-        self.core.isolate(muscles)
+        self.core.use_body(self.core.stream.body.with_isolated(muscles))
 
     def _muscles(self, states: Array) -> None:
-        muscles, now = Muscles(*states), time.monotonic()
-        self.core.muscles(muscles, now)
-        if self.zeros.known:
-            self.gate.message(muscles.tension, muscles.length, now)
+        now = time.monotonic()
+        self.core.muscles(states, now)
+        if self.zeros.known and self.core.sample is not None:
+            length, tension, _ = self.core.sample.newest
+            self.gate.message(tension, length, now)
 
     def _anomaly(self, detected: bool) -> None:
         self.core.anomaly(detected)
@@ -141,12 +150,14 @@ class Controller(Shell):
     def _target(self, message: JointState) -> None:
         self.core.target(read_target(message, self.robot.joints))
         warn = self.get_logger().warning
-        if cause := self.core.safety.cause:
-            warn(f'stopped ({cause}): the target waits for controller/reset')
-        if short := self.core.short:
-            warn(f'out of reach: {short}')
-        if clamped := ', '.join(self.core.clamped):
-            warn(f'target clamped to the joint limits: {clamped}')
+        if not self.core.supervisor.is_running:
+            condition = self.core.supervisor.condition
+            warn(f'stopped ({condition}): the target waits for controller/reset')
+        target = self.core.target_state
+        if target.unreachable_reason:
+            warn(f'out of reach: {target.unreachable_reason}')
+        if target.clamped:
+            warn(f'target clamped to the joint limits: {", ".join(target.clamped)}')
 
     def _trajectory(self, message: JointTrajectory) -> None:
         points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
@@ -157,31 +168,32 @@ class Controller(Shell):
     def _pose(self, message: PoseStamped) -> None:
         only = without_orientation(message)
         pose = read_pose(message, self.root_frame, only)
-        before = self.core.short
+        before = self.core.target_state.unreachable_reason
         self.core.pose(pose, not only, self.now())
-        if self.core.short not in ('', before):
-            self.get_logger().warning(f'out of reach: {self.core.short}')
+        reason = self.core.target_state.unreachable_reason
+        if reason not in ('', before):
+            self.get_logger().warning(f'out of reach: {reason}')
         self._tell_slowed()
 
     def _twist(self, message: TwistStamped) -> None:
         self.core.twist(read_twist(message, self.root_frame))
 
     def _tell_slowed(self) -> None:
-        if slowed := status.slowed(self.core.motion):
+        if slowed := status.slowed(self.core.activities.follower):
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
     def _state(self) -> JointTrajectory:
         """Say what is desired, what is estimated, and the error, as three points."""
-        motion = self.core.motion
-        desired, names = motion.desired, ('positions', 'velocities', 'accelerations')
+        follower = self.core.activities.follower
+        desired, names = follower.desired, ('positions', 'velocities', 'accelerations')
         parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}
-        estimated = desired.theta - motion.error
+        estimated = desired.theta - follower.error
         points = [
             JointTrajectoryPoint(**parts),
             JointTrajectoryPoint(positions=estimated.tolist()),
-            JointTrajectoryPoint(positions=motion.error.tolist()),
+            JointTrajectoryPoint(positions=follower.error.tolist()),
         ]
-        points[0].time_from_start = Duration(seconds=motion.time).to_msg()
+        points[0].time_from_start = Duration(seconds=follower.time).to_msg()
         message = JointTrajectory(joint_names=self.robot.joints, points=points)
         message.header.stamp = self.get_clock().now().to_msg()
         return message
@@ -189,22 +201,23 @@ class Controller(Shell):
     def _explore(self, request: SetBool.Request) -> str:
         if reason := self.core.explore(request.data):
             raise MusculoskeletalError(reason)
-        stopped = self.core.safety.cause
-        holding = f'stopped: {stopped}' if stopped else 'holding'
+        condition = self.core.supervisor.condition
+        holding = 'holding' if condition is None else f'stopped: {condition}'
         return 'exploring' if request.data else holding
 
     def _stop(self, _: Trigger.Request) -> str:
-        self.core.stop('controller/stop was called')
+        self.core.stop(StopCause.OPERATOR)
         return 'stopped; controller/reset ends it'
 
     def _reset(self, _: Trigger.Request) -> str:
-        if reason := self.core.reset(time.monotonic()):
-            again = f'call again once that is over, {SETTLED:g} s after it is mended'
-            raise MusculoskeletalError(f'refused: {reason}; {again}')
+        present = self.core.reset(time.monotonic())
+        if present is not None:
+            again = f'call again once that is over, {LIMITS.settled:g} s after it is mended'
+            raise MusculoskeletalError(f'refused: {present}: {present.cause.remedy}; {again}')
         return 'going on to the last target, if any; controller/explore explores again'
 
     def _watch(self) -> None:
-        if time.monotonic() - self.core.watch.stepped_at > 1.5 / self.rate:
+        if time.monotonic() - self.core.watchdog.age.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:
@@ -215,22 +228,39 @@ class Controller(Shell):
             self.publishers_of[command.kind].publish(message)
             self.core.sent_at = time.monotonic()
             self.recording.heard(f'muscle_{command.kind}_command', message)
-        if self.core.follows:
+        if self.core.is_following:
             self.states.publish(self._state())
         if self.action is not None:
             self.action.step(self._state)
-        safety, before = self.core.safety, self.latched
-        self.latched = bool(safety.cause) and not safety.passing
-        if self.latched and not before:
-            self.recording.save(safety.cause, self.parameter('stop_recordings'))
+        self._publish_mode()
+        self._record_stop()
+
+    def _publish_mode(self) -> None:
+        """Publish mode and stop cause as identifiers, whenever they change."""
+        supervisor = self.core.supervisor
+        mode = supervisor.mode
+        if supervisor.condition is not None:
+            mode = f'{mode}:{supervisor.condition.cause.identifier}'
+        if mode != self.published_mode:
+            self.published_mode = mode
+            self.mode.publish(String(data=mode))
+
+    def _record_stop(self) -> None:
+        """Keep the last seconds before a stop that has latched."""
+        supervisor = self.core.supervisor
+        if not supervisor.is_latched or supervisor.condition is None:
+            self.recorded = None
+        elif self.recorded is None:
+            self.recorded = supervisor.condition.cause
+            self.recording.save(str(supervisor.condition), self.parameter('stop_recordings'))
 
     def report(self) -> Report:
         """Return what /diagnostics shows, and log what has changed."""
         report = status.report(self.core, time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
-        stopped = [report.message] if self.core.safety.cause else []
-        changing = self.core.follows and self.core.motion.moving
+        stopped = [] if self.core.supervisor.is_running else [report.message]
+        changing = self.core.is_following and self.core.activities.follower.is_moving
         held = {} if changing else report.values
         stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
         before, self.logged = self.logged, stopped + stiffness

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.posture import REPLAN
-from musculoskeletal_ae.control.safety import LENGTH, TENSION, Muscles
+from musculoskeletal_ae.control.feedback import REPLAN
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -21,7 +21,7 @@ EVENTS = {
     'back': lambda bench: bench.target(REST, (0.5, -0.2)),
     'explore': lambda bench: bench.core.explore(True),
     'end': lambda bench: bench.core.explore(False),
-    'stop': lambda bench: bench.core.stop('asked'),
+    'stop': lambda bench: bench.stop(),
     'reset': lambda bench: bench.core.reset(bench.now),
     'swap': lambda bench: bench.core.use(shifted()),
     'moved': lambda bench: setattr(bench, 'theta', REST + 0.1),
@@ -126,7 +126,7 @@ def test_a_target_beyond_the_limits_is_clamped_and_joints_not_named_keep_theirs(
     bench = Bench()
     bench.target([-0.2, -0.7])
     bench.core.target({ROBOT.joints[1]: (-9.0, 0.0)})
-    np.testing.assert_array_equal(bench.core.posture.theta, [-0.2, ROBOT.lower[1]])
+    np.testing.assert_array_equal(bench.core.target_state.theta, [-0.2, ROBOT.lower[1]])
     bench.step()
     assert bench.report().values['target clamped at'] == ROBOT.joints[1]
     bench.core.target({ROBOT.joints[1]: (-1.0, 0.0)})
@@ -140,15 +140,15 @@ def test_stale_sensor_data_stop_the_arm_and_a_reset_is_refused_while_they_are_st
     bench.step(50)
     bench.blind = {what}
     bench.step(15)
-    assert not bench.core.safety.cause
+    assert bench.cause == ''
     assert None not in bench.step(10)  # keeps commanding
-    assert 'older than 0.2 s' in bench.core.safety.cause
-    assert 'older than' in bench.core.reset(bench.now)
+    assert 'older than 0.2 s' in bench.condition
+    assert 'older than' in str(bench.core.reset(bench.now))
     bench.blind = set()
     bench.step(2)
-    assert bench.core.safety.cause
-    assert bench.core.reset(bench.now) == ''
-    assert not bench.core.safety.cause
+    assert bench.cause
+    assert bench.core.reset(bench.now) is None
+    assert bench.cause == ''
 
 
 def test_an_anomaly_stops_the_arm_even_before_the_first_command():
@@ -158,7 +158,7 @@ def test_an_anomaly_stops_the_arm_even_before_the_first_command():
     assert bench.step(3) == [None] * 3
     bench.core.anomaly(False)
     assert bench.step(3) == [None] * 3
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     assert None not in bench.step(3)
 
 
@@ -171,10 +171,10 @@ def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on
     mae.fail = fault
     bench.target(OTHER)
     assert None not in bench.step(100)
-    assert type(fault).__name__ in bench.core.safety.cause
+    assert type(fault).__name__ in bench.condition
     mae.fail = None
-    assert bench.core.reset(bench.now) == ''
-    np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
+    assert bench.core.reset(bench.now) is None
+    np.testing.assert_array_equal(bench.core.target_state.theta, OTHER)
     bench.step(300)
     assert bench.report().message == 'holding'
 
@@ -187,20 +187,20 @@ def test_a_network_that_answers_nan_stops_the_arm_and_no_command_is_nan():
     broken.offset = np.nan
     bench.core.use(broken)
     assert np.isfinite(values(bench.step(100))).all()
-    assert bench.core.safety.cause
+    assert bench.cause
     bench.core.use(ExactMae(ROBOT))
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     bench.step(300)
-    assert not bench.core.safety.cause
+    assert bench.cause == ''
 
 
 def test_after_reset_the_last_target_is_resumed_by_a_ramp():
     bench = Bench(first_duration=1.0, feedback_gain=0.0)
     bench.target(OTHER)
     goal = bench.step(300)[-1].value
-    bench.core.stop('asked')
+    bench.stop()
     bench.step(300)
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     np.testing.assert_allclose(bench.step(300)[-1].value, goal, atol=1e-9)
 
 
@@ -210,13 +210,13 @@ def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
     bench.step(10)
     assert bench.report().message == 'exploring'
     bench.target(REST)
-    assert not bench.core.posture.exploring
+    assert not bench.core.supervisor.explores
     bench.core.explore(True)
-    bench.core.stop('asked')
-    assert not bench.core.posture.exploring
-    assert 'asked' in bench.core.explore(True)
-    assert bench.core.reset(bench.now) == ''
-    assert bench.core.posture.theta is None  # exploration is not resumed
+    bench.stop()
+    assert not bench.core.supervisor.explores
+    assert 'controller/stop' in bench.core.explore(True)
+    assert bench.core.reset(bench.now) is None
+    assert bench.core.target_state.theta is None  # exploration is not resumed
 
 
 def test_exploration_started_again_continues_its_stream_of_postures():
@@ -226,7 +226,7 @@ def test_exploration_started_again_continues_its_stream_of_postures():
         bench.core.explore(True)
         bench.core.explore(True)  # asking twice starts nothing anew
         bench.step(5)
-        observed.append(bench.core.posture.theta)
+        observed.append(bench.core.target_state.theta)
         bench.core.explore(False)
         bench.step(5)
     assert len({tuple(theta) for theta in observed}) == 3
@@ -238,7 +238,7 @@ def test_the_preset_decides_whether_exploration_takes_joints_to_their_limits(pre
     for _ in range(30):
         bench.core.explore(True)
         bench.step(2)
-        theta = bench.core.posture.theta
+        theta = bench.core.target_state.theta
         at_limit |= bool(((theta == ROBOT.lower) | (theta == ROBOT.upper)).any())
         bench.core.explore(False)
     assert at_limit == sends
@@ -250,7 +250,7 @@ def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
         bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
     bench.step()
     bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
-    np.testing.assert_allclose(bench.core.posture.theta, [0.1, REST[1]])
+    np.testing.assert_allclose(bench.core.target_state.theta, [0.1, REST[1]])
 
 
 def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
@@ -266,11 +266,11 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
         if step == 300:
             strongest = int(np.argmax(core.posture.solution.tension))
             temperature[strongest] = 84.0
-        core.muscles(Muscles(length, tension, temperature), 0.01 * step)
+        core.muscles(np.array([length, tension, temperature]), 0.01 * step)
         core.estimated(theta, 0.01 * step)
         core.step(0.01 * step)
         planned.append(core.posture.solution.tension if core.posture.solution else None)
-    limit = core.watch.limit[strongest]
+    limit = core.watchdog.heat.planned[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
     reported = status.report(core, 12.0)
@@ -282,13 +282,13 @@ def test_rest_feedback_is_bounded_and_begins_only_at_rest():
     bench = Bench(first_duration=1.0, feedback_gain=2.0)
     bench.target(OTHER)  # the made-up arm never moves there
     moving = bench.step(60)
-    assert not bench.core.posture.feedback.correction.any()
+    assert not bench.core.activities.follower.feedback.correction.any()
     assert np.abs(np.diff(values(moving), axis=0)).max() > 0.0
     bench.step(2000)
-    assert np.abs(bench.core.posture.feedback.correction).max() == pytest.approx(0.3)
+    assert np.abs(bench.core.activities.follower.feedback.correction).max() == pytest.approx(0.3)
     bench.target(REST)
     bench.step(10)
-    assert not bench.core.posture.feedback.correction.any()
+    assert not bench.core.activities.follower.feedback.correction.any()
 
 
 def test_a_new_network_keeps_the_correction_of_rest_feedback():
@@ -314,7 +314,7 @@ def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused
     bench = Bench(method='stiffness', first_duration=0.5)
     bench.target(REST)
     before = bench.step(100)[-1].value
-    free = bench.core.posture.solution.stiffness
+    free = bench.core.activities.follower.solution.stiffness
     stiffer = 0.25 * free.lowest + 0.75 * free.highest
     with pytest.raises(MusculoskeletalError, match='2 numbers'):
         bench.configure(joint_stiffness=(1.0, 2.0, 3.0))
@@ -323,7 +323,7 @@ def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused
     after = values(bench.step(100))
     assert np.abs(np.diff(after, axis=0)).max() <= bench.core.settings.rate_limit * DT + 1e-9
     assert np.abs(after[-1] - before).max() > 1e-4
-    planned = bench.core.posture.solution.stiffness.expected[0, 0]
+    planned = bench.core.activities.follower.solution.stiffness.expected[0, 0]
     assert planned == pytest.approx(stiffer[0], rel=0.01)
     bench.configure(joint_stiffness=(1e3, 0.0))
     bench.step(100)
@@ -338,8 +338,8 @@ def test_a_hot_muscle_limited_to_the_tension_bias_does_not_stop_the_arm():
         bench.temperature = np.linspace(60.0, 100.0, ROBOT.muscle_count)
         bench.target(OTHER)
         bench.step(100)
-        assert bench.core.safety.cause == ''
-        assert bench.core.watch.limit.min() == ROBOT.tension.bias[0]
+        assert bench.cause == ''
+        assert bench.core.watchdog.heat.planned.min() == ROBOT.tension.bias[0]
 
 
 def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_the_arm_is():
@@ -350,7 +350,7 @@ def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_th
     bench.configure(method='float')
     sent = bench.step(200)
     assert {command.kind for command in sent} == {TENSION}
-    assert not bench.core.posture.exploring and bench.report().message == 'floating'
+    assert not bench.core.supervisor.explores and bench.report().message == 'floating'
     with pytest.raises(MessageError, match='floating'):
         bench.target(OTHER)
     assert 'float' in bench.core.explore(True)
@@ -359,13 +359,13 @@ def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_th
         bench.step()
     bench.configure(method='proposed')
     assert {command.kind for command in bench.step(300)} == {LENGTH}
-    np.testing.assert_allclose(bench.core.posture.theta, OTHER, atol=0.06)
+    np.testing.assert_allclose(bench.core.target_state.theta, OTHER, atol=0.06)
 
 
 def test_a_stop_ends_gravity_compensation_and_a_reset_resumes_it():
     bench = Bench(method='float')
     bench.step(50)
-    bench.core.stop('asked')
+    bench.stop()
     bias = ROBOT.tension.bias
     np.testing.assert_array_equal(bench.step(400)[-1].value, bias)
     assert not bench.core.reset(bench.now)
@@ -378,8 +378,8 @@ def test_a_reset_ends_a_stop_by_late_data_at_once():
     bench.step(10)
     bench.blind = {'muscles'}
     bench.step(30)
-    assert bench.core.safety.passing
+    assert bench.core.supervisor.mode == 'paused'
     bench.blind = set()
     bench.step(2)
-    assert bench.core.reset(bench.now) == ''
-    assert not bench.core.safety.passing
+    assert bench.core.reset(bench.now) is None
+    assert bench.core.supervisor.mode != 'paused'

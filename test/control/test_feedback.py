@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.posture import (
+from musculoskeletal_ae.control.command import Pull
+from musculoskeletal_ae.control.feedback import (
     BETWEEN,
     CORRECTION,
     DEADBAND,
     RELIEF,
     SETTLING,
-    Pull,
     RestFeedback,
 )
 from musculoskeletal_ae.robot.robot import Robot

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control.calibrating import SPEED, gentle_limit
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.exploration import SPEED, gentle_limit
-from musculoskeletal_ae.control.safety import Muscles
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 DT = 0.01
 
@@ -21,15 +21,22 @@ class Loop:
         self.arm, self.core, self.now = EmulatedArm(robot, 1), Controller(robot), 0.0
         self.offset = np.zeros(robot.muscle_count)
         self.core.use(mae)
-        self.core.zeros(False, self.offset)
+        self.core.use_body(
+            self.core.stream.body.with_offsets(LengthOffsets.unknown(len(self.offset)))
+        )
         self.commands, self.pulls = [], []
+
+    def know(self, offset):
+        """Let the controller know by how much lengths read too much."""
+        offsets = LengthOffsets(offset, np.zeros(len(offset)))
+        self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def run(self, seconds):
         for _ in range(round(seconds / DT)):
             self.now += DT
             read = self.arm.sense()
             length = read.length + self.offset
-            self.core.muscles(Muscles(length, read.tension, read.temperature), self.now)
+            self.core.muscles(np.array([length, read.tension, read.temperature]), self.now)
             self.core.estimated(self.arm.theta, self.now)
             command = self.core.step(self.now)
             if command is not None:
@@ -49,8 +56,8 @@ def test_a_target_waits_until_the_length_offsets_are_known(loop):
     loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
     loop.run(0.5)
     assert not loop.commands
-    assert 'length zeros are unknown' in status.report(loop.core, loop.now).message
-    loop.core.zeros(True, loop.offset)
+    assert 'length offsets are unknown' in status.report(loop.core, loop.now).message
+    loop.know(loop.offset)
     loop.run(0.5)
     assert loop.commands
 
@@ -62,7 +69,7 @@ def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_te
     for _ in range(200):
         loop.run(0.1)
         observed.append(loop.arm.theta)
-    assert not loop.core.safety.cause
+    assert not loop.core.supervisor.condition
     assert np.ptp(observed, axis=0).min() > 0.3
     speed = np.abs(np.diff(loop.commands, axis=0)) / DT
     # What is faster pays out, so that no tension passes its limit.
@@ -76,7 +83,7 @@ def test_new_length_offsets_do_not_move_the_arm(loop):
     reduced = np.array([0.1, -0.1, 0.05, 0.02, -0.02, 0.03])
     before = loop.commands[-1]
     loop.offset = loop.offset - reduced
-    loop.core.zeros(True, reduced)
+    loop.know(reduced)
     # An estimate may come before the next lengths.
     assert np.abs(loop.core.step(loop.now).value - loop.offset - before).max() < 0.002
     loop.run(DT)

@@ -15,6 +15,7 @@ from musculoskeletal_ae.control.goal import (
     FollowedGoal,
     read_tolerances,
 )
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 
@@ -43,8 +44,8 @@ class Followed:
             if outcome := self.goal.outcome():
                 return outcome, step
             self.bench.step()
-            if moves and self.bench.core.follows:
-                self.bench.theta = self.bench.core.motion.desired.theta.copy()
+            if moves and self.bench.core.is_following:
+                self.bench.theta = self.bench.core.activities.follower.desired.theta.copy()
         return None, steps
 
 
@@ -52,7 +53,7 @@ def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
     followed = Followed(path=TIGHT, goal=TIGHT)
     (code, reported), steps = followed.run()
     assert (code, reported) == (SUCCESSFUL, '')
-    duration = followed.bench.core.motion.trajectory.duration
+    duration = followed.bench.core.activities.follower.trajectory.duration
     assert 100.0 * duration - 1.5 <= steps <= 100.0 * duration + 5.0
 
 
@@ -75,7 +76,7 @@ def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
     followed = Followed(goal=TIGHT, patience=0.5)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
-    assert steps > 100.0 * (followed.bench.core.motion.trajectory.duration + 0.5) - 2.0
+    assert steps > 100.0 * (followed.bench.core.activities.follower.trajectory.duration + 0.5) - 2.0
 
 
 def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
@@ -90,7 +91,7 @@ def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
     monkeypatch.setattr(bench, 'step', learning)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
-    assert steps < 100.0 * (bench.core.motion.trajectory.duration + 3.5)
+    assert steps < 100.0 * (bench.core.activities.follower.trajectory.duration + 3.5)
 
 
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])
@@ -103,7 +104,7 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
     elif event == 'target':
         followed.bench.target(REST)
     elif event == 'stop':
-        core.stop('asked')
+        core.stop(StopCause.OPERATOR)
     else:
         followed.bench.configure(method='tension')
     (code, reported), steps = followed.run()

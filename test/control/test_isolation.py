@@ -11,10 +11,12 @@ from exact_mae import ExactMae, rest_readings
 from robots import write_robot
 
 from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
 from musculoskeletal_ae.control.reach import lacking
-from musculoskeletal_ae.control.safety import DEPTH, LENGTH, PAYING_OUT, TENSION, WIND, Muscles
 from musculoskeletal_ae.control.settings import METHODS
+from musculoskeletal_ae.control.stopping import DEPTH, LARGEST_RISE, PAYING_OUT
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.robot.kinematics import RACK
@@ -49,19 +51,19 @@ NOT_THERE = next(theta for theta in POSTURES if not held(theta))
 def test_no_method_commands_tension_of_an_isolated_muscle(method, duration):
     bench = Bench(method=method, first_duration=1.0, second_duration=0.5, target_duration=duration)
     bench.tension = np.full(ROBOT.muscle_count, 60.0)  # its sensor says so, too
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     if method != 'float':
         bench.theta = THERE
         bench.step()
         bench.target(THERE)
     sent = bench.step(600)
     core, last = bench.core, sent[-1]
-    assert core.safety.cause == ''
+    assert core.supervisor.is_running
     if last.kind == TENSION:
         assert last.value[LOST] == 0.0
         assert (last.value[USED] >= 30.0).all()
     else:
-        assert last.value[LOST] == core.safety.longest[LOST]
+        assert last.value[LOST] == core.limiter.slack_length[LOST]
     assert np.abs(np.diff(values(sent)[:, USED], axis=0)).max() <= (
         0.1 * 0.01 * (1.0 if last.kind == LENGTH else 1e4) + 1e-9
     )
@@ -72,19 +74,19 @@ def test_the_sensors_of_an_isolated_muscle_do_not_move_the_arm():
     sent = []
     for tension, longer in ((0.0, 0.0), (450.0, 0.5)):
         bench = Bench()
-        bench.core.isolate([LOST])
+        bench.isolate([LOST])
         length, pull = rest_readings(ROBOT, REST)
         pull = np.where(USED, pull, tension)
         bench.tension = pull
         bench.target(THERE)
         for _ in range(100):
             bench.now += 0.01
-            read = Muscles(length + longer * ~USED, pull, np.full(6, 30.0))
+            read = np.array([length + longer * ~USED, pull, np.full(6, 30.0)])
             bench.core.muscles(read, bench.now)
             bench.core.estimated(REST, bench.now)
             bench.core.step(bench.now)
-        assert bench.core.safety.cause == ''
-        sent.append(bench.core.safety.command.value)
+        assert bench.cause == ''
+        sent.append(bench.core.limiter.command.value)
     np.testing.assert_array_equal(sent[0][USED], sent[1][USED])
 
 
@@ -101,7 +103,7 @@ def test_an_isolated_muscle_stops_the_arm_for_real_heat_but_not_for_impossible_r
     temperature, tension, cause
 ):
     bench = Bench()
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.step()
     bench.target(REST)
     bench.step(10)
@@ -109,67 +111,67 @@ def test_an_isolated_muscle_stops_the_arm_for_real_heat_but_not_for_impossible_r
     bench.temperature = np.where(USED, 30.0, temperature)
     bench.dt = 0.1
     bench.step(300)
-    assert bench.core.safety.cause[: len(cause) or None] == cause
+    assert bench.condition[: len(cause) or None] == cause
 
 
 def test_the_arm_stops_when_all_remaining_muscles_are_overheated():
     bench = Bench()
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.step()
     bench.target(REST)
     bench.step(10)
     bench.temperature = np.where(USED, bench.core.settings.temperature_limit + 10.0, 30.0)
     bench.step(300)
-    assert bench.core.safety.cause.startswith('overheated')
+    assert bench.condition.startswith('overheated')
 
 
 def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench = Bench(target_duration=1.0)
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.theta = THERE
     bench.step()
     name = ROBOT.muscles[LOST]
     with pytest.raises(MessageError, match=f'lack .* N·m at .* without {name}; nearest'):
         bench.target(NOT_THERE)
-    assert bench.core.posture.theta is None
+    assert bench.core.target_state.theta is None
     bench.configure(unreachable='nearest')
     bench.target(NOT_THERE)
-    goal = bench.core.posture.theta
+    goal = bench.core.target_state.theta
     assert not lacking(bench.core.robot, bench.mae, goal)
     way, whole = goal - THERE, NOT_THERE - THERE
     np.testing.assert_allclose(way, whole * (way @ whole) / (whole @ whole), atol=1e-9)
     bench.step()
     assert 'nearest approached' in bench.report().message
-    bench.core.isolate([])
+    bench.isolate([])
     bench.target(NOT_THERE)
-    np.testing.assert_array_equal(bench.core.posture.theta, NOT_THERE)
+    np.testing.assert_array_equal(bench.core.target_state.theta, NOT_THERE)
 
 
 def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy():
     bench = Bench()
     bench.step()
-    bench.core.isolate(range(ROBOT.muscle_count))
+    bench.isolate(range(ROBOT.muscle_count))
     assert 'estimator/restore' in bench.core.explore(True)
-    assert not bench.core.posture.exploring
-    bench.core.isolate(range(ROBOT.muscle_count - 1))
+    assert not bench.core.supervisor.explores
+    bench.isolate(range(ROBOT.muscle_count - 1))
     assert bench.core.explore(True) == ''
     bench.step()
     assert 'holds too few postures; estimator/restore' in bench.report().message
-    bench.core.isolate([])
+    bench.isolate([])
     assert 'too few' not in bench.report().message
 
 
 def test_an_arm_without_a_muscle_that_falls_approaches_its_target_again_a_few_times():
     for lost, times in (([LOST], APPROACHES), ([], 0)):
         bench = Bench(target_duration=0.2)
-        bench.core.isolate(lost)
+        bench.isolate(lost)
         bench.theta = REST
         bench.step()
         bench.target(THERE)
-        ways = [bench.core.motion.trajectory]
+        ways = [bench.core.activities.follower.trajectory]
         for _ in range(4 * (APPROACHES + 1)):
             bench.step(100)
-            if (last := bench.core.motion.trajectory) is not ways[-1]:
+            if (last := bench.core.activities.follower.trajectory) is not ways[-1]:
                 ways.append(last)
             np.testing.assert_array_equal(last.end, THERE)
         assert len(ways) == 1 + times
@@ -177,7 +179,7 @@ def test_an_arm_without_a_muscle_that_falls_approaches_its_target_again_a_few_ti
 
 def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     bench = Bench(target_duration=0.2)
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.theta = NOT_THERE
     bench.step()
     bench.target(THERE)
@@ -242,7 +244,7 @@ class Verified(Bench):
         super().__init__(**chosen)
         self.target(REST)
         self.step(50)
-        self.core.isolate([LOST])
+        self.isolate([LOST])
         self.core.anomaly(True)
 
     def wound(self, count):
@@ -257,14 +259,14 @@ def test_a_suspect_is_wound_in_gently_during_verification_and_the_arm_goes_on_af
     assert np.diff(after).min() >= -0.02 * 0.01 - 1e-12
     fell = before[-1] - after[-1]
     length = rest_readings(ROBOT, REST)[0][LOST]
-    assert 1e4 * (length - after[-1]) >= WIND
+    assert 1e4 * (length - after[-1]) >= LARGEST_RISE
     assert 0.0 < fell <= DEPTH
     assert np.abs(np.diff(after[-20:])).max() == 0.0
-    assert bench.core.safety.cause == 'anomaly_detected'
+    assert bench.cause == 'anomaly_detected'
     bench.core.anomaly(False)
     bench.step(2)
-    assert bench.core.safety.cause == ''
-    assert bench.step(400)[-1].value[LOST] == bench.core.safety.longest[LOST]
+    assert bench.cause == ''
+    assert bench.step(400)[-1].value[LOST] == bench.core.limiter.slack_length[LOST]
 
 
 def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
@@ -273,26 +275,26 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(50):  # it is gone
         bench.now += 0.01
-        bench.core.muscles(Muscles(length, tension, np.full(6, 30.0)), bench.now)
+        bench.core.muscles(np.array([length, tension, np.full(6, 30.0)]), bench.now)
         bench.core.step(bench.now)
     bench.core.anomaly(False)
-    bench.core.isolate([])
+    bench.isolate([])
     bench.step(100)
-    assert bench.core.safety.cause == 'anomaly_detected'
+    assert bench.cause == 'anomaly_detected'
 
 
 def test_a_suspect_with_dead_sensors_is_wound_in_by_a_bounded_length():
     bench = Verified()
     bench.step(200)
-    highest = bench.core.safety.command.value[LOST]
+    highest = bench.core.limiter.command.value[LOST]
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(300):
         bench.now += 0.01
-        read = Muscles(length - 0.1 * ~USED, tension * USED, np.full(6, 30.0))
+        read = np.array([length - 0.1 * ~USED, tension * USED, np.full(6, 30.0)])
         bench.core.muscles(read, bench.now)
         bench.core.estimated(REST, bench.now)
         bench.core.step(bench.now)
-    assert highest - bench.core.safety.command.value[LOST] <= DEPTH + 1e-9
+    assert highest - bench.core.limiter.command.value[LOST] <= DEPTH + 1e-9
 
 
 @pytest.mark.parametrize('first', [True, False])
@@ -300,28 +302,28 @@ def test_a_requested_stop_outlasts_a_verification(first):
     bench = Bench()
     bench.target(REST)
     bench.step(5)
-    events = [lambda: bench.core.stop('controller/stop was called'),
-              lambda: (bench.core.isolate([LOST]), bench.core.anomaly(True))]  # fmt: skip
+    events = [lambda: bench.stop(),
+              lambda: (bench.isolate([LOST]), bench.core.anomaly(True))]  # fmt: skip
     for event in events if first else events[::-1]:
         event()
         bench.step(5)
     bench.core.anomaly(False)
     bench.step(10)
-    assert bench.core.safety.cause
-    assert bench.core.reset(bench.now) == ''
+    assert bench.cause
+    assert bench.core.reset(bench.now) is None
 
 
 def test_the_end_of_an_anomaly_without_a_suspect_does_not_end_the_stop():
     bench = Bench()
     bench.target(REST)
-    bench.core.isolate([LOST])  # long before
+    bench.isolate([LOST])  # long before
     bench.step(150)
     bench.core.anomaly(True)
     lengths = bench.step(300)[-1].value
-    assert (lengths <= np.where(USED, bench.core.safety.longest, np.inf)).all()
+    assert (lengths <= np.where(USED, bench.core.limiter.slack_length, np.inf)).all()
     bench.core.anomaly(False)
     bench.step(10)
-    assert bench.core.safety.cause == 'anomaly_detected'
+    assert bench.cause == 'anomaly_detected'
 
 
 def test_exploration_resumes_after_the_suspect_was_verified():
@@ -329,12 +331,12 @@ def test_exploration_resumes_after_the_suspect_was_verified():
     bench.core.explore(True)
     bench.step(20)
     bench.core.anomaly(True)  # whichever comes first
-    bench.core.isolate([0])
+    bench.isolate([0])
     bench.step(300)
-    bench.core.isolate([])  # it was healthy
+    bench.isolate([])  # it was healthy
     bench.core.anomaly(False)
     bench.step(5)
-    assert bench.core.posture.exploring
+    assert bench.core.supervisor.explores
 
 
 @pytest.mark.parametrize('stopped_before', [True, False])
@@ -343,15 +345,15 @@ def test_exploration_resumes_whichever_finding_of_the_muscle_stopped_the_arm_fir
     bench.core.explore(True)
     bench.step(20)
     if stopped_before:
-        bench.core.stop('muscle_states: length jumped')
+        bench.core.stop(StopCause.IMPLAUSIBLE_MUSCLE_STATES, 'length jumped')
         bench.step(5)
     bench.core.anomaly(True)
-    bench.core.isolate([0])
+    bench.isolate([0])
     bench.step(100)
-    bench.core.isolate([])
+    bench.isolate([])
     bench.core.anomaly(False)
     bench.step(5)
-    assert bench.core.posture.exploring
+    assert bench.core.supervisor.explores
 
 
 @pytest.mark.parametrize('wish', ['hold', 'target'])
@@ -360,63 +362,63 @@ def test_a_request_during_verification_ends_exploration(wish):
     bench.core.explore(True)
     bench.step(20)
     bench.core.anomaly(True)
-    bench.core.isolate([0])
+    bench.isolate([0])
     bench.step(100)
     assert bench.core.explore(False) == '' if wish == 'hold' else bench.target(THERE) is None
     bench.step(100)
-    bench.core.isolate([])
+    bench.isolate([])
     bench.core.anomaly(False)
     bench.step(5)
-    assert bench.core.safety.cause == ''
-    assert not bench.core.posture.exploring
+    assert bench.cause == ''
+    assert not bench.core.supervisor.explores
     if wish == 'target':
-        np.testing.assert_array_equal(bench.core.posture.theta, THERE)
+        np.testing.assert_array_equal(bench.core.target_state.theta, THERE)
 
 
 def test_a_stop_by_stale_data_outlasts_a_later_verification():
     bench = Verified()
     bench.step(200)
-    bench.core.isolate([])
+    bench.isolate([])
     bench.core.anomaly(False)
     bench.step(50)
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
     bench.blind = {'estimate'}
     bench.step(200)
     bench.blind = set()
     bench.step(100)
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.core.anomaly(True)
     bench.step(200)
-    bench.core.isolate([])
+    bench.isolate([])
     bench.core.anomaly(False)
     bench.step(50)
-    assert 'older' in bench.core.safety.cause
+    assert 'older' in bench.condition
 
 
 def test_a_stop_pays_an_isolated_muscle_out_to_its_longest_length_at_most():
     bench = Bench()
-    bench.core.isolate([LOST])
+    bench.isolate([LOST])
     bench.target(REST)
     bench.step(100)
-    bench.core.stop('controller/stop was called')
+    bench.stop()
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(600):
         bench.now += 0.01
-        bench.core.muscles(Muscles(length + 5.0 * ~USED, tension, np.full(6, 30.0)), bench.now)
+        bench.core.muscles(np.array([length + 5.0 * ~USED, tension, np.full(6, 30.0)]), bench.now)
         bench.core.estimated(REST, bench.now)
         bench.core.step(bench.now)
-    assert bench.core.safety.command.value[LOST] <= bench.core.safety.longest[LOST]
+    assert bench.core.limiter.command.value[LOST] <= bench.core.limiter.slack_length[LOST]
 
 
 def test_a_trajectory_to_a_posture_that_cannot_be_held_is_refused():
     bench = Bench(unreachable='nearest')
-    bench.core.isolate([0])
+    bench.isolate([0])
     bench.step(5)
     still = np.zeros((1, 2))
     end = Points(np.array([0, 1]), np.array([3.0]), np.array([[-1.2, -0.2]]), still, still)
     with pytest.raises(MessageError, match='nearest posture held'):
         bench.core.trajectory(end)
-    assert not bench.core.follows
+    assert not bench.core.is_following
 
 
 @pytest.mark.parametrize('preset', ['default', 'paper'])

@@ -11,13 +11,14 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
 
-from musculoskeletal_ae.control.controller import FED_BACK, Controller
+from musculoskeletal_ae.control.command import LENGTH
+from musculoskeletal_ae.control.controller import DEMANDED, Controller
+from musculoskeletal_ae.control.follower import SHARE, slowness
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
-from musculoskeletal_ae.control.motion import SHARE, Winches, slowness
-from musculoskeletal_ae.control.safety import LENGTH, Muscles
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.winches import Winches
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 
@@ -34,8 +35,8 @@ def moved(bench, count):
     sent = []
     for _ in range(count):
         sent += bench.step()
-        if bench.core.motion.trajectory is not None:
-            bench.theta = bench.core.motion.desired.theta
+        if bench.core.activities.follower.trajectory is not None:
+            bench.theta = bench.core.activities.follower.desired.theta
     return sent
 
 
@@ -53,7 +54,7 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     sent += moved(bench, 400)
     assert {command.kind for command in sent} == {LENGTH}
     assert bench.report().message == 'holding'
-    held = bench.core.motion._tension
+    held = bench.core.activities.follower.tension
     torque = ROBOT.kinematics.holding_torque(OTHER)
     np.testing.assert_allclose(-ROBOT.routes.muscle_jacobian(OTHER).T @ held, torque, atol=0.3)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
@@ -62,41 +63,41 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
 def test_a_trajectory_too_fast_for_the_winches_is_slowed_as_a_whole_and_reported(bench):
     bench.configure(rate_limit=0.05)
     bench.core.trajectory(points(OTHER, 0.5))
-    trajectory = bench.core.motion.trajectory
+    trajectory = bench.core.activities.follower.trajectory
     assert trajectory.slowed > 1.2
     assert slowness(ROBOT, bench.mae, trajectory, bench.core.settings) == pytest.approx(1.0)
     sent = values(moved(bench, 20))
     assert 'slowed to' in bench.report().message
     sent = np.vstack([sent, values(moved(bench, 600))])
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.05 * DT + 1e-9
-    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
 
 
 def test_a_trajectory_of_zero_duration_takes_as_long_as_the_winches_need(bench):
     bench.core.trajectory(points(OTHER, 0.0))
     sent = values(moved(bench, 300))
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.3 * DT + 1e-9
-    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
-    assert not bench.core.motion.moving
+    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
+    assert not bench.core.activities.follower.is_moving
 
 
 def test_a_new_trajectory_replaces_the_old_from_its_start_time_and_an_empty_one_holds(bench):
     bench.core.trajectory(points(OTHER, 2.0))
     moved(bench, 100)
     bench.core.trajectory(points(REST, 2.0), delay=0.5)
-    first = bench.core.motion.trajectory
+    first = bench.core.activities.follower.trajectory
     moved(bench, 45)
-    assert bench.core.motion.trajectory is first
-    before = bench.core.motion.desired
+    assert bench.core.activities.follower.trajectory is first
+    before = bench.core.activities.follower.desired
     moved(bench, 10)
-    after = bench.core.motion.desired
-    assert bench.core.motion.trajectory is not first
+    after = bench.core.activities.follower.desired
+    assert bench.core.activities.follower.trajectory is not first
     assert np.abs(after.theta - before.theta).max() < 0.2
-    np.testing.assert_allclose(bench.core.motion.trajectory.end, REST)
+    np.testing.assert_allclose(bench.core.activities.follower.trajectory.end, REST)
     bench.core.trajectory(None)
     moved(bench, 40)
-    assert not bench.core.motion.desired.velocity.any()
-    assert np.abs(bench.core.motion.desired.theta - REST).max() > 0.1
+    assert not bench.core.activities.follower.desired.velocity.any()
+    assert np.abs(bench.core.activities.follower.desired.theta - REST).max() > 0.1
 
 
 def test_a_refused_trajectory_changes_nothing(bench):
@@ -104,22 +105,22 @@ def test_a_refused_trajectory_changes_nothing(bench):
         bench.core.trajectory(points(ROBOT.upper + 0.1))
     with pytest.raises(MessageError, match='all points have passed'):
         bench.core.trajectory(points(OTHER), delay=-5.0)
-    bench.core.stop('asked')
+    bench.stop()
     with pytest.raises(MessageError, match='stopped'):
         bench.core.trajectory(points(OTHER))
-    assert bench.core.motion.trajectory is None
+    assert bench.core.activities.follower.trajectory is None
     assert bench.step(3)[-1] is None
 
 
 def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_by_a_ramp(bench):
     bench.core.trajectory(points(OTHER))
     moved(bench, 50)
-    bench.core.stop('asked')
+    bench.stop()
     bench.step(100)
     assert not bench.core.reset(bench.now)
     bench.step(5)
-    assert not bench.core.motion.moving or not bench.core.follows
-    np.testing.assert_array_equal(bench.core.posture.theta, OTHER)
+    assert not bench.core.activities.follower.is_moving or not bench.core.is_following
+    np.testing.assert_array_equal(bench.core.target_state.theta, OTHER)
 
 
 def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
@@ -127,8 +128,8 @@ def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
     sent = moved(bench, 50)
     bench.now += 2.0
     sent += moved(bench, 200)
-    assert bench.core.follows
-    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
+    assert bench.core.is_following
+    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * 0.1 + 1e-9
 
 
@@ -136,11 +137,13 @@ def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(
     bench.configure(target_duration=0.5)
     bench.target(OTHER, (2.0, 0.0))
     moved(bench, 500)
-    held = bench.core.motion._tension
+    held = bench.core.activities.follower.tension
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
     moved(bench, 200)
-    np.testing.assert_allclose(bench.core.motion._tension, held, rtol=0.25)  # friction is unknown
+    np.testing.assert_allclose(
+        bench.core.activities.follower.tension, held, rtol=0.25
+    )  # friction is unknown
 
 
 @pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
@@ -148,11 +151,11 @@ def test_a_slow_target_does_not_carry_a_moving_arm_beyond_its_limits(bench, dura
     bench.configure(target_duration=duration)
     bench.core.trajectory(points(OTHER, 0.6))
     moved(bench, 15)
-    assert np.abs(bench.core.motion.desired.velocity).max() > 0.3
+    assert np.abs(bench.core.activities.follower.desired.velocity).max() > 0.3
     bench.target(REST + 0.1)
-    bench.core.motion.trajectory.check(ROBOT)
-    np.testing.assert_allclose(bench.core.motion.trajectory.end, REST + 0.1)
-    assert bench.core.motion.trajectory.duration < duration + 1.0
+    bench.core.activities.follower.trajectory.check(ROBOT)
+    np.testing.assert_allclose(bench.core.activities.follower.trajectory.end, REST + 0.1)
+    assert bench.core.activities.follower.trajectory.duration < duration + 1.0
 
 
 def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
@@ -162,10 +165,10 @@ def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
         bench.target(ROBOT.random_postures(1, rng)[0])
         moved(bench, 40)
         hand(bench, theta)
-        bench.core.motion.trajectory.check(ROBOT)
+        bench.core.activities.follower.trajectory.check(ROBOT)
         moved(bench, 30)
         bench.core.twist(np.array([0.1, 0.0, 0.1, 0.0, 0.0, 0.0]))
-        bench.core.motion.trajectory.check(ROBOT)
+        bench.core.activities.follower.trajectory.check(ROBOT)
 
 
 def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
@@ -181,12 +184,12 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
     bench.configure(target_duration=1.0)
     bench.target(OTHER)
     moved(bench, 400)
-    plain = bench.core.motion._tension
-    assert bench.core.follows
+    plain = bench.core.activities.follower.tension
+    assert bench.core.is_following
     bench.target(OTHER, (1.0, 0.0))
     moved(bench, 400)
-    np.testing.assert_allclose(bench.core.motion.desired.theta, OTHER)
-    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.motion._tension)
+    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
+    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.activities.follower.tension)
     np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
     bench.target(ROBOT.upper + 1.0)
     bench.step()
@@ -217,22 +220,22 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     core.use(ExactMae(ROBOT))
     arm.reset(REST)
     now, off = 0.0, []
-    while not off or core.motion.moving:
+    while not off or core.activities.follower.is_moving:
         theta, *read = arm.sense()
-        core.muscles(Muscles(*read), now)
+        core.muscles(np.array([*read]), now)
         core.estimated(theta, now)
-        if core.motion.trajectory is None:
+        if core.activities.follower.trajectory is None:
             core.trajectory(points(REST, 0.5))
         elif now > 0.6 and not off:
             core.trajectory(points(OTHER))
             arm.set_wrench(np.array([push, 0.0, 0.0, 0.0, 0.0, 0.0]))
         arm.command_length(core.step(now).value)
         if now > 0.6:
-            off.append(core.motion.desired.theta - arm.theta)
+            off.append(core.activities.follower.desired.theta - arm.theta)
         interval = 0.001 * rng.choice(intervals)
         arm.step(interval)
         now += interval
-    assert not core.safety.cause
+    assert core.supervisor.is_running
     return np.array(off)
 
 
@@ -292,7 +295,7 @@ def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench)
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
     demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
     beyond = (demanded - limits.limit) / (limits.max - limits.limit)
-    assert 0.0 < beyond.max() <= FED_BACK + 1e-9 < 0.5
+    assert 0.0 < beyond.max() <= DEMANDED + 1e-9 < 0.5
 
 
 @pytest.mark.parametrize('trajectory', [True, False])
@@ -306,7 +309,7 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
         bench.tension = pull = pull + 0.3 * (demanded - pull)
         highest = max(highest, (pull - ROBOT.tension.limit).max())
     assert highest > 20.0  # [N]
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
 
 
 def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
@@ -317,7 +320,7 @@ def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch)
     monkeypatch.setattr(bench.core, '_ready', lambda *_: (start, bench.mae))
     with pytest.raises(MessageError, match='leaves the joint limits'):
         bench.core.trajectory(points((-0.8, -1.1), 0.3))
-    assert not bench.core.follows
+    assert not bench.core.is_following
 
 
 def test_an_isolated_muscle_does_not_slow_a_trajectory():
@@ -343,14 +346,14 @@ def hand(bench, theta, whole=False):
 def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(bench):
     hand(bench, OTHER)
     moved(bench, 300)
-    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta)
+    at = ROBOT.kinematics.end_effector_pose(bench.core.activities.follower.desired.theta)
     wanted = ROBOT.kinematics.end_effector_pose(OTHER)
     np.testing.assert_allclose(at.translation, wanted.translation, atol=5e-3)
     far = pin.SE3(wanted.rotation, 3.0 * wanted.translation)
-    before = bench.core.motion.trajectory
+    before = bench.core.activities.follower.trajectory
     with pytest.raises(MessageError, match='out of reach'):
         bench.core.pose(far, False, bench.now)
-    assert bench.core.motion.trajectory is before
+    assert bench.core.activities.follower.trajectory is before
     bench.configure(unreachable='nearest')
     bench.core.pose(far, False, bench.now)
     bench.step()
@@ -382,12 +385,16 @@ def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
         hand(bench, start + 0.01 * n * speed)
         moved(bench, 1)
     wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
-    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
+    at = ROBOT.kinematics.end_effector_pose(
+        bench.core.activities.follower.desired.theta
+    ).translation
     assert np.linalg.norm(at - wanted) < 0.006
     moved(bench, 150)  # no other comes
-    assert not bench.core.motion.moving
+    assert not bench.core.activities.follower.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
-    at = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation
+    at = ROBOT.kinematics.end_effector_pose(
+        bench.core.activities.follower.desired.theta
+    ).translation
     assert np.linalg.norm(at - last) < 1e-3
 
 
@@ -399,7 +406,7 @@ def test_a_repeated_hand_pose_is_approached_at_hand_speed(bench, every):
         if n % every == 0:
             hand(bench, OTHER)
         moved(bench, 1)
-        before, where = where, place(bench.core.motion.desired.theta).translation
+        before, where = where, place(bench.core.activities.follower.desired.theta).translation
         if before is not None:
             fastest = max(fastest, float(np.linalg.norm(where - before)) / DT)
     assert fastest < 0.15
@@ -411,10 +418,10 @@ def test_the_duration_to_the_nearest_posture_does_not_grow_with_an_unreachable_d
     at, taken = ROBOT.kinematics.end_effector_pose(REST), []
     for far in (3.0, 1e3, 1e9):
         bench.core.pose(pin.SE3(at.rotation, at.translation + [far, 0.0, 0.0]), False, bench.now)
-        taken.append(bench.core.motion.latest.duration)
+        taken.append(bench.core.activities.follower.latest.duration)
     assert max(taken) < 5.0
     bench.step(3)
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
 
 
 def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
@@ -435,9 +442,14 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
     for _ in range(20):
         bench.core.twist(twist)
         moved(bench, 5)
-    rate = ROBOT.kinematics.end_effector_jacobian(bench.core.motion.desired.theta)[:3]
-    np.testing.assert_allclose(rate @ bench.core.motion.desired.velocity, twist[:3], atol=0.02)
+    rate = ROBOT.kinematics.end_effector_jacobian(bench.core.activities.follower.desired.theta)[:3]
+    np.testing.assert_allclose(
+        rate @ bench.core.activities.follower.desired.velocity, twist[:3], atol=0.02
+    )
     moved(bench, 80)
-    assert not bench.core.motion.moving
-    gone = ROBOT.kinematics.end_effector_pose(bench.core.motion.desired.theta).translation - begun
+    assert not bench.core.activities.follower.is_moving
+    gone = (
+        ROBOT.kinematics.end_effector_pose(bench.core.activities.follower.desired.theta).translation
+        - begun
+    )
     assert gone @ twist[:3] / 0.1 > 0.08

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.posture import Ramp
+from musculoskeletal_ae.control.ramps import Ramp
 
 values = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
 

@@ -3,13 +3,20 @@
 
 import numpy as np
 import pytest
+from control_bench import inputs
 from exact_mae import ExactMae
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import write_robot
 
-from musculoskeletal_ae.control.methods import BAND, HOLD, WALL_AT, FloatControl, TorqueControl
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.torque import (
+    BAND,
+    HOLD,
+    WALL_AT,
+    GravityCompensation,
+    TorqueControl,
+)
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('musashi_left_arm')
@@ -20,10 +27,10 @@ DT = 0.01
 
 
 def settled(control, target=THETA, effort=None, theta=THETA, limit=LIMIT):
-    effort = np.zeros(5) if effort is None else effort
+    control.set_target(target, np.zeros(5) if effort is None else effort)
     for _ in range(300):
-        tension = control.step(MAE, theta, target, effort, limit, DT)
-    return tension
+        command = control.step(inputs(MAE, theta, limit, ROBOT))
+    return command.value
 
 
 def torque_of(tension):
@@ -51,7 +58,7 @@ def test_the_position_gain_exerts_torque_towards_the_target():
     np.testing.assert_allclose(extra, 4.0 * offset, atol=0.1)
 
 
-@pytest.mark.parametrize('control', [TorqueControl, FloatControl])
+@pytest.mark.parametrize('control', [TorqueControl, GravityCompensation])
 def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     mae, middle = ExactMae(robot), 0.5 * (robot.lower + robot.upper)
@@ -59,10 +66,11 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
 
     def torque(theta):
         held = control(robot, Settings())
-        held.start_from(robot.tension.bias)
-        held.step(mae, middle, middle, nothing, limit, DT)
+        held.set_target(middle, nothing)
+        held.enter(inputs(mae, middle, limit, robot))
+        held.step(inputs(mae, middle, limit, robot))
         for _ in range(300):
-            tension = held.step(mae, theta, middle, nothing, limit, DT)
+            tension = held.step(inputs(mae, theta, limit, robot)).value
         return -mae.muscle_jacobian(theta, tension).T @ tension
 
     theta = middle - 0.02 * robot.kinematics.radian
@@ -73,10 +81,11 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
 
 def test_tensions_change_no_faster_than_the_rate_limit_allows():
     control = TorqueControl(ROBOT, Settings(rate_limit=0.05))
-    control.start_from(np.full(ROBOT.muscle_count, 150.0))
     before = np.full(ROBOT.muscle_count, 150.0)
+    control.set_target(THETA, np.zeros(5))
+    control.enter(inputs(MAE, THETA, LIMIT, ROBOT, tension=before))
     for _ in range(50):
-        tension = control.step(MAE, THETA, THETA, np.zeros(5), LIMIT, DT)
+        tension = control.step(inputs(MAE, THETA, LIMIT, ROBOT)).value
         assert np.abs(tension - before).max() <= ROBOT.stiffness[0] * 0.05 * DT + 1e-9
         before = tension
 
@@ -97,12 +106,14 @@ def carried(control, theta):
 
 
 def test_gravity_compensation_carries_the_weight_and_no_more():
-    np.testing.assert_allclose(carried(FloatControl(ROBOT, Settings()), THETA), 0.0, atol=0.1)
+    np.testing.assert_allclose(
+        carried(GravityCompensation(ROBOT, Settings()), THETA), 0.0, atol=0.1
+    )
 
 
 @pytest.mark.parametrize('way', [1.0, -1.0])
 def test_gravity_compensation_resists_a_motion_by_its_band_at_most(way):
-    control = FloatControl(ROBOT, Settings())
+    control = GravityCompensation(ROBOT, Settings())
     carried(control, THETA)
     little = carried(control, THETA + way * 0.5 * BAND)
     np.testing.assert_allclose(little, -way * 0.5 * BAND * HOLD, atol=0.15)
@@ -114,6 +125,6 @@ def test_gravity_compensation_resists_a_motion_by_its_band_at_most(way):
 def test_gravity_compensation_pushes_back_from_the_joint_limits():
     theta = THETA.copy()
     theta[3] = ROBOT.lower[3]
-    pushed = carried(FloatControl(ROBOT, Settings()), theta)
+    pushed = carried(GravityCompensation(ROBOT, Settings()), theta)
     assert pushed[3] > 10.0 * WALL_AT
     np.testing.assert_allclose(np.delete(pushed, 3), 0.0, atol=0.15)

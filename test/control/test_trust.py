@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.controller import RESUME
-from musculoskeletal_ae.control.safety import Muscles
-from musculoskeletal_ae.control.watch import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE
+from musculoskeletal_ae.control.supervisor import RESUME
+from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE
 from musculoskeletal_ae.exceptions import MessageError
 
 TICK = 0.1 * DT  # [m] that the rate limit allows
@@ -67,10 +66,10 @@ LIES = st.one_of(
 def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lies):
     bench = Lied()
     for row, lie, pause in lies:
-        before = bench.core.safety.command
+        before = bench.core.limiter.command
         sent = bench.lies(1, **{row: lie}) + bench.step(pause)
         assert largest_step(before, sent) <= TICK + 1e-9
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
 
 
 @pytest.mark.parametrize(
@@ -86,14 +85,14 @@ def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lie
 )
 def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(row, lie, cause):
     bench = Lied()
-    before = bench.core.safety.command
+    before = bench.core.limiter.command
     sent = bench.lies(70 if 'jumped' in cause else 110, **{row: lie})
-    assert cause in bench.core.safety.cause
-    assert not bench.core.safety.passing
+    assert cause in bench.condition
+    assert bench.core.supervisor.mode != 'paused'
     assert cause in bench.core.reset(bench.now)
     assert largest_step(before, sent) <= TICK + 1e-9
     bench.step(120)
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     bench.step(200)
     assert bench.report().message == 'holding'
 
@@ -104,15 +103,17 @@ def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_th
     bench.temperature = np.full(ROBOT.muscle_count, np.nan)
     bench.temperature[known] = 110.0
     bench.step(200)
-    assert bench.core.safety.cause[:10] == ('overheated' if known else '')
+    assert bench.condition[:10] == ('overheated' if known else '')
     warm = np.isin(np.arange(ROBOT.muscle_count), known)
     tension = ROBOT.tension
-    np.testing.assert_array_equal(bench.core.watch.limit, np.where(warm, tension.bias, tension.max))
+    np.testing.assert_array_equal(
+        bench.core.watchdog.heat.planned, np.where(warm, tension.bias, tension.max)
+    )
 
 
 def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
     bench = Lied()
-    before = bench.core.safety.command
+    before = bench.core.limiter.command
     bench.blind = {'estimate'}
     for k in range(15):
         with pytest.raises(MessageError, match='outside the joint limits'):
@@ -120,22 +121,22 @@ def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_
         sent = bench.step()
         assert largest_step(before, sent) <= TICK + 1e-9
         before = sent[-1]
-        assert not (bench.core.safety.cause and k < 9)
-    assert 'estimate: θ far outside' in bench.core.safety.cause
+        assert not (bench.condition and k < 9)
+    assert 'estimate: θ far outside' in bench.condition
 
 
 def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_the_rate_limit():
     bench = Lied()
     bench.pull(np.full(ROBOT.muscle_count, 150.0))
     bench.step(300)
-    limit, before = bench.core.watch.limit.copy(), bench.core.safety.command
+    limit, before = bench.core.watchdog.heat.planned.copy(), bench.core.limiter.command
     for hot in (84.0, 90.0, 200.0):
         sent = bench.lies(2, temperature=lambda t, hot=hot: t * 0.0 + hot) + bench.step(10)
-        np.testing.assert_array_equal(bench.core.watch.limit, limit)
+        np.testing.assert_array_equal(bench.core.watchdog.heat.planned, limit)
         assert largest_step(before, sent) <= TICK + 1e-9
     bench.temperature = COLD + np.array([60.0, *[0.0] * (ROBOT.muscle_count - 1)])
     assert largest_step(before, bench.step(200)) <= TICK + 1e-9
-    assert bench.core.watch.limit[0] == ROBOT.tension.bias[0]
+    assert bench.core.watchdog.heat.planned[0] == ROBOT.tension.bias[0]
 
 
 def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
@@ -144,15 +145,15 @@ def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
     bench.temperature = COLD.copy()
     bench.temperature[2] = limit + OVERHEATED + 1.0
     bench.step(20)
-    assert bench.core.safety.cause.startswith(f'overheated: {ROBOT.muscles[2]} 106 °C')
+    assert bench.condition.startswith(f'overheated: {ROBOT.muscles[2]} 106 °C')
     bench.temperature[2] = limit + 1.0
     bench.step(20)
     assert 'overheated' in bench.core.reset(bench.now)
     bench.temperature[2] = limit - 6.0
     bench.step(20)
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     bench.step(20)
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
 
 
 def test_a_tension_above_the_limit_is_reported_at_once_and_stops_the_arm_after_the_overload_time():
@@ -162,12 +163,12 @@ def test_a_tension_above_the_limit_is_reported_at_once_and_stops_the_arm_after_t
     bench.pull(tension)
     assert f'tension above 200 N: {ROBOT.muscles[3]}' in bench.report().message
     bench.step(280)
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
     bench.step(20)
-    assert bench.core.safety.cause == f'{ROBOT.muscles[3]}: tension above 200 N for 3 s'
+    assert bench.condition == f'{ROBOT.muscles[3]}: tension above 200 N for 3 s'
     bench.tension = None
     bench.step(120)
-    assert bench.core.reset(bench.now) == ''
+    assert bench.core.reset(bench.now) is None
     assert OVERLOAD_MOMENT < 3.0
 
 
@@ -181,13 +182,13 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
     bench.step(50)
     bench.blind = {what}
     held = bench.step(60)  # late after 0.2 s, gone after 0.7 s
-    assert 'older' in bench.core.safety.cause
+    assert 'older' in bench.condition
     assert bench.report().level == 'warn'
     assert len({tuple(command.value) for command in held[25:]}) == 1
     bench.blind = set()
     back = bench.step(round(RESUME / DT) + 3)
-    assert bench.core.safety.cause == ''
-    assert bench.core.posture.exploring
+    assert bench.cause == ''
+    assert bench.core.supervisor.explores
     assert largest_step(held[-1], back + bench.step(100)) <= TICK + 1e-9
 
 
@@ -199,9 +200,9 @@ def test_data_that_stay_away_latch_the_stop_and_end_exploration():
     bench.step(80)
     bench.blind = set()
     bench.step(200)
-    assert 'muscle_states older' in bench.core.safety.cause
-    assert not bench.core.posture.exploring
-    assert bench.core.reset(bench.now) == ''
+    assert 'muscle_states older' in bench.condition
+    assert not bench.core.supervisor.explores
+    assert bench.core.reset(bench.now) is None
 
 
 @pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
@@ -210,7 +211,7 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
     before = bench.step()[-1]
     bench.now += pause
     sent = bench.step(100)
-    assert bench.core.safety.cause == ''
+    assert bench.cause == ''
     assert np.abs(values(sent)[0] - before.value).max() <= 10 * TICK + 1e-9  # LONGEST_STEP
     assert pause > OWN_PAUSE
 
@@ -229,10 +230,10 @@ def run(pace, gap=0.0, at=150, count=250):
             sent.append(bench.core.step(now, time))
         now, time = now + DT / pace, time + DT
         tension = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
-        bench.core.muscles(Muscles(ROBOT.muscle_lengths(REST, tension), tension, COLD), now)
+        bench.core.muscles(np.array([ROBOT.muscle_lengths(REST, tension), tension, COLD]), now)
         bench.core.estimated(REST, now)
         sent.append(bench.core.step(now, time))
-    return values(sent), bench.core.safety.cause
+    return values(sent), bench.condition
 
 
 @pytest.mark.parametrize('pace', [0.3, 3.0])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from nominal_body import nominal_arm
 
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.experiments.control import METHODS, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 
@@ -33,7 +34,7 @@ def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monk
     def stopping(loop, theta):
         target(loop, theta)
         if loop.core.settings.method == 'geometric':
-            loop.core.safety.stop('as a test')
+            loop.core.stop(StopCause.OPERATOR)
 
     monkeypatch.setattr(ClosedLoop, 'target', stopping)
     ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)

@@ -54,7 +54,7 @@ def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm
     arm.targets.publish(JointState(name=['knee'], position=[0.0]))
     rejected = arm.controller.rejected
     arm.graph.wait(lambda: rejected['target_joint_states: unknown joint'] == 1, 'the rejection')
-    assert arm.controller.core.posture.theta[1] == arm.robot.lower[1]
+    assert arm.controller.core.target_state.theta[1] == arm.robot.lower[1]
 
 
 def test_exploration_moves_the_arm_and_a_target_ends_it(arm):

@@ -98,7 +98,7 @@ def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_takes_over(mo
 
     def heard():  # it may be new to the publisher, too
         arm.target(THERE)
-        return arm.controller.core.posture.theta is not None
+        return arm.controller.core.target_state.theta is not None
 
     arm.graph.wait(heard, 'the target')
     arm.goes_to(THERE)

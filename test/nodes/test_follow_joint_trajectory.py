@@ -114,10 +114,10 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     arm.graph.wait(lambda: fourth.status == 'aborted', 'the end of the goal')
     assert fourth.result.error_code == -4
     arm.says('holding')
-    before = arm.controller.core.motion.trajectory
+    before = arm.controller.core.activities.follower.trajectory
     assert server.send(Goal(trajectory(arm, arm.robot.upper + 0.5))) is None
     assert server.send(Goal(JointTrajectory())) is None
-    assert arm.controller.core.motion.trajectory is before
+    assert arm.controller.core.activities.follower.trajectory is before
     rejected = arm.controller.rejected
     assert rejected['follow_joint_trajectory: beyond the joint limits'] == 1
     assert rejected['follow_joint_trajectory: empty'] == 1

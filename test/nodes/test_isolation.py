@@ -38,7 +38,7 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
     assert arm.estimator.core.verified == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name
-    graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
+    graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     assert arm.controller.core.robot.isolated == (3,)
     arm.target(THERE)
     arm.goes_to(THERE)
@@ -55,10 +55,10 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
     graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
     assert arm.estimator.core.verified == f'{name}: a sensor says no number'
-    graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
+    graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     arm.target(THERE)
     arm.goes_to(THERE)
-    assert np.isfinite(arm.controller.core.safety.command.value).all()
+    assert np.isfinite(arm.controller.core.limiter.command.value).all()
     for node in (arm.estimator, arm.controller):
         assert any('not finite' in reason for reason in node.rejected)
 

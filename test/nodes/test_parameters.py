@@ -142,7 +142,7 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
         (
             Controller,
             {'method': 'float', 'joint_stiffness': [1.0]},
-            lambda node: node.core.posture.exploring,
+            lambda node: node.core.supervisor.explores,
         ),
     ],
 )

@@ -46,7 +46,7 @@ def test_a_bad_network_is_refused_by_every_node_and_the_arm_goes_on(arm, trained
     for node in nodes:
         assert 'unexplained on the geometric model, limit' in node._reception.last_rejected
     arm.goes_to(HERE)
-    assert arm.controller.core.safety.cause == ''
+    assert arm.controller.core.supervisor.is_running
     arm.never_jumped()
 
 
@@ -138,7 +138,7 @@ def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
 
         node.create_subscription(Float64MultiArray, 'muscle_states', repeat, 10)
         two = f'from 2 nodes {node.get_namespace()}/hardware_emulator'
-        arm.graph.wait(lambda: two in arm.controller.core.watch.intruder, 'the stop')
+        arm.graph.wait(lambda: two in arm.controller.core.watchdog.second_publisher, 'the stop')
     finally:
         twin.destroy_node()
 
@@ -181,7 +181,7 @@ def test_with_use_sim_time_a_ramp_follows_the_clock(graph, arm26, trained_file):
         clock.publish(message)
         muscles.publish(array_message(rows, 'quantity', 'muscle'))
         joints.publish(joint_message(arm26.joints, HERE, message.clock))
-        if node.core.posture.theta is None and now > 101.0:
+        if node.core.target_state.theta is None and now > 101.0:
             targets.publish(JointState(name=arm26.joints, position=[-0.2, -0.8]))
             begun = now
         ramp = node.core.posture._ramp
@@ -189,7 +189,7 @@ def test_with_use_sim_time_a_ramp_follows_the_clock(graph, arm26, trained_file):
             done_at = now
         graph.spin(0.01)
         assert time.monotonic() - started < 60.0
-    assert node.core.safety.cause == ''
+    assert node.core.supervisor.is_running
     # By the steady clock it would be over after 0.6 s of this one.
     assert done_at - begun >= 0.9 * ramp.duration
     assert len(sent) > 0

@@ -40,7 +40,7 @@ def test_length_offsets_are_found_and_reach_every_node(
         # The network knows the geometric model alone.
         np.testing.assert_allclose(other.zeros.offset, offset, atol=0.03)
         assert not any('length' in reason for reason in other.rejected)
-    assert controller.core.safety.zeroed and not controller.core.safety.cause
+    assert controller.core.stream.body.offsets.known and controller.core.supervisor.is_running
     assert not node.core.cause
 
 
@@ -56,7 +56,7 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
 
     def known(expected):
         graph.wait(
-            lambda: controller.zeros.known == controller.core.safety.zeroed == expected,
+            lambda: controller.zeros.known == controller.core.stream.body.offsets.known == expected,
             'the zeros',
         )
 

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is published is never faster, stronger or less finite than allowed, whatever is desired."""
+
+import numpy as np
+import pytest
+from control_bench import sample
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from musculoskeletal_ae.arrays import median_of_rows
+from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, unchanging
+from musculoskeletal_ae.control.limiter import LENGTH_MARGIN, CommandLimiter
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot.load('arm26')
+COUNT, BIAS, MAX = ROBOT.muscle_count, ROBOT.tension.bias[0], ROBOT.tension.max[0]
+LIMIT = np.full(COUNT, MAX)
+DT = 0.01
+VALUES = st.floats(-1e3, 1e3) | st.sampled_from([np.nan, -np.inf])
+
+
+@given(st.integers(1, 6).flatmap(lambda rows: arrays(float, (rows, 3), elements=VALUES)))
+@pytest.mark.filterwarnings('ignore:invalid value')
+def test_median_of_rows_agrees_with_numpy(rows):
+    np.testing.assert_array_equal(median_of_rows(rows), np.median(rows, axis=0))
+
+
+def vectors(low, high):
+    return st.lists(st.floats(low, high), min_size=COUNT, max_size=COUNT).map(np.array)
+
+
+@given(
+    st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
+    st.floats(0.001, 1.0),
+)
+def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_hard(commands, rate):
+    limiter, before = CommandLimiter(ROBOT, Settings(rate_limit=rate)), None
+    for desired, length, limit in commands:
+        pull = np.full(COUNT, BIAS)
+        if before is not None:  # muscle stiffness control obeys the last command
+            pull += np.maximum(0.0, ROBOT.stiffness * (length - before))
+        now = sample(length, pull)
+        if before is None:
+            before = limiter.last(LENGTH, now).value
+        sent = limiter.limit(Command(LENGTH, desired), now, limit, DT).value
+        assert (sent - before >= -rate * DT - 1e-12).all()
+        demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
+        tense = pull > ROBOT.tension.limit
+        assert (demanded <= limit + 1e-6)[tense].all()
+        # Paying out faster is what the tension limit may do, and nothing else.
+        slow = ~tense | (demanded < limit - 1e-6)
+        assert ((sent - before)[slow] <= rate * DT + 1e-12).all()
+        before = sent
+
+
+def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
+    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
+    held = unchanging(ROBOT, LENGTH, now)
+    before = limiter.limit(held, now, LIMIT, DT).value
+    for _ in range(5):
+        sent = limiter.limit(held, sample(0.06, BIAS), LIMIT, DT).value
+        assert (sent - before <= Settings().rate_limit * DT + 1e-12).all()
+        before = sent
+
+
+def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_most():
+    limiter = CommandLimiter(ROBOT, Settings())
+    for _ in range(10):
+        held = unchanging(ROBOT, LENGTH, sample(0.0, BIAS))
+        sent = limiter.limit(held, sample(5.0, BIAS), LIMIT, DT).value
+    theta = ROBOT.random_postures(2000, np.random.default_rng(3))
+    assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
+
+
+@given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))
+def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(commands):
+    settings = Settings()
+    limiter, before = CommandLimiter(ROBOT, settings), np.full(COUNT, BIAS)
+    for desired, limit in commands:
+        sent = limiter.limit(Command(TENSION, desired), sample(0.0, BIAS), limit, DT).value
+        assert (sent >= BIAS).all()
+        assert (sent <= limit).all()
+        assert (sent - before <= ROBOT.stiffness * settings.rate_limit * DT + 1e-9).all()
+        before = sent
+
+
+@given(vectors(-0.5, 0.5), vectors(BIAS, MAX), vectors(BIAS, MAX))
+def test_going_over_from_lengths_to_tensions_and_back_starts_from_how_the_muscles_pull(
+    desired, pull, other
+):
+    limiter, rate = CommandLimiter(ROBOT, Settings()), Settings().rate_limit
+    now = sample(0.0, pull)
+    limiter.limit(Command(LENGTH, desired), now, LIMIT, DT)
+    tension = limiter.limit(Command(TENSION, other), now, LIMIT, DT).value
+    assert (np.abs(tension - pull) <= ROBOT.stiffness * rate * DT + 1e-9).all()
+    length = limiter.limit(Command(LENGTH, desired), now, LIMIT, DT).value
+    before = np.minimum(unchanging(ROBOT, LENGTH, now).value, limiter.longest)
+    assert (length >= before - rate * DT - 1e-12).all()
+
+
+@pytest.mark.parametrize('kind', [LENGTH, TENSION])
+def test_a_command_that_is_not_finite_is_not_published_and_the_last_one_stays(kind):
+    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
+    good = limiter.limit(unchanging(ROBOT, kind, now), now, LIMIT, DT)
+    bad = good.value.copy()
+    bad[2] = np.nan
+    assert limiter.limit(Command(kind, bad), now, LIMIT, DT) is None
+    assert limiter.command is good
+
+
+@given(vectors(0.0, MAX), vectors(-0.2, 0.2))
+def test_the_unchanging_command_demands_the_present_tension(tension, length):
+    now = sample(length, tension)
+    sent = unchanging(ROBOT, LENGTH, now).value
+    pull = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
+    np.testing.assert_allclose(pull, np.maximum(tension, BIAS))
+    np.testing.assert_array_equal(unchanging(ROBOT, TENSION, now).value, np.maximum(tension, BIAS))
