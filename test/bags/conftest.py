@@ -33,7 +33,7 @@ class Tool:
     """`record` or `replay` as a process; ended by the test that started it."""
 
     def __init__(self, name: str, *arguments: str | Path) -> None:
-        code = f'import sys; from musculoskeletal_ae.nodes.{name} import main; sys.exit(main())'
+        code = f'import sys; from musculoskeletal_ae.executables import {name}; sys.exit({name}())'
         self.process = subprocess.Popen(
             [sys.executable, '-c', code, *map(str, arguments)],
             stdout=subprocess.PIPE,
