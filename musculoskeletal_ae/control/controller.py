@@ -182,6 +182,8 @@ class Controller:
         self.sent_at = 0.0  # when the last command went out; its user says so
         self._estimate_problem = Persistence()
         self._suspicion = Suspicion()
+        if self.settings.method == 'float':
+            self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
     # -- what comes in --------------------------------------------------------------------------
 
@@ -529,10 +531,9 @@ class Controller:
     def _hold(self) -> None:
         """Go to the target by the method that is set now, from how the muscles pull."""
         state = self.target_state
-        if self.settings.method == 'tension':
-            activity = Activity.TORQUE
-        else:
-            activity = Activity.IDLE if state.theta is None else Activity.HOLDING
+        by_torque = self.settings.method == 'tension'
+        holding = Activity.TORQUE if by_torque else Activity.HOLDING
+        activity = Activity.IDLE if state.theta is None else holding
         self.activities.leave()
         if state.theta is not None:
             self.activities.torque.set_target(state.theta, state.effort)
