@@ -282,7 +282,8 @@ class Controller:
         isolated = self.stream.body.isolated
         suspect = self._suspicion.suspect(self.watchdog.has_anomaly, isolated)
         self.stopping.suspect = suspect
-        self.supervisor.on_suspect(suspect is not None)
+        if suspect is not None:
+            self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
         """Count the messages' time from here."""
@@ -306,11 +307,18 @@ class Controller:
             nearest = self.planner.takes_nearest
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
+        before = self.target_state
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
-        if self.supervisor.is_running and by_follower(self.settings) and self._is_ready:
+        if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
+            self._hold()  # it is gone to as soon as the arm may move
+            return
+        try:
             self._approach(self.settings.target_duration or self.settings.first_duration)
-        else:  # it is gone to as soon as the arm may move
-            self._hold()
+        except MessageError:
+            self.target_state = before
+            raise
+        except Exception as error:  # noqa: BLE001 (as in `_desired`)
+            self._note_fault(error)
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
         """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
@@ -358,6 +366,8 @@ class Controller:
             known = self.stream.body.offsets.known
             exploring = Activity.EXPLORING if known else Activity.CALIBRATING
             self._request(exploring if wanted else Activity.IDLE)
+        elif not wanted:  # nor is it to explore after a stop
+            self.supervisor.on_request(self.supervisor.activity)
         return ''
 
     def stop(self, cause: StopCause, detail: str = '') -> None:
@@ -429,8 +439,11 @@ class Controller:
                 reason = f'what is left without {isolated} holds too few postures; {RESTORE}'
             self.target_state.unreachable_reason = reason
         except Exception as error:  # noqa: BLE001 (whatever it is, the arm must stop)
-            self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
+            self._note_fault(error)
         return None
+
+    def _note_fault(self, error: Exception) -> None:
+        self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
         activities, state = self.activities, self.target_state

@@ -46,7 +46,7 @@ class Event(Enum):
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over: the arm is being released'
     SUSPECT = 'the estimator has isolated a suspect muscle'
-    SUSPECT_LOST = 'the suspect is no longer isolated, or the estimator is gone'
+    SUSPECT_LOST = 'the estimator is gone, and its suspect with it'
     VERIFIED = 'the anomaly ended by verification, and every cause clears by that'
     VERIFIED_IN_VAIN = 'the anomaly ended by verification, and another cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
@@ -175,7 +175,11 @@ class Supervisor:
             self._fire(Event.RELEASED)
 
     def on_suspect(self, is_isolated: bool) -> None:
-        """Take whether a suspect muscle is isolated and being verified."""
+        """Take that a suspect muscle is isolated and being verified, or that the estimator is gone.
+
+        A suspect that is no longer isolated was found healthy: the verification ends with the
+        anomaly.
+        """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 
     def on_verified(self) -> None:
@@ -218,6 +222,8 @@ class Supervisor:
                 self.activity = Activity.EXPLORING
         elif self.is_latched:
             self.activity = AFTER_A_STOP.get(self.activity, self.activity)
+            if self.condition is not None:  # one that might have cleared by itself has latched
+                self._causes.add(self.condition.cause)
 
 
 def diagram() -> str:
