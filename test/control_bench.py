@@ -13,7 +13,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_stream import MuscleStream
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 ROBOT = Robot.load('arm26')
 DT = 0.01
@@ -25,7 +25,18 @@ COLD = np.full(ROBOT.muscle_count, 30.0)
 def sample(length, tension, robot=ROBOT, temperature=30.0):
     """Return muscle states as the stream gives them out; numbers are for all muscles."""
     rows = [np.broadcast_to(row, robot.muscle_count) for row in (length, tension, temperature)]
-    return MuscleStream(robot).take_states(np.array(rows, dtype=float), 0.0)
+    states = np.array(rows, dtype=float)
+    return MuscleSample(
+        time=0.0,
+        length=states[0],
+        length_read=states[0],
+        motor_tension=states[1],
+        bone_tension=states[1],
+        sliding=np.zeros(robot.muscle_count),
+        temperature=states[2],
+        usable=robot.used,
+        newest=states,
+    )
 
 
 def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):

@@ -405,23 +405,21 @@ class Controller:
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
         if stale_estimate:  # an estimator that starts anew knows of no suspect
             self.supervisor.on_suspect(False)
-        was_running = self.supervisor.is_running
-        if self.limiter.command is not None or not was_running:  # else there is nothing to stop
-            is_released = not was_running and self.stopping.is_releasing
-            self.supervisor.on_conditions(present, step.elapsed, is_released)
+        if self.limiter.command is not None or not self.supervisor.is_running:
+            # Before the first command there is nothing to stop.
+            self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
         fall = self.limiter.largest_change(TENSION, step.dt)
         self.watchdog.heat.lower(self.settings.temperature_limit, fall)
         dt = max(step.dt - computing, 0.0)
-        desired = None
-        if self.supervisor.is_running and not present:
-            desired = self._desired(step.dt)
+        if self.supervisor.is_running:
+            self.stopping.leave()
+            desired = None if present else self._desired(step.dt)
+            limited = self._limited(desired, dt)
+            if desired is not None and limited is None:
+                self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
-            desired = self._stopped(was_running, present, dt)
-        command = self._limited(desired, dt)
-        if command is None and desired is not None and self.supervisor.is_running:
-            self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
-            command = self._limited(self._stopped(True, present, dt), dt)
-        return command if command is not None else self.limiter.command
+            limited = self._limited(self._stopped(present, dt), dt)
+        return limited or self.limiter.command
 
     def _desired(self, dt: float) -> Command | None:
         """Return what the activity wants; any fault of it stops the arm."""
@@ -512,9 +510,9 @@ class Controller:
         released = self.limiter.slack_length if command.kind == LENGTH else 0.0
         return Command(command.kind, np.where(self.robot.used, command.value, released))
 
-    def _stopped(self, begins: bool, present: list[Condition], dt: float) -> Command | None:
+    def _stopped(self, present: list[Condition], dt: float) -> Command | None:
         """Return the command of a stopped arm."""
-        if begins:
+        if not self.stopping.is_entered:
             self.activities.leave()
             self.stopping.enter()
         if self.sample is None:

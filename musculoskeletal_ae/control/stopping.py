@@ -28,13 +28,15 @@ class SafeStop:
 
     Attributes:
         suspect: Position of the muscle that may be wound in, or None.
+        is_entered: Whether a stop goes on.
     """
 
     def __init__(self, robot: Robot, settings: Settings, limiter: CommandLimiter) -> None:
         self._limiter = limiter
         self.suspect: int | None = None
+        self.is_entered = False
         self.use(robot, settings)
-        self.enter()
+        self.leave()
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Release this robot, whose isolated muscles do not count, by these settings."""
@@ -42,6 +44,12 @@ class SafeStop:
 
     def enter(self) -> None:
         """Begin a stop."""
+        self.leave()
+        self.is_entered = True
+
+    def leave(self) -> None:
+        """End a stop."""
+        self.is_entered = False
         self._held = 0.0  # [s]
         self._wound_from: float | None = None  # the suspect's command before it is wound in [m]
 

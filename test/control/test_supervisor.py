@@ -47,7 +47,7 @@ def test_old_data_that_outlasts_the_hold_time_stops_the_arm_until_a_reset():
     wait(supervisor, seconds=10.0)
     assert supervisor.mode == 'stopped'
     assert supervisor.on_reset([]) is None
-    assert supervisor.mode == 'holding'
+    assert supervisor.mode == 'idle'  # exploration has no target to hold
 
 
 def test_a_reset_is_refused_with_the_cause_that_is_present():
