@@ -307,7 +307,7 @@ class Controller:
             nearest = self.planner.takes_nearest
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
-        before = self.target_state
+        last = self.target_state
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
         if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
             self._hold()  # it is gone to as soon as the arm may move
@@ -315,7 +315,7 @@ class Controller:
         try:
             self._approach(self.settings.target_duration or self.settings.first_duration)
         except MessageError:
-            self.target_state = before
+            self.target_state = last
             raise
         except Exception as error:  # noqa: BLE001 (as in `_desired`)
             self._note_fault(error)
