@@ -28,9 +28,10 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector, Verdict
-from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
-from musculoskeletal_ae.estimation.verification import HEALTHY, VERIFYING, Verification
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeroing, Zeros
+from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
+from musculoskeletal_ae.estimation.length_calibration import LengthCalibration
+from musculoskeletal_ae.estimation.verification import Outcome, Verification
+from musculoskeletal_ae.estimation.verification import Verdict as VerificationVerdict
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.heat import Heat
@@ -40,6 +41,7 @@ from musculoskeletal_ae.plausibility import SLACK
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 # Commands older than this no longer say what the modules do.
 COMMAND_AGE = 0.5  # [s]
@@ -69,7 +71,7 @@ class Estimate(NamedTuple):
     state: State  # (θ, T, l) as the network restores them
     anomaly: float  # A, scaled units
     detected: bool  # whether this message completes a detection that was not there before
-    touch: Touch | None = None  # None while the zeros of l are unknown
+    contact: Contact | None = None  # None while the zeros of l are unknown
 
 
 class Estimator:
@@ -91,14 +93,16 @@ class Estimator:
         self.verified = ''  # the last suspect, and what it was
         self.detector = AnomalyDetector(robot, preset=preset)
         self.heat = Heat(robot)
-        self._direction, self._external = FrictionDirection(), ExternalTorque(robot)
-        self._touch: Touch | None = None
+        self._direction, self._external = FrictionDirection(), ContactEstimator(robot)
+        self._contact: Contact | None = None
         self._contacts = 0
         self.cause = self._suspect = ''  # why an anomaly is latched, and the muscle
         self._theta: Array = 0.5 * (robot.lower + robot.upper)
         self._verdict: Verdict | None = None
-        self.zeros = Zeros.of(robot.muscle_count)  # of the length sensors, as all nodes are told
-        self._zeroing: Zeroing | None = None
+        self.zeros = LengthOffsets.none(
+            robot.muscle_count
+        )  # of the length sensors, as all nodes are told
+        self._zeroing: LengthCalibration | None = None
         self._joints: tuple[float, Array | None] = -math.inf, None
         self._time = math.inf  # of the last message; none yet
         self._stepped_at = self._commanded_at = -math.inf
@@ -110,7 +114,7 @@ class Estimator:
         self._external.use(less)
         self._whole, self.mae = mae, less
         if self._zeroing is not None:  # what it found with another one is off by their difference
-            self._zeroing = Zeroing(self._robot, less, self._zeroing.posture)
+            self._zeroing = LengthCalibration(self._robot, less, self._zeroing.posture)
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Go on without these muscles, places in T and l, and with all others.
@@ -160,11 +164,11 @@ class Estimator:
             raise MusculoskeletalError('no checkpoint, and zeros are found with a network')
         self.check_posture(posture)
         robot = self._robot
-        self._zeroing = Zeroing(robot, self.mae, np.array(posture) if posture else None)
-        self.zeros = Zeros.of(robot.muscle_count, UNKNOWN)
+        self._zeroing = LengthCalibration(robot, self.mae, np.array(posture) if posture else None)
+        self.zeros = LengthOffsets.unknown(robot.muscle_count)
         self.detector.judges, self._verdict = False, None
         self._external.reset()
-        self._touch = None
+        self._contact = None
         self.reset()
 
     def step(
@@ -187,7 +191,7 @@ class Estimator:
         if now - self._commanded_at > COMMAND_AGE:
             self.detector.commanded()
             self._command = None
-        guess: Zeros | None = self.zeros
+        guess: LengthOffsets | None = self.zeros
         if self._zeroing is not None:
             guess = self._zero_on(self._zeroing, tension, length, dt, now)
         if guess is None:
@@ -210,11 +214,11 @@ class Estimator:
             self._suspect = self._robot.muscles[verdict.suspect]
             self.cause = f'{self._suspect}: {verdict.cause}'
             self._begin_verification(verdict.suspect, now)
-        before, self._touch = self._touch, None
+        before, self._contact = self._contact, None
         if self.zeros.known:
-            self._touch = touch = self._external.step(state.theta, end * self._robot.used, since)
-            self._contacts += touch.contact and not (before is not None and before.contact)
-        return Estimate(state, verdict.anomaly, detected, self._touch)
+            self._contact = touch = self._external.step(state.theta, end * self._robot.used, since)
+            self._contacts += touch.is_contact and not (before is not None and before.is_contact)
+        return Estimate(state, verdict.anomaly, detected, self._contact)
 
     def _stands_still(
         self, mae: Mae, tension: Array, end: Array, length: Array, dt: float
@@ -267,7 +271,9 @@ class Estimator:
         if muscle is None or now - since < SILENT or self.detector.settings.on_anomaly == 'stop':
             return False
         assert muscle is not None
-        self.verified = f'{self._robot.muscles[muscle]}: a sensor says no number'
+        self.verified = (
+            f'{self._robot.muscles[muscle]}: {VerificationVerdict(Outcome.VALUES_MISSING)}'
+        )
         self.isolate((*self._robot.isolated, muscle))
         return True
 
@@ -290,10 +296,10 @@ class Estimator:
         pulls = np.clip(end, 0.0, self._robot.description.tension.limit)
         likely = self.mae.lengths(theta, pulls)
         found = suspect.step(float(tension[m]), float(length[m]), command, float(likely[m]), dt)
-        if not found:
+        if found is None:
             return
         self.verified = f'{self._robot.muscles[m]}: {found}'
-        if found == HEALTHY:
+        if found.outcome is Outcome.HEALTHY:
             self._acquitted.append(now)
         else:
             self._verification = None
@@ -301,12 +307,12 @@ class Estimator:
         self._clear()
 
     def _zero_on(
-        self, zeroing: Zeroing, tension: Array, length: Array, dt: float, now: float
-    ) -> Zeros | None:
+        self, zeroing: LengthCalibration, tension: Array, length: Array, dt: float, now: float
+    ) -> LengthOffsets | None:
         came, theta = self._joints
         zeroing.step(tension, length, dt, theta if now - came < JOINTS_AGE else None)
-        guess = zeroing.zeros
-        if zeroing.stands and not zeroing.done:
+        guess = zeroing.offsets
+        if zeroing.is_standing and not zeroing.is_done:
             return None  # nobody shall move
         # A guess is told anew only when it is another one: whoever follows it goes on from there.
         if guess is not None and (
@@ -315,7 +321,7 @@ class Estimator:
             or np.abs(guess.offset - self.zeros.offset).max() > SHIFTED
         ):
             self.zeros = guess
-        if zeroing.done:
+        if zeroing.is_done:
             self._zeroing, self.detector.judges = None, True
             self.detector.reset()
         return guess
@@ -367,6 +373,7 @@ class Estimator:
             values['joint uncertainty'] = self._robot.told(spread, 3)
         if isolated := self._robot.names(self._robot.isolated):
             values['isolated muscles'] = isolated
+        values['verification'] = 'none' if self._verification is None else 'running'
         if self.verified:
             values['last verified'] = self.verified
         drifting = {self._robot.muscles[m]: how for m, how in self.heat.changed.items()}
@@ -382,10 +389,10 @@ class Estimator:
                 assert self._read is not None
                 limit = self.detector.limit(self._theta, self._read[1])
                 values[f'{letter} limit'] = f'{limit:.3g}'
-        if (touch := self._touch) is not None:
+        if (touch := self._contact) is not None:
             force = f'{np.linalg.norm(touch.force()):.0f} N at the hand'
-            known = force if touch.contact else 'none'
-            values['contact'] = known if self._external.calibrated else 'not calibrated'
+            known = force if touch.is_contact else 'none'
+            values['contact'] = known if self._external.is_calibrated else 'not calibrated'
             values['contacts'] = str(self._contacts)
         if self.zeros.offset.any():
             zeros = zip(self._robot.muscles, 1e3 * self.zeros.offset, 1e3 * self.zeros.deviation)
@@ -393,7 +400,7 @@ class Estimator:
         far = self.detector.unfamiliar(self._theta) if self.detector.calibrated else 0.0
         values['posture'] = f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'
         if self.cause:
-            doing = VERIFYING if self._verification is not None else ''
+            doing = '; verifying it' if self._verification is not None else ''
             return Report('error', f'anomaly detected: {self.cause}{doing}', values)
         if now - self._stepped_at > SILENCE:
             return Report('warn', 'no muscle_states', values)

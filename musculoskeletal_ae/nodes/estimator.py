@@ -22,7 +22,6 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Frames, Markers
@@ -39,6 +38,7 @@ from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.drawing import draw_arm
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import read_pose
 
 
@@ -68,7 +68,7 @@ class Estimator(Shell):
         self.follow_parameter('zero_posture', self._take_posture)
         self.unzeroed = self.parameter('zero_at_start')
         if self.unzeroed:  # nobody moves on what sensors say before the network is there
-            self.core.zeros = Zeros.of(self.robot.muscle_count, UNKNOWN)
+            self.core.zeros = LengthOffsets.unknown(self.robot.muscle_count)
         self.follow_parameter('isolate_muscles', self._choose_muscles)
         self.follow_checkpoints(self._use)
         if self.parameter('isolate_muscles'):
@@ -172,7 +172,7 @@ class Estimator(Shell):
             self.zeros = self.core.zeros
             self.plausibility = Plausibility(self.core.robot)
             self.gate.forget()
-            rows = np.stack(self.zeros)
+            rows = np.stack([self.zeros.offset, self.zeros.deviation])
             self.told.publish(array_message(rows, 'quantity', 'muscle'))
 
     def _commanded(self, kind: str, command: Array) -> None:
@@ -212,7 +212,7 @@ class Estimator(Shell):
             self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
         if is_heard(self.anomaly):
             self.anomaly.publish(Float64(data=estimate.anomaly))
-        if (touch := estimate.touch) is not None and is_heard(self.wrench):
+        if (touch := estimate.contact) is not None and is_heard(self.wrench):
             wrench = WrenchStamped()
             wrench.header.stamp, wrench.header.frame_id = clock.to_msg(), self.root_frame
             wrench.wrench.force = Vector3(**dict(zip('xyz', touch.force().tolist())))

@@ -9,6 +9,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,6 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     MessageError,
@@ -52,6 +52,7 @@ from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import (
     QUANTITIES,
     read_array,
@@ -99,7 +100,8 @@ class Shell(Node):
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
-        self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
+        #: by which readings of l are too long
+        self.zeros = LengthOffsets.none(self.robot.muscle_count)
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
@@ -400,18 +402,18 @@ class Shell(Node):
         Known ones that are not those known before come from an estimator that starts anew and
         has not heard of them: nothing is known then, until it finds them.
         """
-        heard = Zeros.of(self.robot.muscle_count, UNKNOWN)
+        heard = LengthOffsets.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
             nonlocal heard
             if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
                 told = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
                 raise MessageError('impossible zeros', told)
-            zeros, before, heard = Zeros(*rows), heard, Zeros(*rows)
+            zeros, before, heard = LengthOffsets(*rows), heard, LengthOffsets(*rows)
             if before.known and zeros.known:
                 if (zeros.offset == before.offset).all():
                     return
-                zeros = Zeros(zeros.offset, np.full(len(zeros.offset), UNKNOWN))
+                zeros = replace(LengthOffsets.unknown(len(zeros.offset)), offset=zeros.offset)
             less, self.zeros = zeros.offset - self.zeros.offset, zeros
             changed(zeros.known, less)
 

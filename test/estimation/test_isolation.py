@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.estimation.verification import HEALTHY, PATIENCE, Verification
+from musculoskeletal_ae.estimation.verification import PATIENCE, Outcome, Verification
 
 BIAS, STIFFNESS, DT = 30.0, 1e4, 0.01
 NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
@@ -37,28 +37,29 @@ def still(_, stir):
 @pytest.mark.parametrize(
     ('tension', 'length', 'likely', 'found'),
     [
-        (follows, still, 0.004, HEALTHY),
-        (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, 'ruptured'),
-        (lambda _, __: 0.0, lambda n, stir: stir - 0.0002 * n, -0.05, 'ruptured'),
-        (lambda _, __: 0.0, still, 0.0, 'its tension sensor stands still'),
-        (lambda _, shake: 0.2 * shake, still, 0.0, 'jammed'),
-        (lambda _, shake: BIAS + 15.0 + shake, still, 0.0, 'jammed'),
-        (lambda _, __: 71.0, still, 0.0, 'its tension sensor stands still'),
-        (follows, lambda _, __: 0.0, 0.03, 'its length sensor stands still'),
-        (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0, 'its length sensor is'),
-        (lambda _, shake: BIAS - 12.0 + shake, still, 0.0, 'jammed'),
+        (follows, still, 0.004, Outcome.HEALTHY),
+        (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, Outcome.RUPTURED),
+        (lambda _, __: 0.0, lambda n, stir: stir - 0.0002 * n, -0.05, Outcome.RUPTURED),
+        (lambda _, __: 0.0, still, 0.0, Outcome.TENSION_SENSOR_FROZEN),
+        (lambda _, shake: 0.2 * shake, still, 0.0, Outcome.JAMMED),
+        (lambda _, shake: BIAS + 15.0 + shake, still, 0.0, Outcome.JAMMED),
+        (lambda _, __: 71.0, still, 0.0, Outcome.TENSION_SENSOR_FROZEN),
+        (follows, lambda _, __: 0.0, 0.03, Outcome.LENGTH_SENSOR_FROZEN),
+        (lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir, 0.0,
+         Outcome.LENGTH_SENSOR_OFFSET),
+        (lambda _, shake: BIAS - 12.0 + shake, still, 0.0, Outcome.JAMMED),
     ],
 )  # fmt: skip
 def test_verification_recognises_the_fault_by_the_response_to_winding_in(
     tension, length, likely, found
 ):
-    assert verdict(tension, length, likely).startswith(found)
+    assert verdict(tension, length, likely).outcome is found
 
 
 def test_a_suspect_that_is_not_wound_in_stays_isolated():
     watched = Verification(0, BIAS, STIFFNESS)
     answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]
-    assert 'nobody' in answers[-1]
+    assert answers[-1].outcome is Outcome.NOT_WOUND_IN
     assert not any(answers[: round(PATIENCE / DT) - 5])
 
 
@@ -131,7 +132,7 @@ def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, heal
         wound_in = 0.0015 * (np.arange(6) == suspect)
         loop.command = loop.command - wound_in
         loop.step(healthy._replace(tension=healthy.tension + 1e4 * wound_in), 100)
-        assert loop.core.verified.endswith(HEALTHY)
+        assert loop.core.verified.endswith('healthy')
         assert loop.core.robot.isolated == ()
         assert loop.core.cause == ''
     assert loop.core.robot.isolated == ()  # latched as with on_anomaly: stop
@@ -206,4 +207,4 @@ def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
         found = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)
         if found:
             break
-    assert found == 'jammed'
+    assert found.outcome is Outcome.JAMMED

@@ -6,7 +6,7 @@ import pytest
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.estimation import zeroing
+from musculoskeletal_ae.estimation import length_calibration
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
@@ -18,7 +18,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 def test_length_offsets_are_found_and_reach_every_node(
     graph, trained_file, tmp_path, monkeypatch, stands
 ):
-    monkeypatch.setattr(zeroing, 'ENOUGH_SEEN', 2.0)
+    monkeypatch.setattr(length_calibration, 'ENOUGH_WITH_ANGLES', 2.0)
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
