@@ -90,6 +90,7 @@ class ContactEstimator:
     Attributes:
         velocity: Filtered θ̇ [rad/s], (D,).
         is_calibrated: Whether the healthy torque of this arm is known, so that contact is decided.
+        count: How many contacts have begun.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -99,6 +100,7 @@ class ContactEstimator:
         self._near = TURNED * robot.kinematics.radian
         self._filter = LowPass(BANDWIDTH)
         self.is_calibrated = False
+        self.count = 0
         self.reset()
 
     def use(self, mae: Mae) -> None:
@@ -145,6 +147,7 @@ class ContactEstimator:
         if self.is_calibrated:
             distance = math.sqrt(self._weight @ (torque * torque))
         self._beyond = self._beyond + 1 if distance > CONTACT else 0
+        self.count += self._beyond == IN_A_ROW
         force = partial(self._force, position, torque, self._weight * is_free)
         return Contact(torque, force, distance, self._beyond >= IN_A_ROW)
 

@@ -13,6 +13,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.length_fit import FARTHEST, Fit, LengthFit, Steps
 from musculoskeletal_ae.estimation.length_moments import MomentCollector, Moments
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
@@ -26,6 +27,7 @@ FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, and between later ones
 LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
 #: a moment in so many is independent of the others
 CORRELATED = 10.0
+BEYOND_STOP = 0.01  # share of a joint's range that a stated posture may lie beyond it
 MAD_TO_DEVIATION = 1.48  # standard deviation over median absolute deviation
 
 
@@ -155,3 +157,22 @@ class LengthCalibration:
         if not cost <= LARGEST_COST:  # another posture may look alike
             return f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
         return ''
+
+
+def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
+    """Check that an arm can stand in θ [rad] (D,); () is legal and means no posture.
+
+    Raises:
+        MusculoskeletalError: With the legal range of every joint.
+    """
+    if not posture:
+        return
+    theta = np.array(posture)
+    # A joint that rests on its stop reads a little beyond it.
+    beyond = BEYOND_STOP * (robot.upper - robot.lower)
+    low, high = robot.lower - beyond, robot.upper + beyond
+    if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
+        return
+    limits = zip(robot.units, robot.lower, robot.upper, strict=True)
+    legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
+    raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal}')

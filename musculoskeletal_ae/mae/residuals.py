@@ -5,7 +5,7 @@
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, section "State Estimation")
 
 A checkpoint carries mean and covariance of e over healthy data; the detector that decides by them
-is `estimation/anomaly.py`.
+is `estimation/detectors/residual_distance.py`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import traceback
 from collections import Counter, deque
@@ -54,7 +53,6 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import (
-    QUANTITIES,
     read_array,
     read_muscle_states,
     read_names,
@@ -346,18 +344,33 @@ class Shell(Node):
         self,
         follow: Callable[[Array], object],
         warn: Callable[[str], object] | None = None,
-        as_read: bool = False,
-        unread: Callable[[Array], object] | None = None,
         unknown: float = 0.0,
     ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
-        If several nodes publish them, `warn` is told who, '' once it is one; without it their
-        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`. What
-        is rejected though it has the right shape is given to `unread`. What is not finite of
-        isolated muscles is `unknown`, a temperature NaN.
+        The length offsets are subtracted from l. What is not finite of isolated muscles is
+        `unknown`, a temperature NaN. For `warn` see `follow_muscle_messages`.
         """
-        intruders, shape = '', (len(QUANTITIES), self.robot.muscle_count)
+
+        def read(message: Float64MultiArray) -> None:
+            muscle_count = self.robot.muscle_count
+            states = read_muscle_states(message, muscle_count, self.left_out, unknown)
+            states[0] -= self.zeros.offset
+            follow(states)
+
+        self.follow_muscle_messages(read, warn)
+
+    def follow_muscle_messages(
+        self,
+        follow: Callable[[Float64MultiArray], object],
+        warn: Callable[[str], object] | None = None,
+    ) -> None:
+        """Give `follow` the messages of muscle_states as they are.
+
+        If several nodes publish them, `warn` is called with their names, and with '' once it is
+        one. Without `warn` their messages are rejected.
+        """
+        intruders = ''
 
         def look_around() -> None:
             nonlocal intruders
@@ -366,17 +379,9 @@ class Shell(Node):
                 warn(intruders)
 
         def from_one(message: Float64MultiArray) -> None:
-            try:
-                states = read_muscle_states(message, shape[1], self.left_out, unknown)
-            except MessageError:
-                if unread and not intruders and len(message.data) == math.prod(shape):
-                    unread(np.reshape(message.data, shape))
-                raise
             if intruders and not warn:
                 raise MessageError('several publishers', intruders)
-            if not as_read:
-                states[0] -= self.zeros.offset
-            follow(states)
+            follow(message)
 
         self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
         self.listen(Float64MultiArray, 'muscle_states', from_one, SENSOR)

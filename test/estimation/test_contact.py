@@ -39,6 +39,10 @@ def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
     return tension, robot.muscle_lengths(theta, tension)
 
 
+def states(tension, length):
+    return np.array([length, tension, np.full(len(length), 25.0)])
+
+
 def felt(core, theta, tension):
     for _ in range(100):
         contact = core.step(theta, tension, DT)
@@ -141,7 +145,7 @@ def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
         torque = robot.kinematics.inverse_dynamics(theta, velocity, acceleration)
         jacobian = mae.muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
         tension = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
-        contact = core.step(tension, mae.lengths(theta, tension), time, time).contact
+        contact = core.step(states(tension, mae.lengths(theta, tension)), time, time).contact
         assert n < 60 or contact.distance < CONTACT
 
 
@@ -197,14 +201,14 @@ def test_the_estimator_reports_contacts(robot, mae):
     core.use(replace(mae, touch=statistics))
     tension, length = pulling(theta, (10.0, 0.0, 10.0), robot)
     for n in range(100):
-        estimate = core.step(tension, length, n * DT, n * DT)
+        estimate = core.step(states(tension, length), n * DT, n * DT)
     assert estimate.contact.is_contact
     values = core.report(1.0).values
     assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
-    core.zero(tuple(theta.tolist()))
-    core.step(tension, length, 1.0, 1.0)
+    core.calibrate_lengths(tuple(theta.tolist()))
+    core.step(states(tension, length), 1.0, 1.0)
     assert 'contact' not in core.report(1.0).values  # of zeros that count no longer
     core = Estimator(robot)
     core.use(mae)
-    core.step(tension, length, 1.0, 1.0)
+    core.step(states(tension, length), 1.0, 1.0)
     assert core.report(1.0).values['contact'] == 'not calibrated'

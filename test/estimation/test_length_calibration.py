@@ -17,6 +17,10 @@ from musculoskeletal_ae.robot.tension import least_tension
 OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
 
 
+def states(tension, length):
+    return np.array([length, tension, np.full(len(length), 25.0)])
+
+
 def swinging(robot, mae):
     """Return T [N] and l [m] at the t-th second of a slow swing, as the network's body holds it."""
 
@@ -91,14 +95,15 @@ def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment
 def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
     estimator = Estimator(robot)
     with pytest.raises(MusculoskeletalError, match='no checkpoint'):
-        estimator.zero()
+        estimator.calibrate_lengths()
     estimator.use(mae)
     for posture in ((0.1,), tuple(robot.upper + 0.1)):
         with pytest.raises(MusculoskeletalError, match='legal'):
-            estimator.zero(posture)
-    assert estimator.zeros.known
-    estimator.zero(tuple(robot.upper + 0.002))  # as read of a joint that rests on its stop
-    assert not estimator.zeros.known
+            estimator.calibrate_lengths(posture)
+    assert estimator.body.offsets.known
+    on_stop = tuple(robot.upper + 0.002)  # what a joint reads that rests on its stop
+    estimator.calibrate_lengths(on_stop)
+    assert not estimator.body.offsets.known
 
 
 def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
@@ -106,18 +111,18 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 ):
     estimator = Estimator(robot)
     estimator.use(calibrated)
-    estimator.zero()
-    assert not estimator.zeros.known
+    estimator.calibrate_lengths()
+    assert not estimator.body.offsets.known
     now, detected = 0.0, []
     for n in range(300):
         _, tension, length = moment(0.01 * n)
         now += 0.01
-        estimator.commanded(now, length=length + OFFSET - estimator.zeros.offset)
+        estimator.commanded(now, length=length + OFFSET - estimator.body.offsets.offset)
         if n > 200:
             tension = tension * (np.arange(6) != 2)
         elif n == 200:
             assert 'finding the length zeros' in str(estimator.report(now))
-        estimate = estimator.step(tension, length + OFFSET, now, now)
+        estimate = estimator.step(states(tension, length + OFFSET), now, now)
         detected += [n] * bool(estimate is not None and estimate.detected)
     assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
 
@@ -162,10 +167,10 @@ def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
 def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(robot, mae, moment):
     estimator = Estimator(robot)
     estimator.use(mae)
-    estimator.zero()
+    estimator.calibrate_lengths()
     for n in range(400):
         _, tension, length = moment(0.01 * n)
-        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
     reported = str(estimator.report(4.0))
     assert re.search('finding the length zeros: [1-4] of', reported)
     estimator.isolate(())
@@ -174,7 +179,7 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)
-        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
     assert re.search('finding the length zeros: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
     assert 'finding the length zeros: 0 of' in str(estimator.report(8.0))

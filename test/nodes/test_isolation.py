@@ -37,7 +37,7 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     )
     assert graph.report('estimator').values['suspect muscle'] == name
     graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
-    assert arm.estimator.core.verified == f'{name}: ruptured'
+    assert arm.estimator.core.suspects.last_verification == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name
     graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
     assert arm.controller.core.robot.isolated == (3,)
@@ -55,7 +55,8 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
     graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
-    assert arm.estimator.core.verified == f'{name}: a sensor does not report a number'
+    verified = arm.estimator.core.suspects.last_verification
+    assert verified == f'{name}: a sensor does not report a number'
     graph.wait(lambda: not arm.controller.core.safety.cause, 'the arm to go on')
     arm.target(THERE)
     arm.goes_to(THERE)
@@ -82,7 +83,7 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
     count = len(graph.received['isolated_muscles'])
     graph.send_network(checkpoint.to_bytes(trained['default']))
     graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
-    assert arm.estimator.core.robot.isolated == (1, 2)
+    assert arm.estimator.core.body.isolated == (1, 2)
 
 
 def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):

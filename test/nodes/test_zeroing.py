@@ -29,7 +29,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     if stands:
         graph.set_parameter('estimator', 'zero_posture', hardware.arm.theta.tolist())
     assert graph.call(Trigger, 'estimator/zero').success
-    assert not node.core.zeros.known
+    assert not node.core.body.offsets.known
     if not stands:
         assert graph.call(SetBool, 'controller/explore', SetBool.Request(data=True)).success
     nodes = [node, controller, learner]
@@ -78,4 +78,4 @@ def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, train
     controller = graph.host(Controller, **common)
     estimator = graph.host(Estimator, **common, zero_at_start=True)
     graph.wait(lambda: not controller.zeros.known, 'the controller to know of it')
-    assert not estimator.core.zeros.known
+    assert not estimator.core.body.offsets.known
