@@ -23,7 +23,7 @@ import torch
 
 from bench.processes import memory
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length zeros found after power-on: with joint sensors, without, and in a stated posture.
+"""Length offsets found after power-on: with joint sensors, without, and in a stated posture.
 
 python -m bench zeroing [--robot …] [--seeds 0,1,2,3,4] [--folder DIR] [--out FILE]
 
@@ -34,7 +34,6 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LEAST, MOST = 0.05, 0.13  # [m]
@@ -54,7 +53,7 @@ class Loop:
         self.estimator, self.controller = Estimator(robot), Controller(robot, seed=seed)
         self.estimator.use(mae)
         self.controller.use(mae)
-        self._zeros = self.estimator.zeros
+        self._zeros = self.estimator.body.offsets
 
     def step(self, joints: bool) -> MuscleSample | None:
         """Let a hundredth of a second pass; return what the modules read."""
@@ -62,11 +61,11 @@ class Loop:
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
             estimator.joints(read.theta, now)
-        estimate = estimator.step(read.tension, read.length, now, now)
-        zeros = estimator.zeros
+        states = np.array([read.length, read.tension, read.temperature])
+        estimate = estimator.step(states, now, now)
+        zeros = estimator.body.offsets
         if zeros is not self._zeros:
-            offsets = LengthOffsets(zeros.offset, zeros.deviation)
-            control.use_body(control.stream.body.with_offsets(offsets))
+            control.use_body(estimator.body)
             self._zeros = zeros
         if estimate is not None:
             control.muscles(np.array([read.length, read.tension, read.temperature]), now)
@@ -93,11 +92,11 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     if how == 'posture':
         told = arm.theta + rng.normal(0.0, STATED, robot.joint_count)
         posture = tuple(np.clip(told, robot.lower, robot.upper).tolist())
-    loop.estimator.zero(posture)
+    loop.estimator.calibrate_lengths(posture)
     if not posture:
         loop.controller.explore(True)
     speed, pull, last, seen = 0.0, 0.0, None, list[Array]()
-    while loop.time < LONGEST and not loop.estimator.zeros.known:
+    while loop.time < LONGEST and not loop.estimator.body.offsets.known:
         muscles = loop.step(how == 'sensors')
         seen.append(arm.theta)
         if muscles is None:
@@ -107,7 +106,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
             speed = max(speed, float(np.abs(length - last).max()) / (10 * SAMPLE_TIME))
         last = length if len(seen) % 10 == 0 or last is None else last
         pull = max(pull, float(muscles.motor_tension.max()))
-    zeros, took, alarms = loop.estimator.zeros, loop.time, loop.alarms
+    zeros, took, alarms = loop.estimator.body.offsets, loop.time, loop.alarms
     part = held_out.part(np.s_[::5])
     tension = end_tensions(mae, held_out)[::5]
     after = mae.estimate(tension, part.length + offset - zeros.offset).theta

@@ -76,7 +76,8 @@ def main() -> None:
                     estimator.use(learner.mae)
                     simulation.use(learner.mae)
                 estimator.commanded(now, command)
-                estimate = estimator.step(tension, length, now, now)
+                states = np.array([length, tension, temperatures[n]])
+                estimate = estimator.step(states, now, now)
                 simulation.command = command[None]
                 simulated = simulation.step(SAMPLE_TIME).theta[0]
                 values = estimator.report(now).values

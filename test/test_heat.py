@@ -72,7 +72,7 @@ class Watched(Motors):
     def hand_on(self):
         length = ROBOT.muscle_lengths(POSTURE, self.pulled)
         self.now += 1.0
-        self.core.step(self.pulled, length, self.now, self.now, self.read)
+        self.core.step(np.array([length, self.pulled, self.read]), self.now, self.now)
 
 
 def test_a_step_of_any_length_solves_the_thermal_model():

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import interface_topics
-from musculoskeletal_ae.estimation.zeroing import Zeros
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
 
@@ -158,7 +158,7 @@ def _latched(times: ArrayLike, when: ArrayLike) -> Any:
 
 def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:
     """Return states with lengths from the zeros of their time, and how many had no known zeros."""
-    known = np.array([Zeros(*rows).known for rows in zeros.values], dtype=bool)
+    known = np.array([LengthOffsets(*rows).known for rows in zeros.values], dtype=bool)
     since = np.searchsorted(zeros.time, states.time, side='right')  # 0: nothing was said yet
     if known[:1].any():  # latched before the bag: the recorder heard the estimator a little late
         since = np.maximum(since, 1)

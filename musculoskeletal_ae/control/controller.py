@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -212,13 +213,20 @@ class Controller:
         if self.activities.entered is self.activities.paper_methods:
             self.activities.ramps.solve_again()
 
+    def take(self, message: Any, now: float) -> None:
+        """Take a message of muscle_states; a RejectionError says why it cannot be used."""
+        self._use_sample(self.stream.take(message, now), now)
+
     def muscles(self, states: Array, now: float) -> None:
         """Take l as it was read [m], T [N] and temperature [°C], (3, M).
 
-        A MessageError says that no muscles of this arm can be so.
+        A RejectionError says that no muscles of this arm can be so.
         """
-        self.sample = self.stream.take_states(np.asarray(states), now)
-        self.watchdog.take_sample(self.sample, now)
+        self._use_sample(self.stream.take_states(np.asarray(states), now), now)
+
+    def _use_sample(self, sample: MuscleSample, now: float) -> None:
+        self.sample = sample
+        self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float) -> None:
         """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""

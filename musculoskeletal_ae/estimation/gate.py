@@ -30,7 +30,7 @@ from functools import cached_property
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.mae.mae import Mae

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may choose about the detector: one table for the core and the node's parameters."""
+"""What a user may choose about detection: one table for the core and the parameters of the node."""
 
 from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import settable
 
-ON_ANOMALY = ('stop', 'isolate')
+STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 
 @dataclass(frozen=True)

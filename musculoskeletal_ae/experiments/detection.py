@@ -9,7 +9,9 @@ from scipy.stats import mannwhitneyu
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM, AnomalyDetector
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
+from musculoskeletal_ae.estimation.finding import observe
+from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
     Recording,
@@ -115,16 +117,22 @@ class Watched(NamedTuple):
 
 def watch(robot: Robot, mae: Mae, recording: Recording) -> Watched:
     """Run estimator and detector over a recording as the node does; nothing is latched."""
-    detector, rows = AnomalyDetector(robot, preset=mae.preset), []
-    detector.use(mae)
-    ends = end_tensions(mae, recording)
-    estimated, read = mae.estimate(ends, recording.length), (recording.tension, recording.length)
-    for n, (end, tension, length) in enumerate(zip(ends, *read, strict=True)):
-        detector.commanded(length=recording.command[n])
-        restored = State(*(part[n] for part in estimated))
-        verdict = detector.step(restored, end, tension, length, SAMPLE_TIME)
-        rows.append((*verdict[:3], bool(verdict.cause)))
-    return Watched(estimated.theta, *columns(rows))
+    health, rows = HealthMonitor(robot, mae.preset), []
+    health.use(mae)
+    bone_tensions = end_tensions(mae, recording)
+    restored = mae.estimate(bone_tensions, recording.length)
+    messages = zip(recording.length, recording.tension, bone_tensions, strict=True)
+    for n, (length, tension, bone_tension) in enumerate(messages):
+        demand = robot.demanded(length, recording.command[n])
+        state = State(*(part[n] for part in restored))
+        message = observe(mae, length, tension, bone_tension, SAMPLE_TIME, demand, state)
+        finding = health.step(message)
+        reading = health.residual.reading
+        assert reading is not None
+        suspect = reading.suspect if finding is None else finding.muscle
+        row = message.estimate.anomaly, reading.distance, suspect, finding is not None
+        rows.append(row)
+    return Watched(restored.theta, *columns(rows))
 
 
 def detection(

@@ -38,7 +38,6 @@ from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, judge
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.plausibility import Plausibility
 from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # messages of the held-out motion
@@ -58,8 +57,7 @@ class Guarded(ClosedLoop):
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
         """Connect an arm that stands."""
         self.estimator = Estimator(arm.robot, mae.preset)
-        self.estimator.detector.settings = Detection(on_anomaly='isolate')
-        self._plausibility = Plausibility(self.estimator.robot)
+        self.estimator.configure(Detection(on_anomaly='isolate'))
         self._latched, self.isolated = False, tuple[int, ...]()
         self.found: list[tuple[tuple[int, ...], str]] = []  # isolated, and why, at each verdict
         self.error = np.nan  # ‖θ_est − θ‖ of the last message [rad]
@@ -73,21 +71,17 @@ class Guarded(ClosedLoop):
     def estimate(self, read: Readings, now: float) -> Array:
         """Return θ [rad] (D,), and tell the controller what the estimator node tells it."""
         core, true = self.estimator, self.arm.theta
-        self._plausibility.check_muscles(read.tension, read.length, read.temperature, now)
-        if (jumped := self._plausibility.jumped) is not None:
-            self._plausibility.jumped = None
-            core.jumped(jumped, now)
-        estimate = core.step(read.tension, read.length, now, now, read.temperature)
+        states = np.array([read.length, read.tension, read.temperature])
+        estimate = core.step(states, now, now)
         assert estimate is not None
         if bool(core.cause) != self._latched:
             self._latched = bool(core.cause)
             self.core.anomaly(self._latched)
             if not self._latched:
-                self.found.append((core.robot.isolated, core.verified))
-        if core.robot.isolated != self.isolated:
-            self.isolated = core.robot.isolated
-            body = self.core.stream.body.with_isolated(self.isolated)
-            self.core.use_body(body)
+                self.found.append((core.body.isolated, core.suspects.last_verification))
+        if core.body.isolated != self.isolated:
+            self.isolated = core.body.isolated
+            self.core.use_body(core.body)
         self.error = float(np.linalg.norm(estimate.state.theta - true))
         return estimate.state.theta
 

@@ -10,7 +10,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.touch import ExternalTorque, Touch
+from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
@@ -34,22 +34,22 @@ class FeelingLoop(ClosedLoop):
     """A closed loop that is asked what pushes the arm."""
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
-        self._external, self._sliding = ExternalTorque(arm.robot), FrictionDirection()
+        self._contact, self._sliding = ContactEstimator(arm.robot), FrictionDirection()
         super().__init__(arm, mae, settings, seed)
 
     def use(self, mae: Mae) -> None:
         """Estimate, control and feel by another network."""
         super().use(mae)
-        self._external.use(mae)
+        self._contact.use(mae)
 
-    def feel(self, exploring: bool = False) -> Touch:
+    def feel(self, exploring: bool = False) -> Contact:
         """Let a message's time pass; return what it says of the outside."""
         _ = self.explore() if exploring else self.step()
         length, friction = self._read.length, self.mae.friction
         end = self._sliding.end_tension(friction, self._read.tension, length)
-        return self._external.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
+        return self._contact.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
-    def feel_during(self, duration: float, exploring: bool = False) -> list[Touch]:
+    def feel_during(self, duration: float, exploring: bool = False) -> list[Contact]:
         """Let time pass [s]; return what each message says."""
         return [self.feel(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
@@ -149,11 +149,11 @@ def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Arra
         if len(found) == count:
             break
         *_, before = loop.feel_during(rng.uniform(0.5, 1.0) * APART, exploring=True)
-        if before.contact or np.linalg.norm(loop.arm.velocity) < 0.1:
+        if before.is_contact or np.linalg.norm(loop.arm.velocity) < 0.1:
             continue
         force = _force(robot, rng, LEAST, MOST)
         loop.push(force)
-        noticed = [felt.contact for felt in loop.feel_during(MOVED, exploring=True)]
+        noticed = [felt.is_contact for felt in loop.feel_during(MOVED, exploring=True)]
         loop.push(np.zeros(3))
         delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
         found.append((float(np.linalg.norm(force)), delay))
@@ -164,7 +164,7 @@ def _healthy(loop: FeelingLoop, seconds: float) -> int:
     """Return how often a contact begins in so much healthy exploration [s], the first 5 s apart."""
     contacts, before = 0, False
     for n in range(round((seconds + 5.0) / SAMPLE_TIME)):
-        now = loop.feel(exploring=True).contact and n * SAMPLE_TIME > 5.0
+        now = loop.feel(exploring=True).is_contact and n * SAMPLE_TIME > 5.0
         contacts, before = contacts + (now and not before), now
     return contacts
 

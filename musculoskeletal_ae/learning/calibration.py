@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.anomaly import DISTANCE, NORM
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
 from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings

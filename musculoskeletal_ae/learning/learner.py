@@ -23,7 +23,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.gate import Gate
-from musculoskeletal_ae.estimation.touch import HealthyTorque
+from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.rest import RestCollector

@@ -5,7 +5,7 @@
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, section "State Estimation")
 
 A checkpoint carries mean and covariance of e over healthy data; the detector that decides by them
-is `estimation/anomaly.py`.
+is `estimation/detectors/residual_distance.py`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class AnomalyStatistics:
 
 @dataclass(frozen=True, eq=False)
 class TouchStatistics:
-    """What tells a push from friction (`estimation/touch.py`)."""
+    """What tells a push from friction (`estimation/contact.py`)."""
 
     friction: Array  # μ of each wire: T at the motor is that at the elastic unit times e^{±μ}, (M,)
     spread: Array  # root mean square of τ_ext of the healthy arm in motion [N·m], (D,); positive

@@ -69,9 +69,7 @@ class Controller(Shell):
         self.needed += ['muscle_states', 'estimated_joint_states']
         self.follow_zeros(self._use_offsets)
         watchdog = self.core.watchdog
-        self.follow_muscle_states(
-            self._muscles, partial(setattr, watchdog, 'second_publisher'), as_read=True
-        )
+        self.follow_muscle_messages(self._muscles, partial(setattr, watchdog, 'second_publisher'))
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
@@ -131,9 +129,9 @@ class Controller(Shell):
         self.gate.isolated = muscles
         self.core.use_body(self.core.stream.body.with_isolated(muscles))
 
-    def _muscles(self, states: Array) -> None:
+    def _muscles(self, message: Float64MultiArray) -> None:
         now = time.monotonic()
-        self.core.muscles(states, now)
+        self.core.take(message, now)
         if self.zeros.known and self.core.sample is not None:
             length, tension, _ = self.core.sample.newest
             self.gate.message(tension, length, now)

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import math
 import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,6 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.gate import Gate
-from musculoskeletal_ae.estimation.zeroing import UNKNOWN, Zeros
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     MessageError,
@@ -52,8 +51,8 @@ from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import (
-    QUANTITIES,
     read_array,
     read_muscle_states,
     read_names,
@@ -99,7 +98,8 @@ class Shell(Node):
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
         self.rejected = self._reception.rejected  # messages, by topic and reason
-        self.zeros = Zeros.of(self.robot.muscle_count)  # that readings of l are too long by
+        #: by which readings of l are too long
+        self.zeros = LengthOffsets.none(self.robot.muscle_count)
         self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
         self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
@@ -344,18 +344,33 @@ class Shell(Node):
         self,
         follow: Callable[[Array], object],
         warn: Callable[[str], object] | None = None,
-        as_read: bool = False,
-        unread: Callable[[Array], object] | None = None,
         unknown: float = 0.0,
     ) -> None:
         """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
 
-        If several nodes publish them, `warn` is told who, '' once it is one; without it their
-        messages are rejected. Zeros are taken off l, here and nowhere else, unless `as_read`. What
-        is rejected though it has the right shape is given to `unread`. What is not finite of
-        isolated muscles is `unknown`, a temperature NaN.
+        The length offsets are subtracted from l. What is not finite of isolated muscles is
+        `unknown`, a temperature NaN. For `warn` see `follow_muscle_messages`.
         """
-        intruders, shape = '', (len(QUANTITIES), self.robot.muscle_count)
+
+        def read(message: Float64MultiArray) -> None:
+            muscle_count = self.robot.muscle_count
+            states = read_muscle_states(message, muscle_count, self.left_out, unknown)
+            states[0] -= self.zeros.offset
+            follow(states)
+
+        self.follow_muscle_messages(read, warn)
+
+    def follow_muscle_messages(
+        self,
+        follow: Callable[[Float64MultiArray], object],
+        warn: Callable[[str], object] | None = None,
+    ) -> None:
+        """Give `follow` the messages of muscle_states as they are.
+
+        If several nodes publish them, `warn` is called with their names, and with '' once it is
+        one. Without `warn` their messages are rejected.
+        """
+        intruders = ''
 
         def look_around() -> None:
             nonlocal intruders
@@ -364,17 +379,9 @@ class Shell(Node):
                 warn(intruders)
 
         def from_one(message: Float64MultiArray) -> None:
-            try:
-                states = read_muscle_states(message, shape[1], self.left_out, unknown)
-            except MessageError:
-                if unread and not intruders and len(message.data) == math.prod(shape):
-                    unread(np.reshape(message.data, shape))
-                raise
             if intruders and not warn:
                 raise MessageError('several publishers', intruders)
-            if not as_read:
-                states[0] -= self.zeros.offset
-            follow(states)
+            follow(message)
 
         self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
         self.listen(Float64MultiArray, 'muscle_states', from_one, SENSOR)
@@ -400,18 +407,18 @@ class Shell(Node):
         Known ones that are not those known before come from an estimator that starts anew and
         has not heard of them: nothing is known then, until it finds them.
         """
-        heard = Zeros.of(self.robot.muscle_count, UNKNOWN)
+        heard = LengthOffsets.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
             nonlocal heard
             if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
                 told = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
                 raise MessageError('impossible zeros', told)
-            zeros, before, heard = Zeros(*rows), heard, Zeros(*rows)
+            zeros, before, heard = LengthOffsets(*rows), heard, LengthOffsets(*rows)
             if before.known and zeros.known:
                 if (zeros.offset == before.offset).all():
                     return
-                zeros = Zeros(zeros.offset, np.full(len(zeros.offset), UNKNOWN))
+                zeros = replace(LengthOffsets.unknown(len(zeros.offset)), offset=zeros.offset)
             less, self.zeros = zeros.offset - self.zeros.offset, zeros
             changed(zeros.known, less)
 

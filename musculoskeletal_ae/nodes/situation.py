@@ -6,8 +6,6 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from musculoskeletal_ae.estimation.verification import VERIFYING
-
 OLD = 1.0  # [s] after which something that moves is no longer shown
 TOLD = 'stopped', 'anomaly detected'  # errors that are told with what to do
 
@@ -43,7 +41,7 @@ class Situation:
                 self.checkpoints = values.get('checkpoints', '')
             elif node == f'{self._here}/estimator':
                 self.suspect = values.get('suspect muscle', '')
-                self._verifying = status.message.endswith(VERIFYING)
+                self._verifying = values.get('verification') == 'running'
                 self.distance = self.limit = math.nan
                 with contextlib.suppress(ValueError):
                     self.distance = float(values.get('d', 'nan'))

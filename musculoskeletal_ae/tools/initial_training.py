@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `train` does: initial training from a robot description, or learning from recordings."""
 
-import copy
 import sys
 import time
 from argparse import Namespace
@@ -16,7 +15,9 @@ from tqdm import tqdm
 from musculoskeletal_ae.arrays import Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
+from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
+from musculoskeletal_ae.estimation.finding import observe
+from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
 from musculoskeletal_ae.learning.learner import Learner
@@ -140,32 +141,31 @@ def learn(
 ) -> None:
     """Feed a recording to a learner, message by message, as if the arm were moving now.
 
-    `progress` is told the recorded seconds that have passed since it was last told.
+    Like the estimator of a running arm, the health monitor decides when learning has to pause.
+    `progress` is called with the recorded seconds that have passed since its last call.
     """
-    robot = copy.copy(learner.robot)  # of which the detector hears who is isolated
-    robot.isolate(learner.isolated)
-    detector = AnomalyDetector(robot, preset=learner.training.preset.name)
+    isolated = learner.isolated
+    health = HealthMonitor(learner.robot, learner.training.preset.name)
     direction = FrictionDirection()
     newest = None
     learner.reset()
     learner.anomaly(False)
     steps = np.diff(recording.time, prepend=recording.time[:1])
-    for dt, at, theta, length, tension, said in zip(steps, *recording, strict=True):
-        if (isolated := _isolated(said, robot.isolated)) != robot.isolated:
-            robot.isolate(isolated)
+    for dt, time_stamp, theta, length, tension, recorded in zip(steps, *recording, strict=True):
+        before, isolated = isolated, _isolated(recorded, isolated)
+        if isolated != before:
             learner.isolate(isolated)
-            detector.reset()
+            health.reset()
             newest = None
         if learner.mae is not newest:
             newest = learner.mae
             mae = newest.without(isolated)
-            detector.use(mae)
-        # The estimator gates live learning; here its detector does the same.
-        end = direction.end_tension(mae.friction, tension, length)
-        verdict = detector.step(mae.estimate(end, length), end, tension, length, dt)
-        if verdict.cause:
+            health.use(mae)
+        bone_tension = direction.end_tension(mae.friction, tension, length)
+        period = min(dt, LONGEST_PERIOD)
+        if health.step(observe(mae, length, tension, bone_tension, period)) is not None:
             learner.anomaly(True)
-        learner.step(at, theta, tension, length)
+        learner.step(time_stamp, theta, tension, length)
         if progress is not None:
             progress(dt)
 

@@ -58,8 +58,8 @@ class Loop:
             data = np.concatenate(reading[1:])
             message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
             states = read_muscle_states(message, ROBOT.muscle_count)
-            self.controller.muscles(np.array([*states]), self.now)
-            estimate = self.estimator.step(reading.tension, reading.length, self.now, self.now)
+            self.controller.muscles(states, self.now)
+            estimate = self.estimator.step(states, self.now, self.now)
             if estimate is not None:
                 self.controller.estimated(estimate.state.theta, self.now)
                 if estimate.detected:

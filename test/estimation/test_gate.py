@@ -11,7 +11,7 @@ import pytest
 from network_attacks import ATTACKS, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
-from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.estimation.gate import FLOOR, LIMITS, MOST_USED, NOTICED, PROOF, Gate
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.estimation.anomaly import DEAD_TIME, AnomalyDetector
+from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.finding import Kind, observe
+from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.settings import Detection
 
 DT = 0.01
@@ -21,17 +23,16 @@ def noticed(robot, mae, slack):
 
     def run(speed, until, longest=20.0, settings=None):
         """Wind in at a speed [m/s] for so far [m], then stand."""
-        detector, rng = AnomalyDetector(robot), np.random.default_rng(0)
-        detector.settings = settings or Detection()
-        detector.use(mae)
+        health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
+        health.use(mae)
         state = mae.estimate(*slack)
         for n in range(round(longest / DT)):
             wound = min(until, speed * n * DT) * np.eye(6)[MUSCLE]
             length = slack.length - wound + 1e-4 * rng.standard_normal(6)
-            detector.commanded(length=length - 0.003)
-            verdict = detector.step(state, slack.tension, slack.tension, length, DT)
-            if verdict.cause:
-                assert verdict.suspect == MUSCLE and 'no tension' in verdict.cause
+            demand, tension = robot.demanded(length, length - 0.003), slack.tension
+            finding = health.step(observe(mae, length, tension, tension, DT, demand, state))
+            if finding is not None:
+                assert (finding.muscle, finding.kind) == (MUSCLE, Kind.SLACK_TENDON)
                 return n * DT
         return np.inf
 
@@ -70,17 +71,17 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
     robot, calibrated, healthy, loose, found
 ):
     """By a slow winch both look alike, but what is left of a cut wire is too short."""
-    detector = AnomalyDetector(robot)
-    detector.use(calibrated)
+    health = HealthMonitor(robot)
+    health.use(calibrated)
     one = np.eye(6)[MUSCLE]
     tension, start = healthy.tension * (1.0 - one), healthy.length + loose * one
-    causes = []
+    kinds = []
     for n in range(60):
         length = start - 0.009 * n * DT * one
-        detector.commanded(length=length - 0.003)
-        state = calibrated.estimate(tension, length)
-        causes.append(detector.step(state, tension, tension, length, DT).cause)
-    assert any(cause.startswith('d = ') for cause in causes[:50]) == found
+        demand = robot.demanded(length, length - 0.003)
+        finding = health.step(observe(calibrated, length, tension, tension, DT, demand))
+        kinds.append(finding and finding.kind)
+    assert (Kind.RESIDUAL_DISTANCE in kinds[:50]) == found
 
 
 @pytest.mark.parametrize('speed', [0.009, 0.036])
@@ -101,7 +102,8 @@ def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
             estimator.commanded(n * DT, length=hold)
         read = arm.sense()
         slack += read.tension[MUSCLE] < 1.0
-        estimator.step(read.tension, read.length, n * DT, n * DT)
+        states = np.array([read.length, read.tension, read.temperature])
+        estimator.step(states, n * DT, n * DT)
         assert not estimator.cause
         arm.step(DT)
     assert slack * DT > 0.5

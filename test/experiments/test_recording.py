@@ -76,7 +76,8 @@ def test_a_recording_is_estimated_as_by_the_estimator(arm26, mae, plain):
     core, estimated = Estimator(arm26), []
     core.use(mae)
     for now, tension, length in zip(times(len(plain.length)), plain.tension, plain.length):
-        estimated.append(core.step(tension, length, now, now).state.theta)
+        states = np.array([length, tension, np.full(arm26.muscle_count, 25.0)])
+        estimated.append(core.step(states, now, now).state.theta)
     tension = end_tensions(mae, plain)
     np.testing.assert_allclose(mae.estimate(tension, plain.length).theta, estimated, atol=1e-6)
     assert np.abs(np.log(tension / plain.tension)).max() > 0.09  # it did rub

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation.anomaly import DISTANCE
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.learning.calibration import (
     GLITCHES,
     LEAST_SAMPLES,

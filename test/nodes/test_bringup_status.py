@@ -72,7 +72,7 @@ def test_a_suspect_that_is_verified_is_not_to_be_mended_yet():
     told, anomaly = Situation('/left'), 'anomaly_detected; call estimator/reset when it is mended'
     told.diagnosed(said('/left/controller', f'stopped: {anomaly}'))
     cause = 'anomaly detected: biceps: d 12.5 above 9.0'
-    told.diagnosed(said('/left/estimator', f'{cause}; verifying it', suspect_muscle='biceps'))
+    told.diagnosed(said('/left/estimator', cause, suspect_muscle='biceps', verification='running'))
     told.detected = True
     assert told.trouble() == 'ANOMALY: biceps is being verified'
     told.diagnosed(said('/left/controller', 'stopped: controller/stop was called'))

@@ -12,7 +12,6 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED
-from musculoskeletal_ae.nodes.situation import VERIFYING
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 
@@ -33,10 +32,12 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
-    graph.wait(lambda: graph.report('estimator').message.endswith(VERIFYING), 'what is done')
+    graph.wait(
+        lambda: graph.report('estimator').values['verification'] == 'running', 'what is done'
+    )
     assert graph.report('estimator').values['suspect muscle'] == name
     graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
-    assert arm.estimator.core.verified == f'{name}: ruptured'
+    assert arm.estimator.core.suspects.last_verification == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     assert arm.controller.core.robot.isolated == (3,)
@@ -54,7 +55,8 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
     graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
-    assert arm.estimator.core.verified == f'{name}: a sensor says no number'
+    verified = arm.estimator.core.suspects.last_verification
+    assert verified == f'{name}: a sensor does not report a number'
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     arm.target(THERE)
     arm.goes_to(THERE)
@@ -81,7 +83,7 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
     count = len(graph.received['isolated_muscles'])
     graph.send_network(checkpoint.to_bytes(trained['default']))
     graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
-    assert arm.estimator.core.robot.isolated == (1, 2)
+    assert arm.estimator.core.body.isolated == (1, 2)
 
 
 def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):

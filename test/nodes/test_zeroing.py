@@ -6,7 +6,7 @@ import pytest
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.estimation import zeroing
+from musculoskeletal_ae.estimation import length_calibration
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
@@ -18,7 +18,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 def test_length_offsets_are_found_and_reach_every_node(
     graph, trained_file, tmp_path, monkeypatch, stands
 ):
-    monkeypatch.setattr(zeroing, 'ENOUGH_SEEN', 2.0)
+    monkeypatch.setattr(length_calibration, 'ENOUGH_WITH_ANGLES', 2.0)
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
@@ -29,7 +29,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     if stands:
         graph.set_parameter('estimator', 'zero_posture', hardware.arm.theta.tolist())
     assert graph.call(Trigger, 'estimator/zero').success
-    assert not node.core.zeros.known
+    assert not node.core.body.offsets.known
     if not stands:
         assert graph.call(SetBool, 'controller/explore', SetBool.Request(data=True)).success
     nodes = [node, controller, learner]
@@ -78,4 +78,4 @@ def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, train
     controller = graph.host(Controller, **common)
     estimator = graph.host(Estimator, **common, zero_at_start=True)
     graph.wait(lambda: not controller.zeros.known, 'the controller to know of it')
-    assert not estimator.core.zeros.known
+    assert not estimator.core.body.offsets.known

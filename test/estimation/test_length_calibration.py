@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zeros of the lengths, found on the network's own body."""
+"""Length offsets are found on the network's own body."""
 
 import re
 
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation import zeroing
+from musculoskeletal_ae.estimation import length_calibration
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.zeroing import LARGEST_LEFT, WINDOW, Zeroing
+from musculoskeletal_ae.estimation.length_calibration import LARGEST_LEFT, LengthCalibration
+from musculoskeletal_ae.estimation.length_moments import WINDOW
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
+
+
+def states(tension, length):
+    return np.array([length, tension, np.full(len(length), 25.0)])
 
 
 def swinging(robot, mae):
@@ -38,7 +43,8 @@ def swinging(robot, mae):
 
 @pytest.fixture
 def seldom(monkeypatch):
-    monkeypatch.setattr(zeroing, 'AGAIN', 5.0)  # a guess takes long, and fewer find zeros no sooner
+    # A guess takes long, and with fewer guesses the offsets are found as soon.
+    monkeypatch.setattr(length_calibration, 'AGAIN', 5.0)
 
 
 @pytest.fixture
@@ -46,55 +52,58 @@ def moment(robot, mae):
     return swinging(robot, mae)
 
 
-def run(zeros, moment, seconds, sees, begin=0.0):
+def run(calibration, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
         for k in range(25):  # angles come more seldom than lengths
-            zeros.step(tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None)
-        if zeros.done:
+            calibration.step(
+                tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None
+            )
+        if calibration.is_done:
             break
-    return zeros
+    return calibration
 
 
 def test_length_offsets_are_found_with_joint_sensors(robot, mae, moment):
-    found = run(Zeroing(robot, mae), moment, 40.0, sees=True)
-    assert found.done and found.moving < 30.0
-    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=1e-3)
+    found = run(LengthCalibration(robot, mae), moment, 40.0, sees=True)
+    assert found.is_done and found.time < 30.0
+    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=1e-3)
 
 
 @pytest.mark.usefixtures('seldom')
 def test_length_offsets_are_found_without_joint_sensors(robot, mae, moment):
-    found = run(Zeroing(robot, mae), moment, 90.0, sees=False)
-    assert found.done and found.moving < 60.0
-    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=3e-3)
+    found = run(LengthCalibration(robot, mae), moment, 90.0, sees=False)
+    assert found.is_done and found.time < 60.0
+    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=3e-3)
 
 
 def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot, mae, moment):
     theta, *standing = moment(3.0)
-    moved = run(Zeroing(robot, mae, theta), moment, 5.0, sees=False, begin=3.0)
-    assert not moved.done and 'call estimator/zero again' in moved.progress
-    found = run(Zeroing(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False)
-    assert found.done
-    np.testing.assert_allclose(found.zeros.offset, OFFSET, atol=1e-3)
+    moved = run(LengthCalibration(robot, mae, theta), moment, 5.0, sees=False, begin=3.0)
+    assert not moved.is_done and 'call estimator/zero again' in moved.progress
+    found = run(LengthCalibration(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False)
+    assert found.is_done
+    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=1e-3)
 
 
 def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment):
-    found = run(Zeroing(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
-    assert found.zeros is not None and not found.zeros.known
-    assert f'0 of {zeroing.ENOUGH:.0f} s of gentle motion' in found.progress
+    found = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
+    assert found.offsets is not None and not found.offsets.known
+    assert f'0 of {length_calibration.ENOUGH:.0f} s of gentle motion' in found.progress
 
 
 def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
     estimator = Estimator(robot)
     with pytest.raises(MusculoskeletalError, match='no checkpoint'):
-        estimator.zero()
+        estimator.calibrate_lengths()
     estimator.use(mae)
     for posture in ((0.1,), tuple(robot.upper + 0.1)):
         with pytest.raises(MusculoskeletalError, match='legal'):
-            estimator.zero(posture)
-    assert estimator.zeros.known
-    estimator.zero(tuple(robot.upper + 0.002))  # as read of a joint that rests on its stop
-    assert not estimator.zeros.known
+            estimator.calibrate_lengths(posture)
+    assert estimator.body.offsets.known
+    on_stop = tuple(robot.upper + 0.002)  # what a joint reads that rests on its stop
+    estimator.calibrate_lengths(on_stop)
+    assert not estimator.body.offsets.known
 
 
 def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
@@ -102,18 +111,18 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 ):
     estimator = Estimator(robot)
     estimator.use(calibrated)
-    estimator.zero()
-    assert not estimator.zeros.known
+    estimator.calibrate_lengths()
+    assert not estimator.body.offsets.known
     now, detected = 0.0, []
     for n in range(300):
         _, tension, length = moment(0.01 * n)
         now += 0.01
-        estimator.commanded(now, length=length + OFFSET - estimator.zeros.offset)
+        estimator.commanded(now, length=length + OFFSET - estimator.body.offsets.offset)
         if n > 200:
             tension = tension * (np.arange(6) != 2)
         elif n == 200:
             assert 'finding the length zeros' in str(estimator.report(now))
-        estimate = estimator.step(tension, length + OFFSET, now, now)
+        estimate = estimator.step(states(tension, length + OFFSET), now, now)
         detected += [n] * bool(estimate is not None and estimate.detected)
     assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
 
@@ -122,7 +131,7 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    monkeypatch.setattr(zeroing, 'AGAIN', 10.0)  # without a muscle it takes longer still
+    monkeypatch.setattr(length_calibration, 'AGAIN', 10.0)  # without a muscle it takes longer still
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -130,19 +139,19 @@ def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibratio
         tension[3], length[3] = rng.uniform(0.0, 300.0), rng.uniform(-5.0, 5.0)
         return theta, tension, length
 
-    found = run(Zeroing(robot, mae.without((3,))), disturbed, 120.0, sees)
-    assert found.done
+    found = run(LengthCalibration(robot, mae.without((3,))), disturbed, 120.0, sees)
+    assert found.is_done
     others = np.arange(6) != 3
-    np.testing.assert_allclose(found.zeros.offset[others], OFFSET[others], atol=4e-3)
+    np.testing.assert_allclose(found.offsets.offset[others], OFFSET[others], atol=4e-3)
 
 
 def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
     theta, *standing = moment(3.0)
-    zeroing = Zeroing(robot, mae.without((3,)), theta)
-    found = run(zeroing, lambda _: (theta, *standing), 2.0, sees=False)
-    assert found.done
-    off = np.abs(found.zeros.offset - OFFSET)
-    assert off[3] < found.zeros.deviation[3] == LARGEST_LEFT
+    calibration = LengthCalibration(robot, mae.without((3,)), theta)
+    found = run(calibration, lambda _: (theta, *standing), 2.0, sees=False)
+    assert found.is_done
+    off = np.abs(found.offsets.offset - OFFSET)
+    assert off[3] < found.offsets.deviation[3] == LARGEST_LEFT
     assert np.delete(off, 3).max() < 1e-3
 
 
@@ -151,17 +160,17 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
 def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
     robot = Robot.load('arm26')
     robot.kinematics.model.gravity.linear = np.zeros(3)  # as with upright axes
-    found = run(Zeroing(robot, mae), swinging(robot, mae), 60.0, sees=False)
-    assert np.isfinite(found.zeros.offset).all()
+    found = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
+    assert np.isfinite(found.offsets.offset).all()
 
 
 def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(robot, mae, moment):
     estimator = Estimator(robot)
     estimator.use(mae)
-    estimator.zero()
+    estimator.calibrate_lengths()
     for n in range(400):
         _, tension, length = moment(0.01 * n)
-        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
     reported = str(estimator.report(4.0))
     assert re.search('finding the length zeros: [1-4] of', reported)
     estimator.isolate(())
@@ -170,7 +179,7 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)
-        estimator.step(tension, length + OFFSET, 0.01 * n, 0.01 * n)
+        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
     assert re.search('finding the length zeros: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
     assert 'finding the length zeros: 0 of' in str(estimator.report(8.0))

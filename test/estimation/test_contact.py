@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from exact_mae import ExactMae
 
+from musculoskeletal_ae.estimation.contact import CONTACT, ContactEstimator
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.touch import CONTACT, ExternalTorque, HealthyTorque
+from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
@@ -24,7 +25,7 @@ SPREAD = np.full(5, 0.2)
 def observer(spread=SPREAD, time=LEAST_MOTION, robot=ARM):
     mae = ExactMae(robot)
     mae.touch = TouchStatistics(mae.friction, spread, time)
-    result = ExternalTorque(robot)
+    result = ContactEstimator(robot)
     result.use(mae)
     return result
 
@@ -38,10 +39,14 @@ def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
     return tension, robot.muscle_lengths(theta, tension)
 
 
+def states(tension, length):
+    return np.array([length, tension, np.full(len(length), 25.0)])
+
+
 def felt(core, theta, tension):
     for _ in range(100):
-        touch = core.step(theta, tension, DT)
-    return touch
+        contact = core.step(theta, tension, DT)
+    return contact
 
 
 @pytest.mark.parametrize('axis', range(3))
@@ -49,23 +54,23 @@ def felt(core, theta, tension):
 def test_a_force_on_the_hand_is_estimated_in_every_direction(axis, size):
     force = size * np.eye(3)[axis]
     core = observer()
-    touch = felt(core, THETA, pulling(THETA, force)[0])
-    np.testing.assert_allclose(touch.force(), force, atol=1.0)
-    assert touch.contact
+    contact = felt(core, THETA, pulling(THETA, force)[0])
+    np.testing.assert_allclose(contact.force(), force, atol=1.0)
+    assert contact.is_contact
 
 
 def test_a_free_arm_has_no_external_force_and_no_contact():
-    touch = felt(observer(), THETA, pulling(THETA)[0])
-    np.testing.assert_allclose(touch.torque, 0.0, atol=0.02)
-    np.testing.assert_allclose(touch.force(), 0.0, atol=0.2)
-    assert not touch.contact
+    contact = felt(observer(), THETA, pulling(THETA)[0])
+    np.testing.assert_allclose(contact.torque, 0.0, atol=0.02)
+    np.testing.assert_allclose(contact.force(), 0.0, atol=0.2)
+    assert not contact.is_contact
 
 
 def test_a_planar_arm_estimates_no_force_across_its_plane(robot):
     theta = 0.5 * (robot.lower + robot.upper)
     core = observer(spread=np.full(2, 0.2), robot=robot)
-    touch = felt(core, theta, pulling(theta, (5.0, 0.0, -5.0), robot)[0])
-    np.testing.assert_allclose(touch.force(), [5.0, 0.0, -5.0], atol=0.5)
+    contact = felt(core, theta, pulling(theta, (5.0, 0.0, -5.0), robot)[0])
+    np.testing.assert_allclose(contact.force(), [5.0, 0.0, -5.0], atol=0.5)
 
 
 def test_known_tendon_friction_is_not_taken_for_a_force():
@@ -76,8 +81,8 @@ def test_known_tendon_friction_is_not_taken_for_a_force():
         core, sliding = observer(), FrictionDirection()
         for row in (*wound, *[length] * 100):
             end = sliding.end_tension(np.full(10, friction), tension * np.exp(0.1), row)
-            touch = core.step(THETA, end, DT)
-        errors.append(np.abs(touch.torque).max())
+            contact = core.step(THETA, end, DT)
+        errors.append(np.abs(contact.torque).max())
     assert errors[1] < 0.05 < 0.2 < errors[0]
 
 
@@ -92,9 +97,9 @@ def test_inertia_is_not_taken_for_a_force():
         torque = ARM.kinematics.inverse_dynamics(theta, velocity, turn)
         jacobian = ExactMae(ARM).muscle_jacobian(theta, np.full(10, 60.0))
         tension = TensionProgramme(jacobian, torque, 5.0, 400.0).nearest(60.0)
-        touch = core.step(theta, tension, DT)
+        contact = core.step(theta, tension, DT)
         if n > 50:
-            largest = max(largest, np.abs(touch.torque).max())
+            largest = max(largest, np.abs(contact.torque).max())
             free = max(free, np.abs(torque - ARM.kinematics.holding_torque(theta)).max())
     assert largest < 0.5 * free
 
@@ -112,16 +117,18 @@ def test_a_joint_at_its_stop_reports_no_torque_that_the_stop_carries():
 
 def test_without_statistics_there_is_a_force_but_no_contact():
     core = observer(time=0.0)
-    touch = felt(core, THETA, pulling(THETA, (20.0, 0.0, 0.0))[0])
-    assert np.linalg.norm(touch.force()) > 10.0 and np.isnan(touch.distance) and not touch.contact
+    contact = felt(core, THETA, pulling(THETA, (20.0, 0.0, 0.0))[0])
+    assert np.linalg.norm(contact.force()) > 10.0
+    assert np.isnan(contact.distance)
+    assert not contact.is_contact
 
 
 @pytest.mark.filterwarnings('ignore:invalid value')
 def test_a_message_that_is_not_finite_leaves_no_trace():
     core, (tension, _) = observer(), pulling(THETA, (20.0, 0.0, 0.0))
-    touch = core.step(np.full(5, np.nan), tension, DT)
-    np.testing.assert_array_equal(touch.force(), 0.0)
-    assert not touch.contact
+    contact = core.step(np.full(5, np.nan), tension, DT)
+    np.testing.assert_array_equal(contact.force(), 0.0)
+    assert not contact.is_contact
     np.testing.assert_allclose(felt(core, THETA, tension).force(), [20.0, 0.0, 0.0], atol=1.0)
 
 
@@ -138,16 +145,16 @@ def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
         torque = robot.kinematics.inverse_dynamics(theta, velocity, acceleration)
         jacobian = mae.muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
         tension = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
-        touch = core.step(tension, mae.lengths(theta, tension), time, time).touch
-        assert n < 60 or touch.distance < CONTACT
+        contact = core.step(states(tension, mae.lengths(theta, tension)), time, time).contact
+        assert n < 60 or contact.distance < CONTACT
 
 
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
 def test_the_observer_is_stable_at_any_rate(dt):
     core, (tension, _) = observer(), pulling(THETA, (0.0, 20.0, 0.0))
     for _ in range(200):
-        touch = core.step(THETA, tension, dt)
-    np.testing.assert_allclose(touch.force(), [0.0, 20.0, 0.0], atol=1.0)
+        contact = core.step(THETA, tension, dt)
+    np.testing.assert_allclose(contact.force(), [0.0, 20.0, 0.0], atol=1.0)
 
 
 @dataclass
@@ -194,14 +201,14 @@ def test_the_estimator_reports_contacts(robot, mae):
     core.use(replace(mae, touch=statistics))
     tension, length = pulling(theta, (10.0, 0.0, 10.0), robot)
     for n in range(100):
-        estimate = core.step(tension, length, n * DT, n * DT)
-    assert estimate.touch.contact
+        estimate = core.step(states(tension, length), n * DT, n * DT)
+    assert estimate.contact.is_contact
     values = core.report(1.0).values
     assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
-    core.zero(tuple(theta.tolist()))
-    core.step(tension, length, 1.0, 1.0)
+    core.calibrate_lengths(tuple(theta.tolist()))
+    core.step(states(tension, length), 1.0, 1.0)
     assert 'contact' not in core.report(1.0).values  # of zeros that count no longer
     core = Estimator(robot)
     core.use(mae)
-    core.step(tension, length, 1.0, 1.0)
+    core.step(states(tension, length), 1.0, 1.0)
     assert core.report(1.0).values['contact'] == 'not calibrated'

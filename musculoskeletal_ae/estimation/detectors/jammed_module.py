@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detect a winch that does not move although its tension is far from the commanded one.
+
+    |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
+
+The readings of a jammed module may agree with a posture. Therefore the residuals need not show it.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+STANDS = 0.001  # [m] that the winch moves by at most
+JAM_TIME = 1.0  # [s]
+JAM, JAM_SHARE = 50.0, 0.3  # [N], and as a share of T_ref, since tension sensors differ in gain
+
+
+class JammedModule(Detector):
+    """Measures for how long each winch has stood although it should have moved."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = self._complete_robot = robot
+        self._time: Array = np.zeros(robot.muscle_count)  # [s]
+        self._length: Array = np.zeros(robot.muscle_count)  # where the winch stands [m]
+
+    def use(self, mae: Mae) -> None:
+        """Judge the muscles that are not isolated in this network."""
+        self._robot = self._complete_robot.without(mae.isolated)
+
+    def reset(self) -> None:
+        """Begin to measure times again."""
+        self._time[:] = 0.0
+
+    def step(self, observation: Observation) -> Finding | None:
+        """Take a message."""
+        if observation.demand is None:
+            self._time[:] = 0.0
+            return None
+        tension, length = observation.sample.motor_tension, observation.sample.length
+        demand = np.minimum(observation.demand, self._robot.tension.max)
+        is_far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
+        has_to_move = is_far & self._robot.used
+        if not np.count_nonzero(has_to_move):
+            self._length = length
+            self._time[:] = 0.0
+            return None
+        stands = has_to_move & (np.abs(length - self._length) < STANDS)
+        self._length = np.where(stands, self._length, length)
+        self._time = np.where(stands, self._time + observation.dt, 0.0)
+        if self._time.max() < JAM_TIME or not observation.lengths_known:
+            return None
+        muscle = int(self._time.argmax())
+        return Finding(muscle, Kind.JAMMED_MODULE, 'its winch stands, whatever is commanded')

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a detector sees, what it may find, and the interface of all detectors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.state_estimator import Estimate, estimate_of
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+
+
+class Kind(Enum):
+    """Kinds of findings. The values are published in /diagnostics."""
+
+    RESIDUAL_DISTANCE = 'residual_distance'
+    SLACK_TENDON = 'slack_tendon'
+    JAMMED_MODULE = 'jammed_module'
+    SENSOR_FROZEN = 'sensor_frozen'
+    LENGTH_JUMP = 'length_jump'
+    THERMAL_DRIFT = 'thermal_drift'
+    VALUES_MISSING = 'values_missing'
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One muscle is not as it should be.
+
+    Attributes:
+        muscle: Its position in T and l.
+        kind: Which rule applied.
+        evidence: The figures behind it, for people.
+    """
+
+    muscle: int
+    kind: Kind
+    evidence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One message, as detectors see it.
+
+    Attributes:
+        sample: What was read.
+        estimate: What the network makes of it.
+        demand: T that the modules are commanded [N], (M,); None where nothing is commanded.
+        dt: Time since the message before [s], at most a short pause.
+        lengths_known: Whether the length offsets are known.
+    """
+
+    sample: MuscleSample
+    estimate: Estimate
+    demand: Array | None
+    dt: float
+    lengths_known: bool = True
+
+
+def observe(
+    mae: Mae,
+    length: Array,
+    motor_tension: Array,
+    bone_tension: Array,
+    dt: float,
+    demand: Array | None = None,
+    state: State | None = None,
+) -> Observation:
+    """Return the observation of recorded readings, whose temperatures are unknown.
+
+    Args:
+        mae: The network that estimates, without the isolated muscles.
+        length: l with the length offset removed [m], (M,).
+        motor_tension: T [N], (M,).
+        bone_tension: T_end [N], (M,).
+        dt: Time since the message before [s].
+        demand: T that the modules are commanded [N], (M,), if it is known.
+        state: What the network restores, if the caller has computed it already.
+    """
+    unknown = np.full(len(length), np.nan)
+    sample = MuscleSample(
+        time=math.nan,
+        length=length,
+        length_read=length,
+        motor_tension=motor_tension,
+        bone_tension=bone_tension,
+        sliding=unknown,
+        temperature=unknown,
+        usable=~np.isin(np.arange(len(length)), mae.isolated),
+        newest=np.array([length, motor_tension, unknown]),
+    )
+    state = mae.estimate(bone_tension, length) if state is None else state
+    return Observation(sample, estimate_of(mae, state, bone_tension, length), demand, dt)
+
+
+class Detector:
+    """Base class of the detectors. Each looks for one kind of fault, and latches nothing.
+
+    A new detector overrides `step` or `read`, and what it needs of the rest. It is used once it
+    stands in the list of `HealthMonitor`.
+    """
+
+    def use(self, mae: Mae) -> None:
+        """Use this network, without the muscles that are isolated in it."""
+
+    def configure(self, settings: Detection) -> None:
+        """Use these settings."""
+
+    def reset(self) -> None:
+        """Forget what came before, as after a jump of the clock or a reset by the user."""
+
+    def accept(self, muscles: Iterable[int]) -> None:
+        """Consider muscles healthy as they are now."""
+
+    def read(self, states: Array, usable: Bools, now: float) -> Finding | None:  # noqa: ARG002
+        """Take the readings of every message, also of one that was rejected.
+
+        Args:
+            states: l [m], T [N] and temperature [°C] as they were read, (3, M).
+            usable: Which muscles count, (M,).
+            now: When it came, on a steady clock [s].
+        """
+        return None
+
+    def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
+        """Take a message of which there is an estimate."""
+        return None

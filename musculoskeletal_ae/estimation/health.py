@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watch whether the body is healthy: the list of detectors.
+
+A new detector is one file in `estimation/detectors/` and one entry in the list below. The
+estimator, offline learning (`train --from-bag`) and the experiments use the same list.
+"""
+
+from collections.abc import Iterable
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
+from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
+from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
+from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
+from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
+from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
+from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.heat import Heat
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets import preset_named
+from musculoskeletal_ae.robot.robot import Robot
+
+
+class HealthMonitor:
+    """Shows every message to all detectors. The first finding of the list counts.
+
+    Attributes:
+        residual: The detector of the residual distance, which also names the most suspect muscle.
+        settings: What the user may choose.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        preset: str = 'default',
+        settings: Detection | None = None,
+        heat: Heat | None = None,
+    ) -> None:
+        """Begin without a network.
+
+        Args:
+            robot: The nominal body.
+            preset: Its name says whether d or A alone decides.
+            settings: What the user may choose.
+            heat: Thermal models of the modules, which the caller steps.
+        """
+        self.settings = settings or Detection()
+        uses_distance = preset_named(preset).whitened
+        slack = SlackTendon(robot, self.settings) if uses_distance else None
+        self.residual = ResidualDistance(robot, self.settings, uses_distance, slack)
+        by_physics: list[Detector] = [] if slack is None else [slack, JammedModule(robot)]
+        self._detectors: list[Detector] = [
+            LengthJump(),
+            MissingValues(),
+            *by_physics,
+            self.residual,
+            FrozenSensor(robot),
+            ThermalDrift(heat or Heat(robot)),
+        ]
+
+    def use(self, mae: Mae) -> None:
+        """Use this network, without the muscles that are isolated in it."""
+        for detector in self._detectors:
+            detector.use(mae)
+
+    def configure(self, settings: Detection) -> None:
+        """Use these settings."""
+        self.settings = settings
+        for detector in self._detectors:
+            detector.configure(settings)
+
+    def reset(self) -> None:
+        """Forget what came before, as after a jump of the clock or a reset by the user."""
+        for detector in self._detectors:
+            detector.reset()
+
+    def accept(self, muscles: Iterable[int]) -> None:
+        """Consider muscles healthy as they are now."""
+        muscles = tuple(muscles)
+        for detector in self._detectors:
+            detector.accept(muscles)
+
+    def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
+        """Take the readings of every message, also of one that was rejected; see `Detector`."""
+        findings = [detector.read(states, usable, now) for detector in self._detectors]
+        return next(filter(None, findings), None)
+
+    def step(self, observation: Observation) -> Finding | None:
+        """Take a message of which there is an estimate."""
+        findings = [detector.step(observation) for detector in self._detectors]
+        return next(filter(None, findings), None)

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the external torque that a healthy arm in motion seems to have.
+
+    σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²),   t: time of motion so far, MEMORY at most
+
+`estimation/contact.py` decides by σ whether a torque means contact.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.contact import ContactEstimator
+from musculoskeletal_ae.friction import FrictionDirection
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION
+from musculoskeletal_ae.robot.robot import Robot
+
+MEMORY = 180.0  # [s] of motion whose torques count
+MOVING = 0.05  # [rad/s], or times RACK [m/s], of all joints together, below which an arm rests
+#: A torque counts as at most this many times σ: a larger one means that somebody touched the arm.
+OUTLIER = 5.0
+LEAST_SPREAD = 1e-3  # [N·m]
+
+
+class HealthyTorque:
+    """Measures σ over the last minutes of motion. `use` has to be called first."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._contact, self._direction = ContactEstimator(robot), FrictionDirection()
+        self._radian = robot.kinematics.radian
+        self.start()
+
+    def start(self) -> None:
+        """Begin again, as for another arm."""
+        self._square, self._time = np.zeros_like(self._radian), 0.0
+
+    def use(self, mae: Mae) -> Mae:
+        """Use this network; return it with σ, if it has a calibrated body model."""
+        if (known := mae.touch) is None:
+            self._mae = mae
+        else:
+            if self._time == 0.0:
+                self._square, self._time = known.spread**2, known.time
+            spread = np.maximum(np.sqrt(self._square), LEAST_SPREAD)
+            self._mae = replace(mae, touch=replace(known, spread=spread, time=self._time))
+        self._contact.use(self._mae)
+        return self._mae
+
+    def reset(self) -> None:
+        """Forget the motion so far, as after a jump of the clock; σ stays."""
+        self._contact.reset()
+        self._direction.reset()
+
+    def step(self, tension: Array, length: Array, dt: float) -> None:
+        """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after those before."""
+        end = self._direction.end_tension(self._mae.friction, tension, length)
+        theta = self._mae.estimate(end, length).theta
+        torque = self._contact.step(theta, end, dt).torque
+        if np.linalg.norm(self._contact.velocity / self._radian) < MOVING:
+            return
+        square = torque**2
+        if self._time > LEAST_MOTION:
+            square = np.minimum(square, OUTLIER**2 * self._square)
+        self._time = min(self._time + dt, MEMORY)
+        change = np.where(torque == 0.0, 0.0, square - self._square)  # 0: its joint is at its stop
+        self._square = self._square + dt / self._time * change

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Length calibration: find by how much every length sensor reads too much after power-on.
+
+The offsets are found while the arm moves gently, with or without measured joint angles, or while it
+stands in a stated posture. `length_moments.py` collects the readings, `length_fit.py` has the
+equations, and this file decides when to fit and whether the result can be relied on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.length_fit import FARTHEST, Fit, LengthFit, Steps
+from musculoskeletal_ae.estimation.length_moments import MomentCollector, Moments
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
+
+#: [s] of gentle motion that are enough with measured joint angles and without, and of standing in a
+#: stated posture
+ENOUGH_WITH_ANGLES, ENOUGH, STANDING = 20.0, 38.0, 1.0
+FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, and between later ones
+#: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which offsets
+#: are wrong. Correct ones leave 0.3 mm and cost 0.2–0.5; those of a wrong posture cost 1.1.
+LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
+#: a moment in so many is independent of the others
+CORRELATED = 10.0
+BEYOND_STOP = 0.01  # share of a joint's range that a stated posture may lie beyond it
+MAD_TO_DEVIATION = 1.48  # standard deviation over median absolute deviation
+
+
+class LengthCalibration:
+    """Collects readings and fits the offsets, a little at every message.
+
+    Attributes:
+        posture: θ [rad] (D,) in which the arm stands, or None if it moves gently.
+        offsets: The guess so far, known or not; None before the first one.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
+        """Begin.
+
+        Args:
+            robot: The nominal body.
+            mae: The network; its isolated muscles do not count.
+            posture: θ [rad] (D,) if the arm stands in a known posture.
+        """
+        self._robot, self._mae, self.posture = robot, mae, posture
+        self._fit = LengthFit(robot, mae)
+        self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
+        self._since = 0.0  # [s] since the last fit began
+        self._work: tuple[Steps, Moments] | None = None  # the fit that is being made
+        self._best: Fit | None = None
+        self._has_angles = False  # whether joint angles are measured most of the time
+        self._problem = ''  # why the last fit cannot be relied on
+        self.offsets: LengthOffsets | None = None
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether the arm stands in a stated posture."""
+        return self.posture is not None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the offsets are known."""
+        return self.offsets is not None and self.offsets.known
+
+    @property
+    def time(self) -> float:
+        """How long the arm has moved gently, or stood [s]."""
+        return self._collector.time
+
+    @property
+    def enough(self) -> float:
+        """How long the arm has to move gently, or to stand [s]."""
+        if self.is_standing:
+            return STANDING
+        return ENOUGH_WITH_ANGLES if self._has_angles else ENOUGH
+
+    @property
+    def progress(self) -> str:
+        """How far the calibration is, and what is in its way."""
+        how = 'of standing still' if self.is_standing else 'of gentle motion'
+        progress = f'{self.time:.0f} of {self.enough:.0f} s {how}'
+        problem = self._problem
+        if self._collector.has_moved_away:
+            problem = 'the arm moved away; let it stand and call estimator/zero again'
+        return f'{progress}; {problem}' if problem else progress
+
+    def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
+        """Take the readings of one message.
+
+        Args:
+            tension: T [N], (M,).
+            length: l as it was read [m], (M,).
+            dt: Time since the message before [s].
+            theta: Measured θ [rad], (D,), if there is any.
+        """
+        has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
+        if self.is_done or has_failed:
+            return
+        self._collector.step(tension, length, dt, theta)
+        self._since += dt
+        if self._work is not None:
+            self._continue_fit(*self._work)
+        elif self._since >= self._pause and len(self._collector):
+            self._since = 0.0
+            self._begin_fit(self._collector.moments())
+
+    @property
+    def _pause(self) -> float:
+        return FIRST if self._best is None or self.is_standing else AGAIN
+
+    def _begin_fit(self, moments: Moments) -> None:
+        measured = np.flatnonzero(~np.isnan(moments.theta).any(axis=1))
+        self._has_angles = 2 * len(measured) > len(moments.theta)
+        if self._has_angles:
+            moments = moments.rows(measured)
+            self._judge(self._fit.known_angles(moments), moments)
+        else:
+            self._work = self._fit.unknown_angles(moments, self._best), moments
+
+    def _continue_fit(self, steps: Steps, moments: Moments) -> None:
+        try:
+            next(steps)
+        except StopIteration as ended:
+            self._work = None
+            self._judge(ended.value, moments)
+
+    def _judge(self, fit: Fit, moments: Moments) -> None:
+        """Use a fit as the guess; the offsets are known if it rests on enough and explains it."""
+        muscle_count, used = self._robot.muscle_count, self._fit.used
+        expected = self._mae.lengths(fit.theta, moments.tension)
+        # An isolated muscle still gets commands: its offset is known as well as its readings allow.
+        of_isolated = np.median(moments.read - expected, axis=0)
+        of_isolated = np.clip(of_isolated, -FARTHEST, FARTHEST)
+        offset = np.where(used, fit.constants[:muscle_count], of_isolated)
+        left = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
+        self._best, self._problem = fit, ''
+        deviation = np.full(muscle_count, UNKNOWN)
+        if self.time >= self.enough:
+            self._problem = self._problem_of(fit, left)
+            if not self._problem:
+                independent = max(1.0, len(fit.theta) / CORRELATED)
+                deviation = MAD_TO_DEVIATION * left / np.sqrt(independent)
+                deviation[~used] = LARGEST_LEFT
+        self.offsets = LengthOffsets(offset, deviation)
+
+    def _problem_of(self, fit: Fit, left: Array) -> str:
+        """Return why a fit cannot be relied on, or ''; `left` [m] is unexplained, (M,)."""
+        if left.max() > LARGEST_LEFT:
+            name = self._robot.muscles[int(left.argmax())]
+            return f'{1e3 * left.max():.1f} mm of {name} are left unexplained'
+        cost = self._fit.cost_per_residual(fit)
+        if not cost <= LARGEST_COST:  # another posture may look alike
+            return f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
+        return ''
+
+
+def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
+    """Check that an arm can stand in θ [rad] (D,); () is legal and means no posture.
+
+    Raises:
+        MusculoskeletalError: With the legal range of every joint.
+    """
+    if not posture:
+        return
+    theta = np.array(posture)
+    # A joint that rests on its stop reads a little beyond it.
+    beyond = BEYOND_STOP * (robot.upper - robot.lower)
+    low, high = robot.lower - beyond, robot.upper + beyond
+    if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
+        return
+    limits = zip(robot.units, robot.lower, robot.upper, strict=True)
+    legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
+    raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal}')

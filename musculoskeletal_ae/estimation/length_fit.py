@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit the length offsets, and the postures of all moments, to readings of length and tension.
+
+    l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
+    0 = g(θ) + G(θ, T)ᵀ T                      D more while the arm moves slowly
+
+Where the angles were measured, o is the mean of what the first line leaves. Otherwise o and the
+postures of all moments are found together, by maximum likelihood with Student's noise; l and G are
+those of the network (①). Muscles outnumber joints, and G changes from posture to posture. Therefore
+only one o explains all moments while the arm wanders. The weight of the arm determines its posture
+before the lengths do, even from a single moment.
+
+The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
+many random first postures. Constants that are estimated besides o: the friction μ of every tendon,
+the offset of every tension sensor, and the Coulomb friction torque of every joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.length_moments import Moments
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+# Where a joint slides, [rad] below are times RACK [m], and [N·m] are over RACK [N].
+
+# What the residuals weigh: standard deviations.
+LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
+WORST = 0.3, 5.0  # times LENGTH_NOISE, of the muscles that a network restores best and worst
+OUTSIDE = 0.05  # [rad] beyond the joint limits
+ISOLATED = 1e-6  # weight of an isolated muscle's length beside that of others
+FREEDOM = 4.0  # of the Student distribution
+AT_STOP = 0.03  # [rad] from a joint limit, where the stop may carry torque
+
+# What is known of the constants before: mean and standard deviation, or the latter alone.
+OFFSET = 0.1  # [m] of a length
+FRICTION = 0.05  # μ of a tendon; mean and standard deviation
+TENSION_OFFSET = 1.5  # [N] of a tension sensor; covers the error of its gain
+JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest that the weight needs
+STICKING = 0.003  # [rad] after a reversal, in which the friction of a joint changes sign
+LEAST_WEIGHT = 0.1  # of what T_bias exerts at the joints: the least that the weight counts for
+
+# The search for a start: random postures, and those that are tried, listed and pursued.
+DRAWN, TRIED, LISTED, PURSUED = 3200, 400, 30, 6
+FEW_MOMENTS = 24  # by which random postures are compared
+BATCH = 20  # postures that are tried at one message
+COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: standard deviations in that comparison
+FARTHEST = 0.3  # [m] of an offset; [rad] of one step of an angle
+
+ROUNDS, FIRST_ROUNDS = 20, 6  # Gauss–Newton steps at most
+STEP = 1e-3  # of numerical derivatives
+LARGEST_DAMPING = 1e4
+
+
+class Fit(NamedTuple):
+    """What explains K moments.
+
+    Attributes:
+        cost: Negative logarithm of the posterior, up to a constant; less is better.
+        constants: o [m], μ of the tendons, offsets of the tension sensors [N], Coulomb torques of
+            the joints [N·m], (3M + D,).
+        theta: Postures [rad], (K, D).
+    """
+
+    cost: float
+    constants: Array
+    theta: Array
+
+
+Steps = Generator[None, None, Fit]  # yields between short pieces of work, and returns a fit
+
+
+class LengthFit:
+    """Fits length offsets with one network.
+
+    Attributes:
+        used: Which muscles are not isolated, (M,).
+    """
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        self._robot, self._mae = robot, mae
+        self._rng = np.random.default_rng([0, 0x2E])
+        muscle_count, joint_count = robot.muscle_count, robot.joint_count
+        self._radian = radian = robot.kinematics.radian
+        postures = robot.random_postures(64, self._rng)
+        weight = np.abs(radian * robot.kinematics.holding_torque(postures)).max()
+        moment_arms = np.abs(radian * robot.routes.muscle_jacobian(postures))
+        # Joints rub even if they carry no weight, as joints with upright axes.
+        by_bias = (robot.description.tension.bias @ moment_arms).max()
+        weight = max(weight, LEAST_WEIGHT * by_bias)
+        counts = muscle_count, muscle_count, muscle_count, joint_count
+        self._prior_mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)
+        spread = OFFSET, FRICTION, TENSION_OFFSET, JOINT_FRICTION * weight
+        self._prior_spread = np.repeat(spread, counts)
+        self._prior_spread[-joint_count:] /= radian
+        self._torque_noise = TORQUE_NOISE / radian
+        self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
+        length_noise = LENGTH_NOISE * _relative_error(mae) / np.where(self.used, 1.0, ISOLATED)
+        #: standard deviations of the residuals, (M + 2D,)
+        self._noise = np.concatenate((length_noise, self._torque_noise, OUTSIDE * radian))
+
+    def known_angles(self, moments: Moments) -> Fit:
+        """Fit moments whose angles were measured."""
+        left = moments.length - self._mae.lengths(moments.theta, moments.tension)
+        muscle_count = self._robot.muscle_count
+        constants = np.concatenate([left.mean(axis=0), self._prior_mean[muscle_count:]])
+        return Fit(0.0, constants, moments.theta)
+
+    def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
+        """Fit moments whose angles were not measured, beginning also from an earlier fit."""
+        rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
+        few = moments.rows(rows)
+        guesses = yield from self._guesses(moments, few)
+        likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
+        # Few moments may be wrong. All of them choose between the newest guess and the last fit.
+        candidates = [likeliest.constants]
+        if before is not None:
+            candidates.append(before.constants)
+        return (yield from self._best(candidates, moments, ROUNDS))
+
+    def cost_per_residual(self, fit: Fit) -> float:
+        """Return the cost of a fit over the number of its residuals of length and torque."""
+        return fit.cost / (len(fit.theta) * (len(self._noise) - self._robot.joint_count))
+
+    # -- where to begin -------------------------------------------------------------------------
+
+    def _best(self, guesses: list[Array], moments: Moments, rounds: int) -> Steps:
+        """Return the best of the fits near each guess of the constants."""
+        fits = list[Fit]()
+        for constants in guesses:
+            length = moments.length - constants[: self._robot.muscle_count]
+            theta = self._mae.estimate(moments.tension, length).theta
+            theta = np.clip(theta, self._robot.lower, self._robot.upper)
+            fits.append((yield from self._refine(Fit(np.inf, constants, theta), moments, rounds)))
+        return min(fits, key=lambda fit: fit.cost)
+
+    def _guesses(self, moments: Moments, few: Moments) -> Generator[None, None, list[Array]]:
+        """Return constants with the offsets of the likeliest of many random first postures."""
+        mae = self._mae
+        tension = np.tile(moments.tension[0], (TRIED, 1))
+        # Before the lengths say anything, the weight excludes most postures.
+        drawn, unbalanced = list[Array](), list[Array]()
+        for _ in range(DRAWN // TRIED):
+            drawn.append(self._robot.random_postures(TRIED, self._rng))
+            torque = self._radian * self._torque(drawn[-1], tension)[0]
+            unbalanced.append(np.linalg.norm(torque, axis=1))
+            yield
+        first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:TRIED]]
+        offset = moments.length[0] - mae.lengths(first, tension)
+        largest = np.abs(offset * self.used).max(axis=1)
+        plausible = max(PURSUED, int((largest < FARTHEST).sum()))
+        offset = offset[np.argsort(largest)[:plausible]]
+        cost, postures = np.empty(len(offset)), list[Array]()
+        for n in range(0, len(offset), BATCH):
+            length = few.length - offset[n : n + BATCH, None]
+            tension = np.broadcast_to(few.tension, length.shape)
+            theta = mae.estimate(tension, length).theta
+            left = self.used * (length - mae.lengths(theta, tension))
+            parts = left / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
+            counted = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
+            cost[n : n + BATCH] = np.sum(counted, axis=0)
+            postures.extend(theta)
+            yield
+        order = np.argsort(cost)[:LISTED]
+        for n in order:
+            torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE[1]
+            cost[n] += np.log1p(torque**2).sum()
+            yield
+        best = order[np.argsort(cost[order])][:PURSUED]
+        others = self._prior_mean[self._robot.muscle_count :]
+        return [np.concatenate([offset[n], others]) for n in best]
+
+    # -- what is left ---------------------------------------------------------------------------
+
+    def _outside(self, theta: Array) -> Array:
+        return theta - np.clip(theta, self._robot.lower, self._robot.upper)
+
+    def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
+        """Return the torque that is not balanced [N·m] (K, D), and G (K, M, D)."""
+        jacobian = self._mae.muscle_jacobian(theta, tension)
+        by_muscles = np.einsum('kmd,km->kd', jacobian, tension)
+        return self._robot.kinematics.holding_torque(theta) + by_muscles, jacobian
+
+    def _residuals(
+        self, fit: Fit, moments: Moments, turning: Array, derivatives: bool = False
+    ) -> tuple[Array, ...]:
+        """Return what is left of lengths, torques and joint limits, over its noise (K, M + 2D).
+
+        Args:
+            fit: Constants and postures.
+            moments: The readings.
+            turning: Which way the joints turned last, (K, D).
+            derivatives: Whether to return the derivatives by θ (K, M + 2D, D) and by the constants
+                (K, M + 2D, 3M + D) as well.
+        """
+        theta, muscles, joints = fit.theta, self._robot.muscle_count, self._robot.joint_count
+        ends = [muscles, 2 * muscles, 3 * muscles]
+        offset, friction, tension_offset, joint_friction = np.split(fit.constants, ends)
+        passed = np.exp(-friction * moments.sliding)  # T_end / T
+        end, pull = moments.tension * passed, (moments.tension - tension_offset) * passed
+        length, outside = self._mae.lengths(theta, end), self._outside(theta)
+        unbalanced, jacobian = self._torque(theta, pull)
+        torque = unbalanced + joint_friction * turning
+        # A stop carries any torque. There, the balance costs as much as a usual residual.
+        at_stop = AT_STOP * self._radian
+        is_free = (self._robot.lower + at_stop < theta) & (theta < self._robot.upper - at_stop)
+        torque = np.where(is_free, torque, self._torque_noise)
+        left = [moments.length - offset - length, torque, outside]
+        value = np.concatenate(left, axis=1) / self._noise
+        if not derivatives:
+            return (value,)
+        turned = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
+        torque_slope = (np.stack(turned, axis=-1) - unbalanced[..., None]) / STEP
+        torque_slope = torque_slope * is_free[..., None]
+        outside_slope = (outside != 0.0)[..., None] * np.eye(joints)
+        by_theta = np.concatenate([-jacobian, torque_slope, outside_slope], axis=1)
+        by_constants = np.zeros((*value.shape, len(fit.constants)))
+        m, j = np.arange(muscles), np.arange(joints)
+        by_constants[:, m, m] = -1.0
+        with_more_friction = self._mae.lengths(theta, end * np.exp(-STEP * moments.sliding))
+        by_constants[:, m, muscles + m] = (length - with_more_friction) / STEP
+        moment_arm = -np.swapaxes(jacobian, 1, 2) * is_free[..., None]
+        by_friction = moment_arm * (pull * moments.sliding)[:, None]
+        by_constants[:, muscles:-joints, muscles + m] = by_friction
+        by_constants[:, muscles:-joints, 2 * muscles + m] = moment_arm * passed[:, None]
+        by_constants[:, muscles + j, 3 * muscles + j] = turning * is_free
+        return value, by_theta / self._noise[:, None], by_constants / self._noise[:, None]
+
+    def _cost(self, value: Array, constants: Array) -> float:
+        noisy, outside = np.split(value, [-self._robot.joint_count], axis=1)
+        student = (FREEDOM + 1.0) * np.log1p(noisy**2 / FREEDOM).sum()
+        prior = np.square((constants - self._prior_mean) / self._prior_spread).sum()
+        return float(student + np.square(outside).sum() + prior)
+
+    # -- Gauss–Newton ---------------------------------------------------------------------------
+
+    def _refine(self, fit: Fit, moments: Moments, rounds: int) -> Steps:
+        """Return the best fit near one, after so many Gauss–Newton steps at most."""
+        joint_eye, constant_eye = np.eye(self._robot.joint_count), np.eye(len(self._prior_mean))
+        damping = 1e-3
+        turning = _turning(fit.theta, STICKING * self._radian)
+        farthest = FARTHEST * self._radian
+        (value,) = self._residuals(fit, moments, turning)
+        fit = fit._replace(cost=self._cost(value, fit.constants))
+        for _ in range(rounds):
+            yield
+            value, by_theta, by_constants = self._residuals(fit, moments, turning, derivatives=True)
+            weight = (FREEDOM + 1.0) / (FREEDOM + value**2)
+            weight[:, -len(joint_eye) :] = 1.0
+            # Normal equations: of θ for each moment, of the constants, and between the two.
+            weighted = weight[..., None] * by_theta
+            theta_normal = np.swapaxes(by_theta, 1, 2) @ weighted
+            theta_gradient = np.einsum('krd,kr->kd', weighted, value)
+            cross = np.swapaxes(by_constants, 1, 2) @ weighted
+            normal = np.einsum('krp,kr,krq->pq', by_constants, weight, by_constants, optimize=True)
+            normal += np.diag(self._prior_spread**-2)
+            gradient = np.einsum('krp,kr->p', by_constants, weight * value)
+            gradient += (fit.constants - self._prior_mean) / self._prior_spread**2
+            before = fit.cost
+            while damping < LARGEST_DAMPING:
+                # Eliminate θ, solve for the constants, and substitute back.
+                damped = theta_normal * (1.0 + damping * joint_eye) + 1e-6 * joint_eye
+                inverse = np.linalg.inv(damped)
+                through = cross @ inverse
+                reduced = normal * (1.0 + damping * constant_eye)
+                reduced = reduced - np.einsum('kpd,kqd->pq', through, cross)
+                eliminated = np.einsum('kpd,kd->p', through, theta_gradient)
+                shift = -np.linalg.solve(reduced, gradient - eliminated)
+                turn = theta_gradient + np.einsum('kpd,p->kd', cross, shift)
+                turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -farthest, farthest)
+                tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
+                (value,) = self._residuals(tried, moments, turning)
+                cost = self._cost(value, tried.constants)
+                if cost < before:
+                    break
+                damping *= 5.0
+                yield
+            else:
+                break
+            fit, damping = tried._replace(cost=cost), max(0.2 * damping, 1e-6)
+            if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
+                break
+        return fit
+
+
+def _turning(theta: Array, sticking: Array) -> Array:
+    """Return which way each joint turned last, in [−1, 1], for K consecutive postures (K, D).
+
+    Its friction changes sign over `sticking` [rad] (D,).
+    """
+    result, reference = np.zeros_like(theta), theta[0].copy()
+    for k, posture in enumerate(theta):
+        reference = np.clip(reference, posture - sticking, posture + sticking)
+        result[k] = (posture - reference) / sticking
+    return result
+
+
+def _relative_error(mae: Mae) -> Array:
+    """Return how much worse than the median muscle the network restores each muscle, (M,).
+
+    The error of a network is the same in neighbouring postures. Therefore a muscle that ② restores
+    badly pulls the offsets of all others along, and its weight falls with the square of its error.
+    """
+    if mae.anomaly is None:
+        return np.ones(len(mae.muscles))
+    variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
+    return np.clip(variance / np.median(variance), *WORST)

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Know what the muscle modules are commanded, as long as the command is fresh."""
+
+import math
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
+
+COMMAND_AGE = 0.5  # [s] beyond which a command no longer says what the modules do
+
+
+class ModuleCommands:
+    """The newest command: either target lengths or target tensions."""
+
+    def __init__(self) -> None:
+        self._length: Array | None = None  # l_target [m], (M,)
+        self._tension: Array | None = None  # T_target [N], (M,)
+        self._time = -math.inf  # [s]
+
+    def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
+        """Note target lengths [m] or tensions [N], (M,)."""
+        self._length, self._tension, self._time = length, tension, now
+
+    def length(self, now: float) -> Array | None:
+        """Return l_target [m], (M,), or None."""
+        return self._length if now - self._time <= COMMAND_AGE else None
+
+    def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
+        """Return T that the modules have to pull with at l [m] (M,), [N] (M,), or None."""
+        if now - self._time > COMMAND_AGE:
+            return None
+        if self._length is None:
+            return self._tension
+        return robot.demanded(length, self._length)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the estimator reports of itself in /diagnostics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from musculoskeletal_ae.report import Report
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.estimation.estimator import Estimator
+    from musculoskeletal_ae.mae.mae import Mae
+
+SILENCE = 1.0  # [s] without a message, beyond which there is nothing to estimate from
+
+
+def report(core: Estimator, now: float) -> Report:
+    """Return level, message and values of a core; `now` is on a steady clock [s].
+
+    The values `finding` and `verification` are identifiers for programs, and `last outcome` is one
+    of `verification.Outcome`.
+    """
+    mae = core.state.mae
+    if mae is None:
+        return Report('warn', 'waiting for a checkpoint', {})
+    values = {
+        **_network(core, mae),
+        **_suspects(core),
+        **_residuals(core),
+        **_contact(core),
+        **_offsets(core),
+        **_familiarity(core),
+    }
+    if core.suspects.finding is not None:
+        verifying = '' if core.suspects.verification is None else '; verifying it'
+        return Report('error', f'anomaly detected: {core.suspects.cause}{verifying}', values)
+    if now - core.stepped_at > SILENCE:
+        return Report('warn', 'no muscle_states', values)
+    if core.calibration is not None:
+        progress = core.calibration.progress
+        return Report('warn', f'finding the length zeros: {progress}', values)
+    calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
+    if core.heat.changed:
+        drifting = (
+            f'{core.robot.muscles[muscle]}: its module {how}'
+            for muscle, how in core.heat.changed.items()
+        )
+        return Report('warn', f'anomaly of a cool muscle: {"; ".join(drifting)}', values)
+    if core.body.isolated:
+        without = core.robot.names(core.body.isolated)
+        return Report('warn', f'estimating{calibrated} without {without}', values)
+    return Report('ok', f'estimating{calibrated}', values)
+
+
+def _network(core: Estimator, mae: Mae) -> dict[str, str]:
+    values = {
+        'checkpoint version': str(mae.version),
+        'anomaly calibrated': str(core.health.residual.is_calibrated),
+    }
+    if mae.covariance is not None:
+        spread = np.sqrt(np.diag(mae.covariance))
+        values['joint uncertainty'] = core.robot.told(spread, 3)
+    return values
+
+
+def _suspects(core: Estimator) -> dict[str, str]:
+    suspects, values = core.suspects, dict[str, str]()
+    if core.body.isolated:
+        values['isolated muscles'] = core.robot.names(core.body.isolated)
+    values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
+    values['verification'] = 'none' if suspects.verification is None else 'running'
+    if suspects.last_verdict is not None:
+        values['last verified'] = suspects.last_verification
+        values['last outcome'] = suspects.last_verdict[1].outcome.value
+    return values
+
+
+def _residuals(core: Estimator) -> dict[str, str]:
+    residual, output = core.health.residual, core.output
+    if output is None or residual.reading is None:
+        return {}
+    suspect = next(iter(core.heat.changed), residual.reading.suspect)
+    if core.suspects.finding is not None:
+        suspect = core.suspects.finding.muscle
+    values = {
+        'A': f'{output.anomaly:.4f}',
+        'd': f'{residual.reading.distance:.1f}',
+        'suspect muscle': core.robot.muscles[suspect],
+    }
+    if residual.is_calibrated:
+        letter = 'd' if residual.uses_distance else 'A'
+        limit = residual.limit(output.state.theta, output.sample.motor_tension)
+        values[f'{letter} limit'] = f'{limit:.3g}'
+    return values
+
+
+def _contact(core: Estimator) -> dict[str, str]:
+    contact = None if core.output is None else core.output.contact
+    if contact is None:
+        return {}
+    count = str(core.contact.count)
+    if not core.contact.is_calibrated:
+        return {'contact': 'not calibrated', 'contacts': count}
+    force = f'{np.linalg.norm(contact.force()):.0f} N at the hand'
+    return {'contact': force if contact.is_contact else 'none', 'contacts': count}
+
+
+def _offsets(core: Estimator) -> dict[str, str]:
+    offsets = core.body.offsets
+    if not offsets.offset.any():
+        return {}
+    rows = zip(core.robot.muscles, 1e3 * offsets.offset, 1e3 * offsets.deviation)
+    each = (f'{name} {offset:.1f} ± {deviation:.1f} mm' for name, offset, deviation in rows)
+    return {'length zeros': ', '.join(each)}
+
+
+def _familiarity(core: Estimator) -> dict[str, str]:
+    residual, far = core.health.residual, 0.0
+    if residual.is_calibrated and core.output is not None:
+        far = residual.unfamiliarity(core.output.state.theta)
+    return {'posture': f'unfamiliar ({far:.1f})' if far > 1.0 else 'familiar'}

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a rupture to moving on: what happens with a muscle that a detector has found.
+
+The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
+
+ 1. Rupture. The muscle has no tension, and its readings do not agree with those of the others.
+ 2. Finding. A detector of `health.py` names the muscle, within half a second. The finding is
+    latched: the estimator publishes `anomaly_detected`, and the controller stops the arm.
+ 3. Isolation. The suspect is isolated at once: estimate and control go on without it.
+ 4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
+    decides by its response: ruptured, jammed, a broken sensor, or healthy.
+ 5. Moving on. A broken muscle stays isolated, a healthy one is restored. Either way the anomaly is
+    over, and the controller resumes after a verification (`control/stops.py`).
+
+With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
+`estimator/reset`. The same holds after ACQUITTALS suspects were healthy within WITHIN seconds:
+something is wrong that a verification does not show. Two kinds of findings differ:
+
+    length_jump      ignored with `on_anomaly: stop`: the new level of the length counts
+    values_missing   never latched; with `on_anomaly: isolate` the muscle is isolated without a
+                     verification, since a sensor without numbers is broken
+"""
+
+from collections.abc import Iterable
+
+from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
+from musculoskeletal_ae.estimation.verification import Outcome, Verdict, Verification
+from musculoskeletal_ae.robot.robot import Robot
+
+ACQUITTALS, WITHIN = 2, 60.0  # suspects that were healthy, [s]
+
+
+class SuspectHandling:
+    """Latches a finding, and decides which muscles are isolated for it.
+
+    Attributes:
+        settings: With `on_anomaly`.
+        finding: The latched finding, or None.
+        verification: Of the suspect, while it runs, or None.
+        last_verdict: The last suspect that was verified (its position in T and l), and the verdict.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.settings = Detection()
+        self.finding: Finding | None = None
+        self.verification: Verification | None = None
+        self.last_verdict: tuple[int, Verdict] | None = None
+        self._acquitted: list[float] = []  # when suspects were found healthy [s]
+
+    @property
+    def cause(self) -> str:
+        """The latched finding, for people, or ''."""
+        if self.finding is None:
+            return ''
+        return f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
+
+    @property
+    def last_verification(self) -> str:
+        """The last verdict, for people, or ''."""
+        if self.last_verdict is None:
+            return ''
+        muscle, verdict = self.last_verdict
+        return f'{self._robot.muscles[muscle]}: {verdict}'
+
+    def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
+        """Take a finding; return the muscles that are isolated from now on.
+
+        Args:
+            finding: Of a detector.
+            isolated: The muscles that are isolated so far.
+            now: On a steady clock [s].
+        """
+        isolated, muscle = tuple(isolated), finding.muscle
+        isolates = self.settings.on_anomaly == ISOLATE
+        if finding.kind is Kind.VALUES_MISSING:
+            if not isolates or muscle in isolated:
+                return isolated
+            self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
+            return (*isolated, muscle)
+        if self.finding is not None or (finding.kind is Kind.LENGTH_JUMP and not isolates):
+            return isolated
+        self.finding = finding
+        recent = [time for time in self._acquitted if now - time < WITHIN]
+        if not isolates or len(recent) >= ACQUITTALS:
+            return isolated
+        bias, stiffness = self._robot.description.tension.bias, self._robot.stiffness
+        self.verification = Verification(muscle, float(bias[muscle]), float(stiffness[muscle]))
+        return (*isolated, muscle)
+
+    def conclude(self, verdict: Verdict, isolated: Iterable[int], now: float) -> tuple[int, ...]:
+        """End the verification with a verdict; return the muscles that are isolated from now on."""
+        assert self.verification is not None
+        self.last_verdict = self.verification.muscle, verdict
+        if verdict.outcome is Outcome.HEALTHY:
+            self._acquitted.append(now)
+        else:
+            self.verification = None  # it stays isolated
+        return self.clear(isolated)
+
+    def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
+        """End the anomaly; return the muscles that are isolated from now on.
+
+        A suspect that is being verified is restored: whoever resets the anomaly declares it
+        healthy.
+        """
+        suspect = None if self.verification is None else self.verification.muscle
+        self.finding = self.verification = None
+        return tuple(muscle for muscle in isolated if muscle != suspect)
+
+    def on_isolated(self, isolated: Iterable[int]) -> None:
+        """Stop verifying a suspect that is no longer isolated; what was found stays latched."""
+        if self.verification is not None and self.verification.muscle not in isolated:
+            self.verification = None

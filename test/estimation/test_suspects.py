@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What follows from a finding, by its kind and the parameter `on_anomaly`."""
+
+import pytest
+
+from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
+from musculoskeletal_ae.estimation.verification import Outcome, Verdict
+
+DISTANCE = Finding(1, Kind.RESIDUAL_DISTANCE, 'd = 9')
+
+
+@pytest.fixture
+def suspects(robot):
+    handling = SuspectHandling(robot)
+    handling.settings = Detection(on_anomaly='isolate')
+    return handling
+
+
+@pytest.mark.parametrize(
+    ('kind', 'on_anomaly', 'latched', 'isolated', 'verified'),
+    [
+        (Kind.SLACK_TENDON, 'stop', True, (), False),
+        (Kind.SLACK_TENDON, 'isolate', True, (2,), True),
+        (Kind.LENGTH_JUMP, 'stop', False, (), False),
+        (Kind.LENGTH_JUMP, 'isolate', True, (2,), True),
+        (Kind.VALUES_MISSING, 'stop', False, (), False),
+        (Kind.VALUES_MISSING, 'isolate', False, (2,), False),
+    ],
+)
+def test_what_a_finding_leads_to(suspects, kind, on_anomaly, latched, isolated, verified):
+    suspects.settings = Detection(on_anomaly=on_anomaly)
+    assert suspects.take(Finding(2, kind, ''), (), 0.0) == isolated
+    assert (suspects.finding is not None) == latched
+    assert (suspects.verification is not None) == verified
+
+
+def test_the_first_finding_stays_latched(suspects, robot):
+    isolated = suspects.take(DISTANCE, (), 0.0)
+    assert suspects.take(Finding(3, Kind.JAMMED_MODULE, ''), isolated, 1.0) == isolated
+    assert suspects.finding is DISTANCE
+    assert suspects.cause == f'{robot.muscles[1]}: d = 9'
+
+
+@pytest.mark.parametrize('outcome', Outcome)
+def test_only_a_healthy_suspect_is_restored_and_either_way_the_anomaly_is_over(suspects, outcome):
+    isolated = suspects.take(DISTANCE, (4,), 0.0)
+    isolated = suspects.conclude(Verdict(outcome), isolated, 1.0)
+    assert (1 in isolated) == (outcome is not Outcome.HEALTHY)
+    assert 4 in isolated
+    assert suspects.finding is suspects.verification is None
+    assert suspects.last_verdict == (1, Verdict(outcome))
+
+
+@pytest.mark.parametrize(('later', 'isolates'), [(1.0, False), (WITHIN, True)])
+def test_after_several_healthy_suspects_the_arm_stays_stopped_for_a_while(
+    suspects, later, isolates
+):
+    for _ in range(ACQUITTALS):
+        isolated = suspects.take(DISTANCE, (), 0.0)
+        assert isolated == (1,)
+        suspects.conclude(Verdict(Outcome.HEALTHY), isolated, 0.0)
+    assert (suspects.take(DISTANCE, (), later) == (1,)) == isolates
+    assert suspects.finding is DISTANCE
