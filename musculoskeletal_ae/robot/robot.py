@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +86,15 @@ class Robot:
     def names(self, muscles: Iterable[int]) -> str:
         """Return the names of muscles, places in T and l, for people to read."""
         return ', '.join(self.muscles[m] for m in muscles)
+
+    def without(self, muscles: Iterable[int]) -> Robot:
+        """Return this robot with exactly these muscles isolated: the tensions they may have are 0.
+
+        The copy shares the geometry with the original, which stays as it is.
+        """
+        reduced = copy.copy(self)
+        reduced.isolate(muscles)
+        return reduced
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Use all muscles but these, which pull nothing: the tensions that they may have are 0.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,12 @@ class MuscleSample:
     usable: Bools
     newest: Array
     jumped: int | None = None
+
+    def shifted(self, offset: Array) -> MuscleSample:
+        """Return the same sample, with lengths that are less by `offset` [m], (M,)."""
+        newest = self.newest.copy()
+        newest[0] -= offset
+        return replace(self, length=self.length - offset, newest=newest)
 
 
 class LevelCheck:
