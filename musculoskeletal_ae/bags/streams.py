@@ -53,18 +53,19 @@ class Streams(NamedTuple):
     def pairs(self) -> Pairs:
         """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.pairing`)."""
         time = self.muscles.time
-        pairing = Pairing(float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
+        pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
         # A muscle message at the end of time gives out the last one.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
-        theta, muscle = [], []  # θ, and the row of (T, l), which stands for them here
-        for came, kind, number in heapq.merge(joints, muscles):
-            row = np.array(number)
+        theta, muscle = [], []  # θ, and the row of the muscle message
+        for came, kind, row in heapq.merge(joints, muscles):
             if kind == 0:
-                pairing.joints(came, self.joints.values[number])
-            elif (paired := pairing.muscles(came, row, row)) and paired.theta is not None:
+                pairing.joints(came, self.joints.values[row])
+                continue
+            paired = pairing.muscles(came, row if came < math.inf else None)
+            if paired is not None and paired.theta is not None:
                 theta.append(paired.theta)
-                muscle.append(int(paired.length))
+                muscle.append(paired.message)
         values, time = self.muscles.values[muscle], time[muscle]
         isolated = np.full(values[:, 0].shape, -1)
         if len(self.isolated.time):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The corrected body: the geometric model with other constants, plus a smooth rest; and its fit.
+"""The calibrated body: the geometric model with other constants, plus a smooth rest; and its fit.
 
     l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
 
@@ -109,7 +109,7 @@ class Poses(NamedTuple):
 
 
 class CorrectedBody:
-    """Lengths of the corrected body, and how they change with its `parameters`."""
+    """Lengths of the calibrated body, and how they change with its `parameters`."""
 
     def __init__(
         self,

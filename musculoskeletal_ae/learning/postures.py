@@ -5,7 +5,7 @@
          + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)²
          + Σ ((z − z̄)/s_z)²
 
-over the parameters w of the corrected body, the postures θ_n and the zeros z of the joint sensors,
+over the parameters w of the calibrated body, the postures θ_n and the zeros z of the joint sensors,
 by Gauss–Newton. z̄ and s_z are what the joints' stops tell (`stops`). y are joint angles that a
 sensor read (with its zero z), a camera saw or somebody stated, u directions of gravity in links
 that carry an IMU; any of them may be missing anywhere.

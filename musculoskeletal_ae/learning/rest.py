@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages to rests that may be learned from: plausible, still, and of a healthy arm.
+"""From messages to rests: when the arm is still.
 
 The arm rests while the means of the two halves of a short window differ by no more than the given
 rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
@@ -7,25 +7,17 @@ sensor's). The rest is averaged until it ends, or for `LONGEST` at a time. An ar
 sensors (`blind`) rests while its muscles do, and θ is averaged where there is any. A motion begins
 and ends too slowly to be told from rest, but not to bend what an accelerometer reads of gravity:
 that counts where the whole windows before and after it were still.
-
-What comes within `MARGIN` before an anomaly is noticed was already wrong; rests and healthy
-messages therefore wait that long before they count.
 """
 
 from bisect import bisect_right
-from collections import Counter, deque
+from collections import deque
 from operator import itemgetter
-from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.friction import FrictionDirection
-from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
-from musculoskeletal_ae.plausibility import Plausibility
-from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
 MOST = 20_000  # readings of one rest: an end where the clock stands still
@@ -89,8 +81,15 @@ class RestDetector:
         gravity, self._gravity = self._gravity, []
         if not rest:
             return None
-        mean = Sample(*(_mean(np.array(column)) for column in zip(*rest)))
-        return mean._replace(gravity=_mean(np.array(gravity)) if gravity else NOTHING)
+        theta, tension, length, direction = (_mean(np.array(part)) for part in [*zip(*rest)][:4])
+        # All messages of a rest were taken under one body state.
+        return rest[-1]._replace(
+            theta=theta,
+            tension=tension,
+            length=length,
+            direction=direction,
+            gravity=_mean(np.array(gravity)) if gravity else NOTHING,
+        )
 
     def _append(self, reading: Sample) -> None:
         held = min(len(self._window), MOST - 1)  # of which one goes when the window is full
@@ -155,114 +154,3 @@ def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
         if len(half) > 1
     )
     return bool((difference <= allowed + SURE * np.sqrt(error)).all())
-
-
-# -- what may be learned --------------------------------------------------------------------------
-
-MARGIN = 2.0  # [s] before a detection and after its reset
-#: [s] without messages, and longer than a rest has to be, in which a wire may have slid anywhere
-HOLE = 0.5
-#: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
-MOST_WAITING = 5000
-
-
-class Waiting(NamedTuple):
-    """A message, and the rest that it ended, that count once no anomaly has followed for MARGIN."""
-
-    time: float
-    dt: float
-    reading: Sample
-    rest: Sample | None
-
-
-class RestCollector:
-    """Steps through the messages and gives out the rests that may be learned from."""
-
-    def __init__(
-        self,
-        robot: Robot,
-        settings: Settings,
-        healthy: Reservoir,
-        blind: bool = False,
-        spread: Array = NOTHING,
-    ) -> None:
-        """Watch `robot`; messages of the healthy arm go to `healthy`.
-
-        A `blind` one rests without joint angles, too; those that there are spread by `spread`.
-        """
-        self._robot, self._healthy, self._spread = robot, healthy, spread
-        self.anomaly = False  # closes the gate
-        # Messages that no sensor measures, and rests that are not learned from, by reason.
-        self.rejected: Counter[str] = Counter()
-        self._detector = RestDetector(settings, blind, robot.kinematics.radian)
-        self._hole = max(HOLE, settings.rest_time)
-        self._plausibility = Plausibility(robot)
-        self.plausible = True  # whether muscles of this arm can say what came last
-        self._direction = FrictionDirection()
-        self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
-        self._time = self._skipped = 0.0
-        self._closed_until = 0.0
-
-    def step(
-        self,
-        tension: Array,
-        length: Array,
-        dt: float,
-        theta: Array | None = None,
-        gravity: Array = NOTHING,
-    ) -> list[Sample]:
-        """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
-
-        And what IMUs read of gravity, see `Sample`. Returns the rests that count from now on.
-        """
-        dt += self._skipped
-        if dt > self._hole:
-            self._direction.reset()
-            dt = self._hole
-        judge = self._plausibility
-        error = judge.levels(tension, length)
-        self.plausible = error is None
-        if error is None and theta is not None:
-            error = judge.outside(np.where(np.isnan(theta), self._robot.lower, theta))
-        if error:
-            self.rejected[error.reason] += 1
-            self._skipped = dt
-            return []
-        self._skipped = 0.0
-        self._time += dt
-        direction = self._direction.step(length)
-        nothing = np.full(self._robot.joint_count, np.nan)
-        theta = nothing if theta is None else theta
-        reading = Sample(theta, tension, length, direction, self._spread, gravity)
-        rest = self._detector.step(reading, dt)
-        if rest is not None and np.isnan(rest.gravity).all():
-            rest = rest._replace(gravity=NOTHING)
-        if self.anomaly or self._time < self._closed_until:
-            if rest is not None:
-                self.rejected['anomaly'] += 1
-            return []
-        self._waiting.append(Waiting(self._time, dt, reading, rest))
-        rests = []
-        while self._waiting and self._time - self._waiting[0].time >= MARGIN:
-            passed = self._waiting.popleft()
-            self._healthy.step(passed.reading, passed.dt)
-            if passed.rest is not None:
-                rests.append(passed.rest)
-        return rests
-
-    def set_anomaly(self, detected: bool) -> None:
-        """Close the gate on an anomaly, open it some time after the reset."""
-        if detected and not self.anomaly:
-            if lost := sum(waiting.rest is not None for waiting in self._waiting):
-                self.rejected['anomaly'] += lost
-            self._waiting.clear()
-        if self.anomaly and not detected:
-            self._closed_until = self._time + MARGIN
-        self.anomaly = detected
-
-    def reset(self) -> None:
-        """Forget what does not count yet, as after a backward jump of the clock."""
-        self._skipped = 0.0
-        self._detector.reset()
-        self._direction.reset()
-        self._waiting.clear()

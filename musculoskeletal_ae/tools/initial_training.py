@@ -144,7 +144,7 @@ def learn(
     """
     robot = copy.copy(learner.robot)  # of which the detector hears who is isolated
     robot.isolate(learner.isolated)
-    detector = AnomalyDetector(robot, preset=learner.training.preset.name)
+    detector = AnomalyDetector(robot, preset=learner.trainer.preset.name)
     direction = FrictionDirection()
     newest = None
     learner.reset()

@@ -9,7 +9,7 @@ import pytest
 from musculoskeletal_ae.learning.body import CorrectedBody, Prior
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.training import Job
+from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot
 

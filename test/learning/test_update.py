@@ -8,14 +8,13 @@ from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import (
-    UNSURE,
     BodyUpdater,
+    NetworkTrainer,
     PaperUpdater,
-    Trainer,
     learned_steps,
-    synthetic_samples,
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.network import from_mae
@@ -134,7 +133,7 @@ def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial
 def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body):
     data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
     with torch.device('meta'):  # computes nothing, so that a loss has no value in the end
-        trainer = Trainer(from_mae(initial))
+        trainer = NetworkTrainer(from_mae(initial))
         with pytest.raises(RuntimeError, match='item'):
             trainer.train(data, 1)
     assert trainer.steps == 1
@@ -178,7 +177,7 @@ def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26,
 
 def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
     with pytest.raises(MusculoskeletalError, match='default, paper'):
-        Training(arm26, 'best')
+        Trainer(arm26, 'best')
 
 
 def test_an_update_on_few_samples_keeps_most_of_a_learned_network(learned, arm26, initial):

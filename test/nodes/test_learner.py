@@ -16,9 +16,9 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.learning.rest import MARGIN
+from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.state import NEWEST
-from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
@@ -110,7 +110,7 @@ class HostedLearner:
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}'
             self.step()
-            if not self.node.core.training.ready:  # what trains may have the processor
+            if not self.node.core.trainer.ready:  # what trains may have the processor
                 time.sleep(DT)
 
 
@@ -125,8 +125,8 @@ def host(graph, arm26, trained_file, monkeypatch):
 
     def make(process=False, **parameters):
         if not process:
-            here = 'musculoskeletal_ae.nodes.learner.TrainingProcess'
-            monkeypatch.setattr(here, lambda *given, device: Training(*given))  # noqa: ARG005
+            here = 'musculoskeletal_ae.nodes.learner.TrainerProcess'
+            monkeypatch.setattr(here, lambda *given, device: Trainer(*given))  # noqa: ARG005
         given = {'checkpoint': trained_file, 'state_directory': '', **parameters}
         return HostedLearner(graph, arm26, **given)
 
@@ -164,7 +164,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     learner.learn(lambda: learner.updates >= 1, 'an update')
     detected.publish(Bool(data=True))
     learner.learn(lambda: 'anomaly' in learner.report().message, 'the gate')
-    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
     samples, updates = learner.samples, learner.updates
     learner.run(2.0 * MARGIN + 2.0)
     assert (learner.samples, learner.updates) == (samples, updates)
@@ -179,7 +179,7 @@ def test_learner_enable_stops_and_resumes_learning(host, graph):
     learner.learn(lambda: learner.updates >= 1, 'an update')
     assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
     assert 'enable' in learner.report().message
-    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
     samples, updates = learner.samples, learner.updates
     learner.run(2.0 * MARGIN + 2.0)
     assert (learner.samples, learner.updates) == (samples, updates)
