@@ -77,6 +77,15 @@ def noise_and_weight(
     return noise, weight
 
 
+def determined(curvature: Array, precision: Array) -> float:
+    """Return how many unknowns residuals determine, beside a prior.
+
+    That is tr((H + S)⁻¹ H), with the curvature H (P, P) of the cost of the residuals and the
+    diagonal S (P,) of the prior.
+    """
+    return float(np.trace(np.linalg.solve(curvature + np.diag(precision), curvature)))
+
+
 class Equations(NamedTuple):
     """The matrix of the normal equations."""
 
@@ -84,12 +93,22 @@ class Equations(NamedTuple):
     mixed: Array  # B, (N, D, P)
     common: Array  # C, (P, P)
 
+    @classmethod
+    def of_common(cls, common: Array) -> Equations:
+        """Return those of a fit without unknowns of single samples."""
+        return cls(np.zeros((0, 0, 0)), np.zeros((0, 0, len(common))), common)
+
 
 class RightSides(NamedTuple):
     """The right sides of the normal equations."""
 
     samples: Array  # a, (N, D)
     common: Array  # c, (P,)
+
+    @classmethod
+    def of_common(cls, common: Array) -> RightSides:
+        """Return those of a fit without unknowns of single samples."""
+        return cls(np.zeros((0, 0)), common)
 
 
 class Step(NamedTuple):
@@ -184,9 +203,7 @@ class Result(Generic[Point]):
     decrease: float = 0.0
 
 
-def minimise(
-    problem: Problem[Point], start: Point, rounds: int, enough: float
-) -> Result[Point]:
+def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) -> Result[Point]:
     """Fit from a point on.
 
     Args:

@@ -9,7 +9,8 @@ samples show that the network is of another arm.
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody, Fit, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.fit import Fit, fit_body, fit_to_network
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.synthetic import held_tensions
 from musculoskeletal_ae.mae.mae import Mae

@@ -31,7 +31,7 @@ from scipy.special import gammaincinv
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody, Fit
+from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.body_fit import (
     LEAST_CHANGE,
     OUTLIER,
@@ -39,6 +39,7 @@ from musculoskeletal_ae.learning.body_fit import (
     contradicted_muscles,
 )
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
+from musculoskeletal_ae.learning.fit import Fit
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.synthetic import UNSURE, TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Job, Update

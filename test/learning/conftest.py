@@ -6,8 +6,9 @@ import copy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.body import CorrectedBody, Prior
+from musculoskeletal_ae.learning.body import CorrectedBody
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.priors import PRIOR
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
@@ -30,7 +31,7 @@ def drawn_body(robot, features: int, seed: int, scale: float) -> CorrectedBody:
     body, rng = CorrectedBody(robot, seed=features), np.random.default_rng(seed)
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
-        body.parameters[m] = Prior().mean(layout) + scale * Prior().spread(layout) * draw
+        body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout) * draw
     return body
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.learning.body import CorrectedBody, Smooth, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body import CorrectedBody, Smooth
+from musculoskeletal_ae.learning.fit import fit_body, fit_to_network
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot

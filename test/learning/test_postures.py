@@ -10,8 +10,9 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
-from musculoskeletal_ae.learning.postures import Bent, _GroupFit
+from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.fit import fit_body
+from musculoskeletal_ae.learning.postures import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
 from musculoskeletal_ae.robot.robot import Robot
@@ -142,17 +143,15 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
     part = observed[np.arange(8)]
     body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
     joints, muscles = np.arange(2), np.arange(6)
-    mean = [np.zeros(layout.size) for layout in body.layouts]
-    spread = [np.ones(layout.size) for layout in body.layouts]
-    fit = _GroupFit(body, part, joints, muscles, mean, spread, 3e-4, Bent.unknown(8, 2))
-    zero, step = np.zeros(2), 1e-6
-    rows = fit.rows(part.theta, zero)
+    model = PostureModel(body, part, joints, muscles, Bent.unknown(8, 2))
+    unknowns, step = Unknowns(part.theta, np.zeros(2), body.parameters), 1e-6
+    rows = model.residuals(unknowns)
     column = 0
     for m, layout in enumerate(body.layouts):
         for k in (0, layout.friction, layout.size - 1):
             at = body.parameters[m][k]
             body.parameters[m][k] = at + step
-            moved = fit.rows(part.theta, zero)
+            moved = model.residuals(unknowns)
             body.parameters[m][k] = at
             # Residuals are what was seen less the body's.
             slope = -(moved.length[:, m] - rows.length[:, m]) / step
