@@ -27,7 +27,7 @@ from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-FEATURES = 60  # of the smooth rest that are drawn, per muscle
+FEATURES = 60  # of the residual model that are drawn, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges
 #: share of their variance that is left out with the directions that vary least, about half of them
 #: (less than 0.1 mm at the prior's spread), and the postures that it is taken over
@@ -50,7 +50,7 @@ class Layout:
         self.rest = slice(end + 6, self.size)  # v [m]
 
 
-class Smooth(NamedTuple):
+class ResidualModel(NamedTuple):
     """ψ of one muscle: K random Fourier features, in the F directions in which they vary.
 
     In single precision, in which cosines take a seventh of the time.
@@ -61,7 +61,9 @@ class Smooth(NamedTuple):
     basis: Singles  # (K, F)
 
     @classmethod
-    def drawn(cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator) -> Smooth:
+    def drawn(
+        cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator
+    ) -> ResidualModel:
         """Draw those of a muscle which crosses some joints (D,); they vary over θ (N, D)."""
         count = FEATURES if crossed.any() else 0
         frequency = rng.normal(0.0, 1.0, (count, robot.joint_count))
@@ -98,7 +100,7 @@ class Poses(NamedTuple):
     detour: Array  # of the nominal body [m], (N, M)
 
 
-class CorrectedBody:
+class CalibratedBody:
     """Lengths of the calibrated body, and how they change with its `parameters`."""
 
     def __init__(
@@ -106,14 +108,14 @@ class CorrectedBody:
         robot: Robot,
         parameters: list[Array] | None = None,
         seed: int = 0,
-        smooth: list[Smooth] | None = None,
+        smooth: list[ResidualModel] | None = None,
     ) -> None:
         """Correct `robot` by one vector per muscle (zero); `seed` draws `smooth` if not given."""
         self.robot, routes = robot, robot.routes
         if smooth is None:
             rng = np.random.default_rng([seed, 0xF0])
             theta = robot.random_postures(POSTURES, np.random.default_rng([seed, 0xF1]))
-            smooth = [Smooth.drawn(robot, crossed, theta, rng) for crossed in routes.crossed]
+            smooth = [ResidualModel.drawn(robot, crossed, theta, rng) for crossed in routes.crossed]
         self.smooth, self.layouts = smooth, list[Layout]()
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
@@ -125,14 +127,14 @@ class CorrectedBody:
         self.zero = np.zeros(robot.joint_count)
         self.found: dict[bytes, tuple[Array, ...]] = {}
 
-    def limb(self, joints: Ints, muscles: Ints) -> CorrectedBody:
+    def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
         """Return the body of one group, with the parameters of its muscles."""
         of_group = [self.smooth[m] for m in muscles]
         smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
-        return CorrectedBody(self.robot.limb(joints, muscles), parameters, smooth=smooth)
+        return CalibratedBody(self.robot.limb(joints, muscles), parameters, smooth=smooth)
 
-    def with_parameters(self, parameters: list[Array]) -> CorrectedBody:
+    def with_parameters(self, parameters: list[Array]) -> CalibratedBody:
         """Return the body with other parameters, one vector per muscle."""
         body = copy(self)
         body.parameters = parameters

@@ -9,7 +9,7 @@ samples show that the network is of another arm.
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.fit import Fit, fit_body, fit_to_network
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.synthetic import held_tensions
@@ -32,7 +32,7 @@ class BodyFit:
 
     def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
         """Begin with the body that a network has learned, if one is given; `seed` draws it."""
-        self.body = CorrectedBody(robot, seed=seed)
+        self.body = CalibratedBody(robot, seed=seed)
         #: what the network knew of the body, in the place of the geometric model
         self._prior_mean: list[Array] | None = None
         if mae is not None:
@@ -52,14 +52,14 @@ class BodyFit:
         if self._prior_mean is None or self._is_prior_confirmed or len(seen) < IN_A_ROW:
             return False
         self._is_prior_confirmed = True
-        body = CorrectedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
+        body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
         (length,) = body.lengths(seen.theta, seen.tension, seen.direction)
         return bool(np.median(np.abs(seen.length - length)[seen.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
         """Begin with the geometric model: a wrong prior is worse than none."""
         self._prior_mean = None
-        self.body = CorrectedBody(self.body.robot, smooth=self.body.smooth)
+        self.body = CalibratedBody(self.body.robot, smooth=self.body.smooth)
 
     def fit(self, seen: Observations, guess: Array) -> Fit:
         """Fit the body to samples; θ that was not read is looked for from `guess` [rad] (N, D)."""

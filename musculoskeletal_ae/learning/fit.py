@@ -25,7 +25,7 @@ from musculoskeletal_ae.gauss_newton import (
     minimise,
     noise_and_weight,
 )
-from musculoskeletal_ae.learning.body import CorrectedBody, Poses
+from musculoskeletal_ae.learning.body import CalibratedBody, Poses
 from musculoskeletal_ae.learning.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.learning.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.learning.samples import Observations
@@ -49,7 +49,7 @@ class Fit(NamedTuple):
 
 
 def fit_body(
-    body: CorrectedBody,
+    body: CalibratedBody,
     seen: Observations,
     prior_mean: list[Array] | None = None,
     guess: Array | None = None,
@@ -81,7 +81,7 @@ def fit_body(
     return Fit(*fit_jointly(body, seen, start, means, spreads, LEAST_NOISE))
 
 
-def _prior(body: CorrectedBody, seen: Observations, m: int) -> MusclePrior:
+def _prior(body: CalibratedBody, seen: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle round the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
@@ -90,7 +90,7 @@ def _prior(body: CorrectedBody, seen: Observations, m: int) -> MusclePrior:
     return MusclePrior(PRIOR.mean(layout), spread)
 
 
-def _reopened(body: CorrectedBody, there: Observations, prior: MusclePrior, m: int) -> MusclePrior:
+def _reopened(body: CalibratedBody, there: Observations, prior: MusclePrior, m: int) -> MusclePrior:
     """Return the prior of a muscle round what it was before it was changed, if it was."""
     before = ~there.known[:, m] & (there.tension[:, m] > 0.0)  # 0 N: it was isolated then
     if before.sum() < LEAST_ANCHOR:
@@ -113,7 +113,7 @@ class MuscleFit:
 
     def __init__(
         self,
-        body: CorrectedBody,
+        body: CalibratedBody,
         poses: Poses,
         seen: Observations,
         used: Bools,
@@ -180,7 +180,7 @@ NETWORK_STATES = 400  # that a network is asked for
 NETWORK_ERROR = 0.001  # [m] by which its lengths may err
 
 
-def fit_to_network(body: CorrectedBody, mae: Mae, seed: int = 0) -> None:
+def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     """Fit a body in place to the lengths that a network restores which has learned a real arm.
 
     A checkpoint carries what was learned of an arm, but not the samples (`train --from-bag`,

@@ -47,7 +47,7 @@ from musculoskeletal_ae.learning.stops import STOP, ZERO, sensor_zeros
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 if TYPE_CHECKING:
-    from musculoskeletal_ae.learning.body import CorrectedBody
+    from musculoskeletal_ae.learning.body import CalibratedBody
 
 DIFFERENCE = 1e-6  # [rad] or [m]
 # For prismatic joints, [rad] below are times RACK [m].
@@ -118,7 +118,7 @@ class PostureModel:
     """What the calibrated body says that N samples of one group should have measured."""
 
     def __init__(
-        self, body: CorrectedBody, seen: Observations, joints: Ints, muscles: Ints, bent: Bent
+        self, body: CalibratedBody, seen: Observations, joints: Ints, muscles: Ints, bent: Bent
     ) -> None:
         """Take the whole body, all samples, and the joints and muscles of the group.
 
@@ -504,7 +504,7 @@ class GroupFit:
 
 
 def fit_jointly(
-    body: CorrectedBody,
+    body: CalibratedBody,
     seen: Observations,
     start: Array,
     mean: list[Array],

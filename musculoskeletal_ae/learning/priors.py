@@ -20,7 +20,7 @@ class Prior:
     friction_mean: float = 0.05
     offset: float = 0.001  # zero of the length sensor [m]
     creep: float = 1e-5  # of a wire, from one sample to the next [m]
-    smooth: float = 0.002  # the smooth rest [m]
+    smooth: float = 0.002  # the residual model [m]
 
     def spread(self, layout: Layout) -> Array:
         """Return s of every parameter of a muscle."""

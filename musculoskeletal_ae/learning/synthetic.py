@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.mae.training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
@@ -28,7 +28,7 @@ UNSURE = 0.25  # share of the friction that the direction of sliding, as lengths
 
 
 def synthetic_samples(
-    body: CorrectedBody,
+    body: CalibratedBody,
     noise: Array,
     count: int,
     rng: np.random.Generator,

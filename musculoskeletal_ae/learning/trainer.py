@@ -36,7 +36,7 @@ from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from musculoskeletal_ae.learning.body import CorrectedBody
+    from musculoskeletal_ae.learning.body import CalibratedBody
     from musculoskeletal_ae.learning.update import Updater
 
 
@@ -87,7 +87,7 @@ class Trainer:
         return self._updater is not None and self._update is None
 
     @property
-    def body(self) -> CorrectedBody | None:
+    def body(self) -> CalibratedBody | None:
         """The calibrated body as it was fitted last; None where none is, or it is elsewhere."""
         return None if self._updater is None else self._updater.body
 

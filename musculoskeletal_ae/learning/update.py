@@ -31,7 +31,7 @@ from scipy.special import gammaincinv
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.body_fit import (
     LEAST_CHANGE,
     OUTLIER,
@@ -65,7 +65,7 @@ class Updater(ABC):
         self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
 
     @property
-    def body(self) -> CorrectedBody | None:
+    def body(self) -> CalibratedBody | None:
         """The body as it was fitted last; None where none is."""
         return None
 
@@ -201,7 +201,7 @@ class BodyUpdater(Updater):
         self._statistics_held = True
 
     @property
-    def body(self) -> CorrectedBody:
+    def body(self) -> CalibratedBody:
         """The body as it was fitted last."""
         return self.body_fit.body
 
@@ -273,7 +273,7 @@ INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says h
 
 def estimate_covariance(
     mae: Mae,
-    body: CorrectedBody,
+    body: CalibratedBody,
     fit: Fit,
     tension: Array,
     seed: int,
@@ -301,7 +301,7 @@ def estimate_covariance(
 
 def _drawn_errors(
     mae: Mae,
-    body: CorrectedBody,
+    body: CalibratedBody,
     fit: Fit,
     theta: Array,
     tension: Array,

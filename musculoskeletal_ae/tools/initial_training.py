@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `train` does: initial training from a robot description, or learning from recordings."""
 
-import copy
 import sys
 import time
 from argparse import Namespace
@@ -13,12 +12,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from musculoskeletal_ae.arrays import Ints
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.anomaly import AnomalyDetector
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
+from musculoskeletal_ae.friction import directions, end_tension
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -37,6 +36,7 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 UNSEEN = 5000  # states
 ENTERED = {
@@ -142,32 +142,54 @@ def learn(
 
     `progress` is told the recorded seconds that have passed since it was last told.
     """
-    robot = copy.copy(learner.robot)  # of which the detector hears who is isolated
-    robot.isolate(learner.isolated)
-    detector = AnomalyDetector(robot, preset=learner.trainer.preset.name)
-    direction = FrictionDirection()
+    stream = MuscleStream(learner.robot, learner.body)
+    detector = _detector(learner)
     newest = None
     learner.reset()
     learner.anomaly(False)
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for dt, at, theta, length, tension, said in zip(steps, *recording, strict=True):
-        if (isolated := _isolated(said, robot.isolated)) != robot.isolated:
-            robot.isolate(isolated)
+        if (isolated := _isolated(said, learner.isolated)) != learner.isolated:
             learner.isolate(isolated)
-            detector.reset()
-            newest = None
+            stream.use_body(learner.body)
+            detector, newest = _detector(learner), None
         if learner.mae is not newest:
             newest = learner.mae
             mae = newest.without(isolated)
+            stream.use_friction(mae.friction)
             detector.use(mae)
-        # The estimator gates live learning; here its detector does the same.
-        end = direction.end_tension(mae.friction, tension, length)
-        verdict = detector.step(mae.estimate(end, length), end, tension, length, dt)
-        if verdict.cause:
+        states = np.array([length, tension, np.full(len(length), np.nan)])
+        learner.joints(at, theta)
+        # The estimator stops live learning at an anomaly; here its detector does the same.
+        if _is_anomaly(detector, mae, stream, states, at, dt):
             learner.anomaly(True)
-        learner.step(at, theta, tension, length)
+        learner.muscles(states, at)
+        learner.poll(at)
         if progress is not None:
             progress(dt)
+
+
+def _detector(learner: Learner) -> AnomalyDetector:
+    robot = learner.robot.without(learner.isolated)
+    return AnomalyDetector(robot, preset=learner.trainer.preset.name)
+
+
+def _is_anomaly(
+    detector: AnomalyDetector,
+    mae: Mae,
+    stream: MuscleStream,
+    states: Array,
+    time: float,
+    dt: float,
+) -> bool:
+    """Whether the detector finds an anomaly in a message; not in one that is not plausible."""
+    try:
+        sample = stream.take_states(states, time)
+    except RejectionError:
+        return False
+    tension, length = sample.bone_tension, sample.length
+    state = mae.estimate(tension, length)
+    return bool(detector.step(state, tension, sample.motor_tension, length, dt).cause)
 
 
 def error(mae: Mae, recording: Pairs) -> float:

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import (
@@ -35,7 +35,7 @@ def test_twenty_samples_halve_the_error(learned, initial):
 
 
 def test_constant_length_differences_are_learned_in_one_step(arm26, initial):
-    longer = CorrectedBody(arm26)
+    longer = CalibratedBody(arm26)
     for parameters, layout in zip(longer.parameters, longer.layouts, strict=True):
         parameters[layout.offset] = 0.008
     stage = Stage(longer)
@@ -57,7 +57,7 @@ def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
 
 
 class Giving(Stage):
-    """An arm whose points give way, which no corrected body can describe."""
+    """An arm whose points give way, which no calibrated body can describe."""
 
     def sample(self):
         sample = super().sample()
