@@ -23,8 +23,8 @@ for each sample, so that θ is eliminated and what remains has the size of w (Sc
 A is (N, D, D), B is (N, D, P), C is (P, P) and contains the prior. The inverse of the Schur
 complement is the covariance of w at the solution.
 
-Damping. A + λ diag(e_θ), C + λ diag(e_w), where e are the usual sizes of a step, as 1/size². Of the
-λ in `DAMPING`, the smallest that lowers the cost is taken, beginning one below that of the last
+Damping. A + λ diag(e_θ), C + λ diag(e_w), where e is one over the square of a usual step. Of the λ
+in `DAMPING`, the smallest that lowers the cost is taken, beginning one below that of the last
 round.
 
 Stopping. The fit ends when a step lowers the cost, or is expected to lower it, by less than
@@ -132,18 +132,18 @@ class Eliminated:
         """Factorise.
 
         Args:
-            equations: The matrix.
-            sample_damping: Added to the diagonals of A, (D,).
+            equations: The matrix; A and the Schur complement have to be positive definite.
+            sample_damping: Added to the diagonals of A, (D,) or (N, D).
             common_damping: Added to the diagonal of C, (P,).
         """
         samples, mixed, common = equations
-        places = samples.shape[-1]
-        damped = samples + np.diag(np.broadcast_to(sample_damping, places))
+        eye = np.eye(samples.shape[-1])
+        damped = samples + np.asarray(sample_damping)[..., None] * eye
         # A⁻¹ = Lᵀ L with L the inverse of the Cholesky factor: products with it are cheaper.
         self._inverse = np.linalg.inv(np.linalg.cholesky(damped))
         self._reduced = self._inverse @ mixed  # L B
         tall = self._reduced.reshape(-1, len(common))
-        diagonal = np.broadcast_to(SMALL + common_damping, len(common))
+        diagonal = np.broadcast_to(common_damping, len(common))
         self.root: Array = cholesky(common + np.diag(diagonal) - tall.T @ tall)
 
     def solve(self, right: RightSides) -> Step:
@@ -238,7 +238,7 @@ def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Resu
     of_samples, of_common = problem.usual
     for level in range(max(0, fit.level - 1), len(DAMPING)):
         damping = DAMPING[level]
-        eliminated = Eliminated(equations, damping * of_samples, damping * of_common)
+        eliminated = Eliminated(equations, damping * of_samples, SMALL + damping * of_common)
         step = eliminated.solve(right)
         if step.decrease < enough:
             break

@@ -31,8 +31,8 @@ from musculoskeletal_ae.learning.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
-ROUNDS = 12  # of Gauss–Newton for one muscle
-ENOUGH = 1e-6  # decrease of the cost, in variances for each length, that ends them
+ROUNDS = 30  # of Gauss–Newton for one muscle
+ENOUGH = 1e-11  # decrease of the cost, in variances for each length, that ends them
 LEAST_NOISE = 0.0003  # [m] of a length at rest, beyond what all the rest explains
 #: samples from before a muscle changed that are enough to start from what they said
 LEAST_ANCHOR = 8

@@ -379,7 +379,7 @@ class GroupFit:
             # What the body does not know is common to all samples: see ALIKE.
             self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
             prior.repeated = prior.repeated * prior.unread
-            eliminated = Eliminated(self.equations(fit.point), 0.0, 0.0)
+            eliminated = Eliminated(self.equations(fit.point), 0.0, SMALL)
         self._widen(fit.point.residuals, eliminated.root)
         return fit.point.unknowns, eliminated.root
 
