@@ -23,16 +23,14 @@ are fitted one after another. For each of them
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.friction import end_tension
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.gauss_newton import (
+    SMALL,
     Eliminated,
     Equations,
     RightSides,
@@ -42,20 +40,15 @@ from musculoskeletal_ae.gauss_newton import (
     noise_and_weight,
     student,
 )
+from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Residuals, Unknowns
+from musculoskeletal_ae.learning.priors import GroupPrior
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.stops import STOP, ZERO, sensor_zeros
-from musculoskeletal_ae.robot.stiffness import muscle_hessian
+from musculoskeletal_ae.learning.stops import Stops
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
 
-DIFFERENCE = 1e-6  # [rad] or [m]
 # For prismatic joints, [rad] below are times RACK [m].
-#: What the body does not know is common to all samples. Therefore they count as no more than these
-#: in what they say of an offset; and torque and stops of joints that no sensor reads, in how much
-#: all that leaves open.
-ALIKE = 10.0
-SENSOR = 0.002  # σ_y of a joint sensor [rad]
 GRAVITY = 0.02  # σ_u: an accelerometer's error and how it is mounted [rad]
 #: σ of a length at first, and at least in what it says of postures: what no body explains [m]
 FIRST_NOISE, LEAST_NOISE = 0.002, 0.0008
@@ -63,266 +56,12 @@ FIRST_NOISE, LEAST_NOISE = 0.002, 0.0008
 #: friction and the offsets of the tension sensors are common to all samples.
 TORQUE = 0.3
 LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
-#: from a limit, where a joint that muscles push there is taken to be at its stop [rad], and how
-#: many such spreads that takes
-NEAR_STOP, PUSHED = 0.05, 3.0
 ROUNDS = 12
 #: decrease, in variances for each length, that ends the rounds: the step was then far shorter than
 #: what the samples leave open, and the noise has settled (with ten times as much, a joint sensor
 #: that slipped is taken for a changed muscle more often)
 ENOUGH = 3e-4
 EXPECTED = 0.3  # usual step of a posture [rad]
-BENT = 0.05  # turn of a joint over which Σ T ∂²l/∂θ² of the geometric model is as it was [rad]
-SMALL = 1e-6
-
-
-# -- the model ------------------------------------------------------------------------------------
-
-
-class Unknowns(NamedTuple):
-    """A value of all that is to be found for one group of D joints and M muscles."""
-
-    theta: Array  # θ of all joints of the body [rad], (N, all joints)
-    zero: Array  # z [rad], (D,)
-    parameters: list[Array]  # w of each muscle
-
-
-class Residuals(NamedTuple):
-    """Residuals and derivatives at one point."""
-
-    length: Array  # (N, M)
-    muscle_jacobian: Array  # G, (N, M, D)
-    by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
-    torque: Array  # (N, D)
-    torque_by_body: Array  # ∂τ/∂w, (N, D, W)
-    load: Array  # what muscles exert at each joint, in either direction [N·m], (D,)
-    angle: Array  # (N, D); 0 where nothing is known
-    gravity: Array  # (N, 3J)
-    gravity_by_posture: Array  # (N, 3J, D)
-
-
-class Bent(NamedTuple):
-    """Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
-
-    theta: Array  # where it was taken last [rad], (N, D)
-    stiffness: Array  # [N·m/rad], (N, D, D)
-
-    @classmethod
-    def unknown(cls, count: int, joint_count: int) -> Bent:
-        """Return that of postures it has never been taken of."""
-        nowhere = np.full((count, joint_count), np.nan)
-        return cls(nowhere, np.zeros((count, joint_count, joint_count)))
-
-
-class PostureModel:
-    """What the calibrated body says that N samples of one group should have measured."""
-
-    def __init__(
-        self, body: CalibratedBody, seen: Observations, joints: Ints, muscles: Ints, bent: Bent
-    ) -> None:
-        """Take the whole body, all samples, and the joints and muscles of the group.
-
-        `bent` is that of the whole body; it is brought up to date in place.
-        """
-        self.body, self.seen = body.limb(joints, muscles), seen.limb(joints, muscles)
-        self.joints = joints
-        self._kinematics = body.robot.kinematics  # of the whole body
-        ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
-        #: where the parameters of each muscle are in w
-        self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
-        self._crossed = self.body.robot.routes.crossed
-        of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
-        #: the parameters of the muscles that cross each joint
-        self.acting = [np.flatnonzero(own) for own in of_muscle]
-        self.is_read = np.isfinite(self.seen.theta)
-        self.by_sensor = self.is_read & (self.seen.spread == 0.0)  # of a joint sensor
-        self.is_tilt_known = np.isfinite(self.seen.gravity)
-        self._tilt = np.where(self.is_tilt_known, self.seen.gravity, 0.0)
-        self._bent = bent
-
-    @property
-    def parameter_count(self) -> int:
-        """The size of w."""
-        return self.columns[-1].stop
-
-    def residuals(self, at: Unknowns) -> Residuals:
-        """Return residuals and derivatives at a point."""
-        body, seen, columns = self.body.with_parameters(at.parameters), self.seen, self.columns
-        own = at.theta[:, self.joints]
-        count, places = own.shape
-        # The postures, then all of them with each joint turned a little.
-        flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
-        poses = body.poses(flat.reshape(-1, places))
-        length, end = np.empty_like(seen.length), np.empty_like(seen.length)
-        slope = np.zeros((*length.shape, places))
-        by_body = []
-        torque_by_body = np.zeros((count, places, self.parameter_count))
-        for m in range(length.shape[1]):
-            pull, way = seen.tension[:, m], seen.direction[:, m]
-            turns = np.flatnonzero(self._crossed[m])  # the other joints do not move it
-            parts = np.append(0, 1 + turns)
-            rows = (count * parts[:, None] + np.arange(count)).ravel()
-            placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))
-            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, seen.age))
-            still = body.smooth[m].at(own)
-            turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
-            smooth = np.concatenate([still, *turned])
-            l_m, j_m = body.linearised(placed, smooth, pulls, ways, m, age)
-            l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
-            length[:, m] = seen.length[:, m] - l_m[0]
-            by_body.append(j_m[0])
-            slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
-            end[:, m] = end_tension(body.friction(m), pull, way)
-            block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
-            block[:, :, body.layouts[m].friction] -= way * end[:, m] * slope[:, m, turns].T
-            torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
-        muscular = end[:, :, None] * slope
-        weight = self._kinematics.holding_torque(at.theta)[:, self.joints]
-        down = self._down(at.theta)
-        return Residuals(
-            length,
-            slope,
-            by_body,
-            -weight - muscular.sum(axis=1),
-            torque_by_body,
-            np.median(np.abs(muscular).sum(axis=1), axis=0),
-            np.where(self.is_read, seen.theta - own - self.by_sensor * at.zero, 0.0),
-            self.is_tilt_known * (self._tilt - down[0]),
-            np.moveaxis(down[1:] - down[0], 0, -1) / DIFFERENCE,
-        )
-
-    def _down(self, theta: Array) -> Array:
-        """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
-
-        At θ, then with each joint of the group turned by `DIFFERENCE`; 0 columns without an IMU.
-        """
-        if not self._tilt.size:
-            return np.zeros((1 + len(self.joints), len(theta), 0))
-        gravity = self._kinematics.model.gravity.linear
-        turned = theta + DIFFERENCE * np.eye(theta.shape[1])[self.joints, None]
-        flat = np.concatenate([theta[None], turned]).reshape(-1, theta.shape[1])
-        rotation = self._kinematics.joint_poses(flat).rotation
-        down = np.einsum('njba,b->nja', rotation, gravity / max(np.linalg.norm(gravity), SMALL))
-        return down.reshape(-1, *self._tilt.shape)
-
-    def stiffness(self, theta: Array) -> Array:
-        """Return ∂τ/∂θ [N·m/rad] (N, D, D), where the muscles' part is the geometric model's."""
-        within = self.joints[:, None], self.joints
-        gravity = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
-        stiffness: Array = gravity[:, within[0], within[1]]
-        return stiffness + self._muscle_stiffness(theta[:, self.joints])
-
-    def _muscle_stiffness(self, own: Array) -> Array:
-        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
-        joints, radian = self.joints, self.body.robot.kinematics.radian
-        at = self._bent.theta[:, joints]
-        moved = np.flatnonzero(~(np.abs(own - at) < BENT * radian).all(axis=1))
-        hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
-        self._bent.theta[np.ix_(moved, joints)] = own[moved]
-        self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(
-            'nm,nmij->nij', self.seen.tension[moved], hessian
-        )
-        return self._bent.stiffness[:, joints[:, None], joints]
-
-
-# -- what is known beforehand ---------------------------------------------------------------------
-
-
-@dataclass
-class GroupPrior:
-    """What is known before the samples, and how far each sensor is to be trusted.
-
-    Attributes:
-        mean: w̄, (W,).
-        precision: 1/s², (W,).
-        zero: z̄ [rad], (D,).
-        zero_precision: 1/s_z², (D,).
-        angle_precision: 1/σ_y², 0 where nothing was read, (N, D).
-        repeated: How many readings of a joint sensor count as one, (D,).
-        unread: How many samples count as one for a joint that no sensor reads, (D,).
-    """
-
-    mean: Array
-    precision: Array
-    zero: Array
-    zero_precision: Array
-    angle_precision: Array
-    repeated: Array
-    unread: Array
-
-    @classmethod
-    def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
-        """Return that of a group; `mean` and `spread` are those of its muscles."""
-        seen, robot, by_sensor = model.seen, model.body.robot, model.by_sensor
-        radian = robot.kinematics.radian
-        angle_spread = np.where(by_sensor, SENSOR * radian, seen.spread)
-        repeated = np.maximum(1.0, by_sensor.sum(axis=0) / ALIKE)
-        readings = np.where(by_sensor, seen.theta, np.nan)
-        zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper, radian)
-        return cls(
-            mean=np.concatenate(mean),
-            precision=np.concatenate([1.0 / each**2 for each in spread]),
-            zero=zero,
-            zero_precision=repeated / zero_spread**2,
-            angle_precision=np.where(
-                model.is_read, 1.0 / np.maximum(angle_spread, SMALL) ** 2, 0.0
-            ),
-            repeated=repeated,
-            unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / ALIKE),
-        )
-
-    def deviation(self, parameters: list[Array]) -> Array:
-        """Return w̄ − w, (W,)."""
-        return self.mean - np.concatenate(parameters)
-
-
-class Stops:
-    """Which joints of a group lean on their stops, and what draws joints back that passed one."""
-
-    def __init__(self, model: PostureModel) -> None:
-        """Start with no joint at a stop."""
-        robot, seen = model.body.robot, model.seen
-        self._lower, self._upper = robot.lower, robot.upper
-        self._radian = robot.kinematics.radian
-        self._by_sensor = model.by_sensor
-        self._near = self._radian * np.where(model.by_sensor, 2.0 * ZERO, NEAR_STOP)
-        # The torque of a muscle that was changed since is not that of the one there is.
-        changed = ~seen.known & (seen.tension > 0.0)  # 0 N: isolated
-        #: whose balance of torques says something, (N, D)
-        self.is_balanced = ~(changed @ robot.routes.crossed)
-        self._at = np.full(model.by_sensor.shape, np.nan)  # the stops that joints lean on [rad]
-
-    def lean(self, own: Array, score: Array) -> Bools:
-        """Find the joints at their stops; return those whose balance says something, (N, D).
-
-        Args:
-            own: θ [rad], (N, D).
-            score: The torque that is left at each joint, in units of what is usually left, (N, D).
-                It pushes the joint; at a stop it is the stop's own.
-        """
-        # A joint that a sensor reads leans on its stop until it would have to be held there.
-        # Another joint would be held by a stop that it was taken to once, and all others would be
-        # bent after it.
-        enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, PUSHED)
-        above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
-        below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)
-        self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
-        return self.is_balanced & ~(above | below)
-
-    def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
-        """Return how far joints are from the stops they lean on or passed [rad], and weights."""
-        goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
-        is_pulled = ~np.isnan(self._at) | (goal != own)
-        return goal - own, is_pulled / (STOP * self._radian) ** 2 / repeated
-
-    @property
-    def least_weight(self) -> Array:
-        """A weight of every angle that keeps the equations regular, (D,)."""
-        weight: Array = SMALL / (STOP * self._radian) ** 2
-        return weight
-
-
-# -- the fit --------------------------------------------------------------------------------------
 
 
 class Weights(NamedTuple):

@@ -17,7 +17,6 @@ needs many, and gets them from the body. Preset `paper` trains on the samples al
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 import time
@@ -26,9 +25,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
-from scipy.special import gammaincinv
-from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CalibratedBody
@@ -39,16 +35,17 @@ from musculoskeletal_ae.learning.body_fit import (
     contradicted_muscles,
 )
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
+from musculoskeletal_ae.learning.covariance import MANY, estimate_covariance, observed_theta
 from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.synthetic import UNSURE, TrainingData, synthetic_samples
+from musculoskeletal_ae.learning.synthetic import TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.residuals import TouchStatistics
-from musculoskeletal_ae.mae.training import TINY, loss, one_thread
-from musculoskeletal_ae.mae.units import LENGTH_SCALE
+from musculoskeletal_ae.mae.training import loss, one_thread
 from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -73,7 +70,7 @@ class Updater(ABC):
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
         mae = self._mae.without(job.isolated)
-        estimate = _estimate(mae, newest)
+        estimate = observed_theta(mae, newest)
         seen = np.isfinite(newest.theta)
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
@@ -107,11 +104,6 @@ class Updater(ABC):
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
-
-
-def _estimate(mae: Mae, seen: Observations) -> Array:
-    """Return θ (N, D) as a network has it."""
-    return mae.estimate(seen.end_tension(mae.friction), seen.length).theta
 
 
 def make_updater(robot: Robot, mae: Mae, preset: Preset, seed: int = 0) -> Updater:
@@ -180,8 +172,8 @@ class PaperUpdater(Updater):
 
 REAL_SHARE = 0.1
 #: share of synthetic samples that many messages of the moving arm take the place of; half of that,
-#: when there are so many
-MOVING_SHARE, MANY = 0.3, 200
+#: when there are `MANY`
+MOVING_SHARE = 0.3
 #: how often a synthetic sample is used before it is forgotten
 USES = 3
 #: a real sample that fits the body worse than this weight is not shown to the network
@@ -210,7 +202,7 @@ class BodyUpdater(Updater):
         if self.body_fit.is_of_another_arm(seen):
             self.body_fit.start_anew()
             self._trainer.restart()
-        fit = self.body_fit.fit(seen, _estimate(self._mae, seen))
+        fit = self.body_fit.fit(seen, observed_theta(self._mae, seen))
         learned, judging = map(self._at_angles, (job.healthy.learned, job.healthy.judging))
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         self._trainer.move(self.body_fit.lengthened())
@@ -261,163 +253,3 @@ class BodyUpdater(Updater):
         data.seen[places] = state.scaled()
         length = real.length + self.body.crept(real.age)
         data.true[places] = state._replace(length=length).scaled()
-
-
-# -- how good the estimates are --------------------------------------------------------------------
-
-#: bodies that the samples allow, many more than joints (of few, an ellipsoid holds what it was made
-#: of, and less of others), and samples of each
-BODIES, EACH = 100, 10
-INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
-
-
-def estimate_covariance(
-    mae: Mae,
-    body: CalibratedBody,
-    fit: Fit,
-    tension: Array,
-    seed: int,
-    judging: Observations | None,
-) -> Array:
-    """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
-
-    It is that of drawn errors, with postures anywhere and tensions [N] (N, M) of the samples. How
-    far drawn errors are too large or too small is told by messages that judge, if there are MANY:
-    by their own errors beside those drawn in their postures, most of which are near the samples.
-    """
-    rng = np.random.default_rng(seed)
-
-    def expected(theta: Array) -> Array:
-        # The same bodies and errors of lengths in all postures, or chance would tell them apart.
-        same = np.random.default_rng(seed)
-        return _spread(_drawn_errors(mae, body, fit, theta, tension, same))
-
-    covariance = expected(body.robot.random_postures(BODIES * EACH, rng))
-    if judging is None or len(judging) < MANY:
-        return covariance
-    here = expected(judging.theta[rng.integers(len(judging), size=BODIES * EACH)])
-    return covariance * _excess(here, _estimate(mae, judging) - judging.theta)
-
-
-def _drawn_errors(
-    mae: Mae,
-    body: CalibratedBody,
-    fit: Fit,
-    theta: Array,
-    tension: Array,
-    rng: np.random.Generator,
-) -> Array:
-    """Return θ_est − θ [rad] (BODIES · EACH, D) at as many postures.
-
-    What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
-    taken as linear in it), and what the network says of such bodies' lengths is compared with where
-    they are.
-    """
-    bodies = np.repeat(np.arange(BODIES), EACH)
-    tension = tension[rng.integers(len(tension), size=len(bodies))]
-    direction = UNSURE * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
-    poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
-    for muscles, root in fit.root:
-        steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
-        ends = np.cumsum([body.layouts[m].size for m in muscles])
-        for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
-            smooth = body.smooth[m].at(theta)
-            seen, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
-            length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
-    error: Array = mae.estimate(tension, length).theta - theta
-    return error
-
-
-def _spread(error: Array) -> Array:
-    """Return a covariance whose ellipsoid of 95 % holds as many errors, (N, D).
-
-    They have heavier tails than a normal distribution.
-    """
-    covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
-    covariance = 0.5 * (covariance + covariance.T)
-    return covariance * _excess(covariance, error)
-
-
-def _excess(covariance: Array, error: Array) -> float:
-    """Return by what to multiply a covariance for its ellipsoid to hold INSIDE of (N, D) errors."""
-    return float(np.quantile(ellipsoids(covariance, error), INSIDE))
-
-
-def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return by what to multiply a covariance for each of (N, D) errors to lie on its ellipsoid.
-
-    The ellipsoid is that of the share INSIDE of a normal distribution; (N,).
-    """
-    squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    # χ² of as many degrees as joints; scipy.stats has the same, and takes 0.7 s to import.
-    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], INSIDE))
-    return bounded
-
-
-# -- the network ----------------------------------------------------------------------------------
-
-STEP_SIZE = 2e-3
-BATCH = 128
-#: averaged over this share of the steps so far, but at least and at most so many steps
-AVERAGED_SHARE, LEAST_AVERAGED, MOST_AVERAGED = 0.1, 20.0, 2000.0
-#: the step size falls to a half after so many steps, and at last to this share of itself, below
-#: which the average no longer wanders but a slowly changing body is still followed
-CALMING, LEAST_CALM = 2000.0, 0.1
-
-
-class NetworkTrainer:
-    """Trains the network a few steps at a time, for as long as the robot lives.
-
-    What is published is the average of the weights over about the last tenth of all steps, and the
-    step size falls as steps add up, so that the network follows a body that is still being found
-    out and becomes calm when it is known. (At a constant step size even the average wanders: ±10 %
-    of the error of an arm over hours.)
-    """
-
-    def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
-        """Go on from a network's weights, as calmly as after so many `steps`."""
-        self.network = network  # the average: what is published
-        self._restless = copy.deepcopy(network)
-        self._weights = [*zip(network.parameters(), self._restless.parameters())]
-        self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
-        self._rng = np.random.default_rng([seed, 0x7A])
-        self.steps = steps  # taken so far, in former lives too
-
-    def train(self, data: TrainingData, steps: int) -> float:
-        """Take steps on batches of the data; return the mean loss of the last half of them."""
-        seen, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
-        mask = torch.arange(3).repeat_interleave(BATCH)
-        losses = []
-        with one_thread():
-            for _ in range(steps):
-                rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
-                value = _loss(self._restless, seen[rows], true[rows], mask)
-                value.backward()
-                self._optimiser.step(max(LEAST_CALM, 1.0 / (1.0 + self.steps / CALMING)))
-                self.steps += 1
-                self._average()
-                losses.append(value.item())
-        return float(np.mean(losses[len(losses) // 2 :]))
-
-    def move(self, length: Array) -> None:
-        """Go on as the network of an arm whose lengths are all longer by so much [m], (M,)."""
-        for network in (self.network, self._restless):
-            network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
-
-    def restart(self) -> None:
-        """Take large steps again and average few: the body has changed."""
-        self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
-
-    def _average(self) -> None:
-        span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
-        with torch.no_grad():
-            for mean, now in self._weights:
-                mean.lerp_(now, 1.0 / span)
-
-
-def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
-    """Return the three norms, each in units of the spread of the data, all three masks entered."""
-    error = network.decoder(network.encode(seen.repeat(3, 1), mask))
-    error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
-    parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
-    return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

@@ -11,10 +11,10 @@ from robots import write_robot
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
 from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.covariance import ellipsoids, estimate_covariance
 from musculoskeletal_ae.learning.fit import fit_body
-from musculoskeletal_ae.learning.postures import Bent, PostureModel, Unknowns
+from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -8,11 +8,11 @@ from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
 from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import (
     BodyUpdater,
-    NetworkTrainer,
     PaperUpdater,
     learned_steps,
 )
