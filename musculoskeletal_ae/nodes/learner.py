@@ -72,7 +72,7 @@ class Learner(Shell):
         self.follow_zeros(lambda *_: self._use_offsets())
         self.follow_muscle_states(lambda states: core.muscles(states, self.now()), as_read=True)
         self.follow_anomaly(core.anomaly)
-        self.told = False
+        self.has_heard_isolated = False
         self.gate = self.core.keeper.validation
         self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
@@ -122,10 +122,10 @@ class Learner(Shell):
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         # An estimator that has just started knows of none before it has our network.
         number = self._reception.numbers['isolated_muscles']
-        knows = number > 1 or (number == 0 and self.told)
+        knows = number > 1 or (number == 0 and self.has_heard_isolated)
         if muscles or knows or not self.core.isolated:
             self.core.isolate(muscles)
-        self.told = True
+        self.has_heard_isolated = True
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)

@@ -28,7 +28,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 # Faster than on a robot, so that a test takes seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}
-REST = 0.8  # [s] in one posture
+REST, MOVE = 0.8, 0.1  # [s] in one posture, and from one to the next
 DT = 0.01
 
 
@@ -41,17 +41,28 @@ class Arm:
         self.joints = graph.publisher(JointState, 'joint_states')
         self.muscles = graph.publisher(Float64MultiArray, 'muscle_states')
         self.time = self.until = 0.0
+        self.theta, self.tension = self.draw()
+
+    def draw(self):
+        """Return a posture and tensions at random."""
+        tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
+        return self.robot.random_postures(1, self.rng)[0], tension
 
     def publish(self):
-        """Publish one message of each kind, of a new posture now and then."""
+        """Publish one message of each kind; the arm goes to a new posture now and then."""
         self.time += DT
         if self.time > self.until:
-            self.theta = self.robot.random_postures(1, self.rng)[0]
-            self.tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
-            self.until = self.time + REST
-        length = self.robot.muscle_lengths(self.theta, self.tension) + 0.005
-        rows = np.stack([length, self.tension, np.full(self.robot.muscle_count, 25.0)])
-        self.joints.publish(JointState(name=self.robot.joints, position=self.theta.tolist()))
+            self.before, self.begun = (self.theta, self.tension), self.time
+            self.theta, self.tension = self.draw()
+            self.until = self.time + MOVE + REST
+        share = min(1.0, (self.time - self.begun) / MOVE)
+        theta, tension = (
+            (1.0 - share) * old + share * new
+            for old, new in zip(self.before, (self.theta, self.tension), strict=True)
+        )
+        length = self.robot.muscle_lengths(theta, tension) + 0.005
+        rows = np.stack([length, tension, np.full(self.robot.muscle_count, 25.0)])
+        self.joints.publish(JointState(name=self.robot.joints, position=theta.tolist()))
         self.muscles.publish(array_message(rows, 'quantity', 'muscle'))
 
     def step(self):
