@@ -96,8 +96,9 @@ class Learner:
         )
         self.keeper = CheckpointKeeper(robot, self.samples, directory, way.gated)
         saved = self.keeper.load()
-        # The saved samples keep the versions that they were taken under; count on from there.
-        self._use_body(replace(self.body, version=self.samples.body_version))
+        if self.samples:
+            # They keep the versions of the body state that they were taken under: count on.
+            self._use_body(replace(self.body, version=self.samples.body_version + 1))
         if saved is not None:
             self._start(saved)
             return

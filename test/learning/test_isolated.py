@@ -40,7 +40,8 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     for _ in range(3):
         learner.accept(stage.sample())
     learner.isolate((LOST,))
-    learner.accept(stage.sample())
+    body = learner.body
+    learner.accept(stage.sample()._replace(body_version=body.version, isolated=body.isolated))
     assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
     assert learner.trainer.jobs == []
     data = learner.poll(0.0)
@@ -50,6 +51,8 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     again = Learner(arm26, trainer=Prepared, directory=tmp_path)
     assert again.isolated == again.mae.isolated == (LOST,)
     assert len(again.samples) == 4
+    assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
+    assert again.body.version > again.samples.body_version  # versions are used once
     again.isolate(())
     assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
     again.close()

@@ -12,6 +12,7 @@ from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.trainer import Trainer, Update
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 DT = 0.01
 
@@ -211,6 +212,17 @@ def test_a_disabled_learner_learns_nothing(learner, stage):
     learner.enable(True)
     arm.rest(MARGIN + 1.5)
     assert len(learner.samples) == 3
+
+
+def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage):
+    learner.use_body(learner.body.with_offsets(LengthOffsets.unknown(6)))
+    arm = Arm(learner, stage)
+    arm.rest(2.0 * MARGIN)
+    assert len(learner.samples) == 0
+    assert 'length zeros' in learner.report().message
+    learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
+    arm.rest(2.0 * MARGIN)
+    assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
 
 
 def calibrated(learner):

@@ -87,7 +87,10 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     gravity[3:6] = 0.0, 0.6, -0.8
     plain = Sample(np.array([0.1, np.nan]), np.full(6, 50.0), np.zeros(6), np.ones(6))
     store = SampleStore()
-    for sample in (plain, plain._replace(spread=np.full(2, 0.02), gravity=gravity)):
+    for sample in (
+        plain,
+        plain._replace(spread=np.full(2, 0.02), gravity=gravity, body_version=3, isolated=(1, 4)),
+    ):
         store.add(sample)
     store.forget(1, newest=1)
     with closing(StateStore(tmp_path, arm26)) as state:
@@ -236,7 +239,8 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     store = SampleStore()
     for _ in range(4):
         theta, *parts, spread, gravity, _, _ = stage.sample()
-        store.add(Sample(theta, *(part[kept] for part in parts), spread, gravity))
+        measured = theta, *(part[kept] for part in parts), spread, gravity
+        store.add(Sample(*measured, isolated=(added,)))  # the muscle after the added one
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
@@ -244,6 +248,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         found = learner.samples
         assert found.numbers == store.numbers
         for one, other in zip(found.samples, store.samples, strict=True):
+            assert one.isolated == (added + 1,) and other.isolated == (added,)
             np.testing.assert_array_equal(one.theta, other.theta)
             np.testing.assert_array_equal(one.length[kept], other.length)
             np.testing.assert_array_equal(one.direction[kept], other.direction)
