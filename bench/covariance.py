@@ -27,8 +27,9 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.sensors import ellipsoid_share
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.learner import NONE, Learner
-from musculoskeletal_ae.learning.training import Job, Training
+from musculoskeletal_ae.learning.collector import NONE
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.trainer import Job, Trainer
 from musculoskeletal_ae.learning.update import make_updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
@@ -39,7 +40,7 @@ HELD_OUT = 60.0  # [s]
 UPDATES, STEPS = 3, 1500
 
 
-class Never(Training):
+class Never(Trainer):
     """Training that waits."""
 
     ready = False
@@ -47,7 +48,7 @@ class Never(Training):
 
 def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: float) -> Mae:
     """Return what an individual's rests tell without a joint angle."""
-    learner = Learner(robot, driver, seed=seed, training=Never, joint_source=NONE)
+    learner = Learner(robot, driver, seed=seed, trainer=Never, joint_source=NONE)
     exploring = record(arm, driver, EXPLORATION_STREAM + seed, 60.0 * minutes)
     teach(learner, zip(*exploring, strict=True), lambda *_: None)
     nothing = Healthy(np.empty((0, 3 * robot.muscle_count), np.float32), 0.0, 0)

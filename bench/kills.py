@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.training import TrainingProcess
+from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
@@ -48,7 +48,7 @@ def samples(robot: Robot, life: int) -> Iterator[Sample]:
 
 def digest(store: SampleStore) -> int:
     """Return a checksum of all that is stored, in order."""
-    sums = [zlib.crc32(np.concatenate([*sample]).tobytes()) for sample in store.samples]
+    sums = [zlib.crc32(np.concatenate(sample[:6]).tobytes()) for sample in store.samples]
     return zlib.crc32(np.array(sums, dtype=np.uint32).tobytes())
 
 
@@ -61,7 +61,7 @@ def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
     def say(*words: object) -> None:
         print(*words, flush=True)
 
-    learner = Learner(robot, steps=STEPS, training=TrainingProcess, directory=directory)
+    learner = Learner(robot, steps=STEPS, trainer=TrainerProcess, directory=directory)
     if learner.checkpoint is None:
         learner.begin(checkpoint.load(initial, robot))
     say('published', learner.mae.version)

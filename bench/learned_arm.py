@@ -15,7 +15,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
@@ -24,7 +24,7 @@ from musculoskeletal_ae.robot.robot import Robot
 SELDOM, STEPS = 20.0, 400  # [s] of news between updates, and their steps: as good, and cheaper
 
 
-class Seldom(Training):
+class Seldom(Trainer):
     """Training that waits for more news than the node's."""
 
     _asked = 0
@@ -63,7 +63,7 @@ def learned_arm(robot: Robot, seed: int, folder: Path, minutes: float) -> Learne
     if not file.exists():
         stream = EXPLORATION_STREAM + seed
         exploring = record(EmulatedArm(robot, seed), driver, stream, 60.0 * minutes)
-        learner = Learner(robot, driver, seed=seed, steps=STEPS, training=Seldom)
+        learner = Learner(robot, driver, seed=seed, steps=STEPS, trainer=Seldom)
         teach(learner, zip(*exploring, strict=True))
         np.savez(messages, *exploring)
         checkpoint.save(learner.mae, file)

@@ -93,7 +93,7 @@ def measured(
         estimation_error(paper, held_out),
         estimation_error(learned, held_out),
         float(np.linalg.norm(apart, axis=1).mean()),
-        learner.refused / max(learner.updates, 1),
+        learner.keeper.rejected / max(learner.updates, 1),
     )
 
 

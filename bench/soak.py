@@ -32,7 +32,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
-from musculoskeletal_ae.learning.training import Job, Training
+from musculoskeletal_ae.learning.trainer import Job, Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
@@ -49,7 +49,7 @@ FILLED = 7200.0
 SLOWER = 1.5  # the last quarter's updates against the first's
 
 
-class RareTraining(Training):
+class RareTrainer(Trainer):
     """Takes a job after every so many samples only; the first ones after fewer.
 
     Attributes:
@@ -116,10 +116,10 @@ def main(argv: list[str]) -> int:
     robot = Robot.load(args.robot)
     mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
     held_out = record(EmulatedArm(robot, args.seed), mae, HELD_OUT_STREAM, PART)
-    learner = Learner(robot, mae, seed=args.seed, steps=args.steps, training=RareTraining)
-    training = learner.training
-    assert isinstance(training, RareTraining)
-    training.every = args.every
+    learner = Learner(robot, mae, seed=args.seed, steps=args.steps, trainer=RareTrainer)
+    trainer = learner.trainer
+    assert isinstance(trainer, RareTrainer)
+    trainer.every = args.every
     arm = EmulatedArm(robot, args.seed)
     least, worst, reopened = np.inf, 0.0, 0
     reported = 0
@@ -133,7 +133,7 @@ def main(argv: list[str]) -> int:
             tension, length, theta = row
             accepted, update = learner.samples.accepted, learner.last_update
             learner.step(PART * part + n * SAMPLE_TIME, theta, tension, length)
-            training.samples += learner.samples.accepted - accepted
+            trainer.samples += learner.samples.accepted - accepted
             if learner.last_update is not None and learner.last_update is not update:
                 reopened += bool(learner.last_update.changed)
         now = PART * (part + 1)
@@ -153,10 +153,10 @@ def main(argv: list[str]) -> int:
                 f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
                 f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {reopened}  '
                 f'{memory(os.getpid()):.0f} MB  '
-                f'update {np.median(training.seconds[reported:]):.2f} s',
+                f'update {np.median(trainer.seconds[reported:]):.2f} s',
                 flush=True,
             )
-            reported = len(training.seconds)
-    problems = judged(worst, filled, most, training.seconds)
+            reported = len(trainer.seconds)
+    problems = judged(worst, filled, most, trainer.seconds)
     print('; '.join(problems) or 'all within what is tolerated')
     return int(bool(problems))

@@ -7,24 +7,34 @@ them each, at times of their own. The rule is the same on a live arm and on a re
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-
-class Paired(NamedTuple):
-    """One message of the muscle modules, with the θ of the same time if there is one."""
-
-    time: float  # when it came [s]
-    tension: Array  # T [N], (M,)
-    length: Array  # l [m], (M,)
-    dt: float  # time since the message before [s], 0 for the first
-    theta: Array | None  # θ [rad], (D,); NaN of joints of which none is
+Message = TypeVar('Message')
 
 
-class Pairing:
+@dataclass(frozen=True)
+class Paired(Generic[Message]):
+    """One message of the muscle modules, with the θ of the same time if there is one.
+
+    Attributes:
+        time: When the message came [s].
+        message: What the caller passed.
+        dt: Time since the message before [s]; 0 for the first.
+        theta: θ [rad], (D,), NaN of joints of which none belongs to it; None if there is no θ.
+    """
+
+    time: float
+    message: Message
+    dt: float
+    theta: Array | None
+
+
+class Pairing(Generic[Message]):
     """Joins two streams; gives out a muscle message when the next one has come."""
 
     def __init__(self, period: float) -> None:
@@ -38,7 +48,7 @@ class Pairing:
         # the latest one: when it came [s], and what it is, (2, D); NaN: none.
         self._last = self._next = self._latest = np.full((2, 1), np.nan)
         self._came = -math.inf
-        self._pending: tuple[float, Array, Array] | None = None
+        self._pending: tuple[float, Message] | None = None
         self._before: float | None = None
 
     def joints(self, time: float, theta: Array) -> None:
@@ -50,20 +60,21 @@ class Pairing:
         self._latest = np.where(np.isnan(new), self._latest, new)
         self._next = np.where(np.isnan(self._next), new, self._next)
 
-    def muscles(self, time: float, tension: Array, length: Array) -> Paired | None:
-        """Take T [N] and l [m] that came at `time` [s]; return the message before, paired.
+    def muscles(self, time: float, message: Message | None) -> Paired[Message] | None:
+        """Take a message that came at `time` [s]; return the message before, paired.
 
-        At the end of a recording, a message at time ∞ gives out the last one.
+        At the end of a recording, None at time ∞ returns the last message.
         """
         # The clock went back, or became another one.
         if self._pending is not None and time < self._pending[0]:
             self.reset()
-        pending, self._pending = self._pending, (time, tension, length)
+        pending = self._pending
+        self._pending = None if message is None else (time, message)
         paired = None
         if pending is not None:
-            came = pending[0]
+            came, earlier = pending
             dt = 0.0 if self._before is None else came - self._before
-            paired = Paired(*pending, dt, self._nearest(came, time))
+            paired = Paired(came, earlier, dt, self._nearest(came, time))
             self._before = came
         self._last, self._next = self._latest, np.full((2, 1), np.nan)
         return paired

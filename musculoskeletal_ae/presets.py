@@ -70,7 +70,7 @@ class Preset(Strict, frozen=True):
     name: str
     network: NetworkSettings
     training: TrainingSettings  # initial training
-    corrected_body: bool  # learn online by fitting the corrected body; else on the samples alone
+    corrected_body: bool  # learn online by fitting the calibrated body; else on the samples alone
     least_samples: Count  # from how many samples on it learns online
     gated: bool  # the learner tries what it learned by `estimation.gate`; as printed it does not
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed

@@ -12,11 +12,11 @@ from musculoskeletal_ae.pairing import Pairing
 def test_the_nearest_angle_within_half_a_period_is_paired():
     pairing = Pairing(0.01)
     pairing.joints(0.0, np.array([0.0]))
-    assert pairing.muscles(0.001, np.ones(1), np.ones(1)) is None
+    assert pairing.muscles(0.001, 'message') is None
     pairing.joints(0.0115, np.array([1.0]))
-    first = pairing.muscles(0.012, np.ones(1), np.ones(1))
-    second = pairing.muscles(0.022, np.ones(1), np.ones(1))
-    third = pairing.muscles(0.032, np.ones(1), np.ones(1))
+    first = pairing.muscles(0.012, 'message')
+    second = pairing.muscles(0.022, 'message')
+    third = pairing.muscles(0.032, 'message')
     assert first.theta == [0.0]
     assert second.theta == [1.0]
     assert second.dt == pytest.approx(0.011)
@@ -25,10 +25,10 @@ def test_the_nearest_angle_within_half_a_period_is_paired():
 
 def test_a_clock_that_goes_back_starts_pairing_anew():
     pairing = Pairing(0.01)
-    pairing.muscles(1.7e9, np.ones(1), np.ones(1))
-    assert pairing.muscles(0.0, np.ones(1), np.ones(1)) is None
+    pairing.muscles(1.7e9, 'message')
+    assert pairing.muscles(0.0, 'message') is None
     pairing.joints(0.0, np.array([2.0]))
-    after = pairing.muscles(0.01, np.ones(1), np.ones(1))
+    after = pairing.muscles(0.01, 'message')
     assert after.dt == 0.0
     assert after.theta == [2.0]
 
@@ -43,7 +43,7 @@ def paired_live(joints, muscles, period):
     ):
         if kind == 0:
             pairing.joints(time, np.array([number]))
-        elif paired := pairing.muscles(time, np.ones(1), np.ones(1)):
+        elif paired := pairing.muscles(time, 'message'):
             given_out.append(None if paired.theta is None else int(paired.theta[0]))
     return given_out
 
@@ -80,7 +80,7 @@ def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
     for time, kind in sorted([(time, 0) for time in sent] + [(m, 1) for m in [*muscles, math.inf]]):
         if kind == 0:
             pairing.joints(time, np.where(sent[time], float(time), np.nan))
-        elif paired := pairing.muscles(time, np.ones(1), np.ones(1)):
+        elif paired := pairing.muscles(time, 'message'):
             found.append(np.full(3, np.nan) if paired.theta is None else paired.theta)
     for j in range(3):
         own = sorted(time for time, which in sent.items() if which[j])

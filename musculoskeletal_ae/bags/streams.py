@@ -19,8 +19,9 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import LengthOffsets
-from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream
+from musculoskeletal_ae.validity import read_array, read_names, read_posture
 
 
 class Series(NamedTuple):
@@ -44,7 +45,7 @@ class Streams(NamedTuple):
     """What one arm measured and was commanded; a topic that the bag lacks is an empty series."""
 
     joints: Series  # θ [rad], (N, D); NaN of joints without a sensor
-    muscles: Series  # length [m] from its zero, tension [N], temperature [°C], (N, 3, M)
+    muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
     isolated: Series  # 1 of isolated muscles, else 0, (N, M)
@@ -53,18 +54,19 @@ class Streams(NamedTuple):
     def pairs(self) -> Pairs:
         """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.pairing`)."""
         time = self.muscles.time
-        pairing = Pairing(float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
+        pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
         # A muscle message at the end of time gives out the last one.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
-        theta, muscle = [], []  # θ, and the row of (T, l), which stands for them here
-        for came, kind, number in heapq.merge(joints, muscles):
-            row = np.array(number)
+        theta, muscle = [], []  # θ, and the row of the muscle message
+        for came, kind, row in heapq.merge(joints, muscles):
             if kind == 0:
-                pairing.joints(came, self.joints.values[number])
-            elif (paired := pairing.muscles(came, row, row)) and paired.theta is not None:
+                pairing.joints(came, self.joints.values[row])
+                continue
+            paired = pairing.muscles(came, row if came < math.inf else None)
+            if paired is not None and paired.theta is not None:
                 theta.append(paired.theta)
-                muscle.append(int(paired.length))
+                muscle.append(paired.message)
         values, time = self.muscles.values[muscle], time[muscle]
         isolated = np.full(values[:, 0].shape, -1)
         if len(self.isolated.time):
@@ -92,10 +94,14 @@ class _Stream:
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
     """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
 
-    The zeros of the last `muscle_length_zeros` are subtracted from lengths, and those of its first
-    message also from what came before, if they are known. Messages that came while zeros were being
-    found are left out. Values of isolated muscles that are not finite become 0, temperatures NaN. A
-    BagError says that no message of a topic fits the robot, or that the bag is damaged.
+    Muscle states pass the same `MuscleStream` as on a robot: messages that are not plausible are
+    left out and counted. The offsets of the last `muscle_length_zeros` are subtracted from lengths,
+    and those of its first message also from what came before, if they are known. Messages that
+    came while offsets were being found are left out. Values of isolated muscles that are not finite
+    become 0, temperatures NaN.
+
+    Raises:
+        BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
     muscles, joints = robot.muscle_count, robot.joints
 
@@ -103,30 +109,33 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         indices = robot.muscle_indices(read_names(message))
         return np.isin(np.arange(muscles), indices).astype(float)
 
+    muscle_stream, has_offsets = MuscleStream(robot), list[bool]()
+
     def muscle_states(message: Any, came: float) -> Array:
-        last = isolated.values and isolated.values[_latched(isolated.times, came)]
-        ignored = np.flatnonzero(last)
-        return read_muscle_states(message, muscles, ignored)
+        muscle_stream.use_body(_body_at(came, muscle_stream.body, isolated, offsets))
+        sample = muscle_stream.take(message, came)
+        has_offsets.append(muscle_stream.body.offsets.known)
+        return np.array([sample.length, sample.motor_tension, sample.temperature])
 
     def rows(count: int) -> Callable[[Any, float], Array]:
         return lambda message, _: read_array(message, count, muscles)
 
-    isolated = _Stream((muscles,), isolated_mask)
+    isolated, offsets = _Stream((muscles,), isolated_mask), _Stream((2, muscles), rows(2))
     streams = {
         'joint_states': _Stream((len(joints),), lambda m, _: read_posture(m, joints, some=True)),
         'muscle_states': _Stream((3, muscles), muscle_states),
         'muscle_length_command': _Stream((muscles,), rows(1)),
         'muscle_tension_command': _Stream((muscles,), rows(1)),
         'isolated_muscles': isolated,
-        'muscle_length_zeros': _Stream((2, muscles), rows(2)),
+        'muscle_length_zeros': offsets,
     }
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
     start, warnings = bag.start, list[str]()
     reception = Reception(warnings.append)
     receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
-    # Isolated muscles come first: the recorder may have received them later than the readings.
-    early = [name for name, topic in topics.items() if topic is isolated]
+    # The body state comes first: the recorder may have received it later than the readings.
+    early = [name for name, topic in topics.items() if topic is isolated or topic is offsets]
     for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic have clocks of their own.
@@ -141,13 +150,14 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         if reasons and not stream.values:
             problem = f'no message of {topic} fits the robot ({reasons[-1]})'
             raise BagError(bag.path, problem, 'choose the robot it was recorded from')
-    joint_states, states, lengths, tensions, isolated_series, zeros = (
+    joint_states, states, lengths, tensions, isolated_series, _ = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
-    states, left_out = _from_zero(states, zeros)
-    if left_out:
-        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += left_out
+    use = np.array(has_offsets, dtype=bool)
+    if not use.all():
+        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += int((~use).sum())
+        states = Series(states.time[use], states.values[use])
     return Streams(joint_states, states, lengths, tensions, isolated_series, reception.rejected)
 
 
@@ -156,14 +166,16 @@ def _latched(times: ArrayLike, when: ArrayLike) -> Any:
     return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
 
 
-def _from_zero(states: Series, zeros: Series) -> tuple[Series, int]:
-    """Return states with lengths from the zeros of their time, and how many had no known zeros."""
-    known = np.array([LengthOffsets(*rows).known for rows in zeros.values], dtype=bool)
-    since = np.searchsorted(zeros.time, states.time, side='right')  # 0: nothing was said yet
-    if known[:1].any():  # latched before the bag: the recorder heard the estimator a little late
-        since = np.maximum(since, 1)
-    use = np.append(True, known)[since]
-    offset = np.concatenate([np.zeros_like(states.values[:1, 0]), zeros.values[:, 0]])
-    values = states.values[use]
-    values[:, 0] -= offset[since[use]]
-    return Series(states.time[use], values), int((~use).sum())
+def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream) -> BodyState:
+    """Return the body state at a time; `before` if it is still that one."""
+    body = before
+    if isolated.values:
+        body = body.with_isolated(np.flatnonzero(isolated.values[_latched(isolated.times, time)]))
+    if offsets.values:
+        number = int(np.searchsorted(offsets.times, time, side='right'))  # 0: nothing known yet
+        if number == 0 and LengthOffsets(*offsets.values[0]).known:
+            number = 1  # latched before the bag: the recorder heard the estimator a little late
+        newest = offsets.values[number - 1] if number else np.zeros_like(offsets.values[0])
+        if not (newest == [body.offsets.offset, body.offsets.deviation]).all():
+            body = body.with_offsets(LengthOffsets(*newest))
+    return body

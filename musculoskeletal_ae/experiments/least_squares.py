@@ -18,7 +18,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE, Arm
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
@@ -87,7 +87,7 @@ def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
     return LeastSquares(robot, *model, robot.series_elastic, tension_noise)
 
 
-def learned(robot: Robot, body: CorrectedBody) -> LeastSquares:
+def learned(robot: Robot, body: CalibratedBody) -> LeastSquares:
     """Return least squares on a body that was fitted, wires in the mean of both directions."""
 
     def lengths(theta: Array, tension: Array) -> Array:

@@ -42,7 +42,8 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
 from musculoskeletal_ae.friction import FrictionDirection
-from musculoskeletal_ae.learning.learner import SENSOR, Learner
+from musculoskeletal_ae.learning.collector import SENSOR
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -159,9 +160,9 @@ def measure(study: Study, seed: int) -> Measured:
         learner, loop = beginner(study, study.arm(seed), seed, preset)
         curve, stream = follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
         checkpoint.save(learner.mae, study.network_file(preset, seed))
-        if learner.training.body is not None:
+        if learner.trainer.body is not None:
             study.keep(seed, exploring=stream, rests=_rests(learner))
-            body = learned(study.robot, learner.training.body)
+            body = learned(study.robot, learner.trainer.body)
             numbers = {'body_rad': body.error(held_out), **numbers}
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.keyed(preset, values)

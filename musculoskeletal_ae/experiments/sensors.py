@@ -26,8 +26,9 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.roles import elbows
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
-from musculoskeletal_ae.learning.learner import MARKER, NONE, SENSOR, Learner
-from musculoskeletal_ae.learning.update import ellipsoids
+from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR
+from musculoskeletal_ae.learning.covariance import ellipsoids
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning the body online: what counts as a sample, the corrected body, the network's updates."""
+"""Learning the body online: what counts as a sample, the calibrated body, the network's updates."""

@@ -12,6 +12,7 @@ Where joint sensors read all angles, the network learns from every second messag
 the others, which it has never seen, tell how good its estimates are.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -74,6 +75,7 @@ class Reservoir:
         self._kept: list[NDArray[np.float32]] = []
         self._seen, self._since = 0, 0.0
         self.time = 0.0  # healthy time seen [s]
+        self._missing: frozenset[int] = frozenset()  # muscles that some messages lack
         self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
@@ -83,6 +85,7 @@ class Reservoir:
             return
         self.time += min(self._since, 2.0 * SPACING)
         self._since = 0.0
+        self._missing |= frozenset(reading.isolated)
         self._seen += 1
         full = len(self._kept) == self._capacity
         place = int(self._rng.integers(self._seen)) if full else len(self._kept)
@@ -97,8 +100,14 @@ class Reservoir:
         if self._rests.is_new(rest):
             self._rests.add(rest)
 
+    def use_isolated(self, isolated: Iterable[int]) -> None:
+        """Go on with these muscles isolated; forget all if messages lack another muscle."""
+        if self._missing - frozenset(isolated):
+            self.clear()
+
     def clear(self) -> None:
         """Forget all, as when the body has changed."""
+        self._missing = frozenset()
         self._kept.clear()
         self._seen, self._since, self.time = 0, 0.0, 0.0
         self._rests.clear()

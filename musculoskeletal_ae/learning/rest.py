@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages to rests that may be learned from: plausible, still, and of a healthy arm.
+"""From messages to rests: when the arm is still.
 
 The arm rests while the means of the two halves of a short window differ by no more than the given
 rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
@@ -7,30 +7,101 @@ sensor's). The rest is averaged until it ends, or for `LONGEST` at a time. An ar
 sensors (`blind`) rests while its muscles do, and θ is averaged where there is any. A motion begins
 and ends too slowly to be told from rest, but not to bend what an accelerometer reads of gravity:
 that counts where the whole windows before and after it were still.
-
-What comes within `MARGIN` before an anomaly is noticed was already wrong; rests and healthy
-messages therefore wait that long before they count.
 """
 
 from bisect import bisect_right
-from collections import Counter, deque
+from collections import deque
+from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.friction import FrictionDirection
-from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
-from musculoskeletal_ae.plausibility import Plausibility
-from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 1.0  # [s] of rest that one sample averages
 MOST = 20_000  # readings of one rest: an end where the clock stands still
 LEAST_READINGS = 4  # in half of `rest_time`, which slow messages make longer: fewer hide a drift
 SURE = 3.0  # standard errors that a difference of means may have by chance
+
+
+class ReadingWindow:
+    """The latest readings with the times when they came, and their values as rows of an array.
+
+    The array is reused, because a new one for every message would be slow.
+    """
+
+    def __init__(self) -> None:
+        self.readings: deque[tuple[float, Sample]] = deque(maxlen=MOST)
+        self._rows = np.empty((0, 1))  # from `_first` on (l, θ) of the readings
+        self._first = 0
+
+    def clear(self) -> None:
+        """Forget all readings."""
+        self.readings.clear()
+
+    @property
+    def start(self) -> float:
+        """When the first reading came [s]."""
+        return self.readings[0][0]
+
+    def append(self, time: float, reading: Sample) -> None:
+        """Add a reading that came at `time` [s]."""
+        held = min(len(self.readings), MOST - 1)  # of which one goes when the window is full
+        self._first += len(self.readings) - held
+        row = np.concatenate((reading.length, reading.theta))
+        if self._first + held == len(self._rows):
+            kept = self._rows[self._first :]
+            self._rows, self._first = np.empty((2 * held + 100, len(row))), 0
+            self._rows[:held] = kept
+        self._rows[self._first + held] = row
+        self.readings.append((time, reading))
+
+    def drop_before(self, time: float) -> None:
+        """Forget the readings that came before `time` [s]."""
+        while self.start < time:
+            self.readings.popleft()
+            self._first += 1
+
+    def parts(self, time: float) -> tuple[Array, Array]:
+        """Return the rows of the readings up to `time` [s], and of those after it."""
+        cut = bisect_right(self.readings, time, key=itemgetter(0))
+        middle, end = self._first + cut, self._first + len(self.readings)
+        return self._rows[self._first : middle], self._rows[middle:end]
+
+
+@dataclass
+class OpenRest:
+    """A rest that goes on.
+
+    Attributes:
+        since: When the arm was found still [s].
+        span: How long the readings last that are averaged [s].
+        readings: Those readings.
+        gravity: What IMUs read of gravity in readings with still windows before and after them.
+    """
+
+    since: float
+    span: float = 0.0
+    readings: list[Sample] = field(default_factory=list)
+    gravity: list[Array] = field(default_factory=list)
+
+    def mean(self) -> Sample | None:
+        """Return the mean of the readings; None if there is none."""
+        if not self.readings:
+            return None
+        theta, tension, length, direction = (
+            _mean(np.array(part)) for part in [*zip(*self.readings)][:4]
+        )
+        # All readings of a rest were taken under one body state.
+        return self.readings[-1]._replace(
+            theta=theta,
+            tension=tension,
+            length=length,
+            direction=direction,
+            gravity=_mean(np.array(self.gravity)) if self.gravity else NOTHING,
+        )
 
 
 class RestDetector:
@@ -41,20 +112,15 @@ class RestDetector:
     ) -> None:
         """Start with an empty window; `radian` is that of `SampleStore`."""
         self.settings, self.blind, self._radian = settings, blind, radian
-        self._window: deque[tuple[float, Sample]] = deque(maxlen=MOST)
-        # Rows from `_first` on are (l, θ) of the window's readings: no new array for every message.
-        self._rows, self._first = np.empty((0, 1)), 0
+        self._window = ReadingWindow()
         self.reset()
 
     def reset(self) -> None:
         """Forget the window, as after a jump of the clock."""
         self._window.clear()
+        self._time = 0.0  # [s]
         self._read_at, self._periods = 0.0, (0.0, 0.0)  # of messages that count, the last two [s]
-        self._rest: list[Sample] = []
-        self._gravity: list[Array] = []  # what counts of it in the rest
-        self._since = 0.0  # when the arm was found still [s]
-        self._span = self._time = 0.0
-        self._still = False
+        self._rest: OpenRest | None = None  # None: the arm moves
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
         """Take a message, `dt` [s] after the one before, with θ NaN where none was measured.
@@ -62,55 +128,40 @@ class RestDetector:
         Returns the mean of a rest that ended or is long enough.
         """
         self._time += dt
-        self._append(reading)
-        if self.blind or _measured(reading):
+        self._window.append(self._time, reading)
+        if self.blind or _is_measured(reading):
             self._periods = self._periods[1], self._time - self._read_at
             self._read_at = self._time
-        # The shorter one: a hole is no rate.
+        # Of the last two periods the shorter one counts: a gap is no rate.
         readings = (2 * LEAST_READINGS + 1) * min(self._periods)
-        self._needed = max(self.settings.rest_time, readings)
-        while self._time - self._window[0][0] > self._needed + 1e-9:
-            self._window.popleft()
-            self._first += 1
-        was_still, self._still = self._still, self._is_still()
-        if not self._still and not was_still:
+        needed = max(self.settings.rest_time, readings)
+        self._window.drop_before(self._time - needed - 1e-9)
+        rest = self._rest
+        if not self._is_still(needed):
+            self._rest = None
+            return None if rest is None else rest.mean()
+        if rest is None:
+            rest = self._rest = OpenRest(since=self._time, span=needed)
+            new = [each for _, each in self._window.readings]
+        else:
+            rest.span += dt
+            new = [reading]
+        rest.readings += new if self.blind else filter(_is_measured, new)
+        time, earlier = self._window.readings[0]
+        if time >= rest.since:
+            rest.gravity.append(earlier.gravity)
+        if rest.span < LONGEST and len(rest.readings) < MOST:
             return None
-        if self._still:
-            new = [reading] if was_still else [reading for _, reading in self._window]
-            self._rest += new if self.blind else filter(_measured, new)
-            self._since = self._since if was_still else self._time
-            time, earlier = self._window[0]
-            if time >= self._since:
-                self._gravity.append(earlier.gravity)
-            self._span = self._span + dt if was_still else self._needed
-            if self._span < LONGEST and len(self._rest) < MOST:
-                return None
-        rest, self._rest, self._span = self._rest, [], 0.0
-        gravity, self._gravity = self._gravity, []
-        if not rest:
-            return None
-        mean = Sample(*(_mean(np.array(column)) for column in zip(*rest)))
-        return mean._replace(gravity=_mean(np.array(gravity)) if gravity else NOTHING)
+        self._rest = OpenRest(since=rest.since)
+        return rest.mean()
 
-    def _append(self, reading: Sample) -> None:
-        held = min(len(self._window), MOST - 1)  # of which one goes when the window is full
-        self._first += len(self._window) - held
-        row = np.concatenate((reading.length, reading.theta))
-        if self._first + held == len(self._rows):
-            kept = self._rows[self._first :]
-            self._rows, self._first = np.empty((2 * held + 100, len(row))), 0
-            self._rows[:held] = kept
-        self._rows[self._first + held] = row
-        self._window.append((self._time, reading))
-
-    def _is_still(self) -> bool:
-        half = 0.5 * self._needed
-        if self._time - self._window[0][0] <= 0.7 * self._needed:
+    def _is_still(self, needed: float) -> bool:
+        """Whether the arm was still for the time that a rest needs [s]."""
+        half = 0.5 * needed
+        if self._time - self._window.start <= 0.7 * needed:
             return False
-        cut = bisect_right(self._window, self._time - half, key=itemgetter(0))
-        middle, end = self._first + cut, self._first + len(self._window)
-        halves = self._rows[self._first : middle], self._rows[middle:end]
-        muscles = len(self._window[0][1].length)
+        halves = self._window.parts(self._time - half)
+        muscles = len(self._window.readings[0][1].length)
         if not _unmoved([h[:, :muscles] for h in halves], self.settings.rest_length_rate * half):
             return False
         angles = [part[:, muscles:] for part in halves]
@@ -132,7 +183,7 @@ class RestDetector:
         )
 
 
-def _measured(reading: Sample) -> bool:
+def _is_measured(reading: Sample) -> bool:
     return not np.isnan(reading.theta).all()
 
 
@@ -155,114 +206,3 @@ def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
         if len(half) > 1
     )
     return bool((difference <= allowed + SURE * np.sqrt(error)).all())
-
-
-# -- what may be learned --------------------------------------------------------------------------
-
-MARGIN = 2.0  # [s] before a detection and after its reset
-#: [s] without messages, and longer than a rest has to be, in which a wire may have slid anywhere
-HOLE = 0.5
-#: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
-MOST_WAITING = 5000
-
-
-class Waiting(NamedTuple):
-    """A message, and the rest that it ended, that count once no anomaly has followed for MARGIN."""
-
-    time: float
-    dt: float
-    reading: Sample
-    rest: Sample | None
-
-
-class RestCollector:
-    """Steps through the messages and gives out the rests that may be learned from."""
-
-    def __init__(
-        self,
-        robot: Robot,
-        settings: Settings,
-        healthy: Reservoir,
-        blind: bool = False,
-        spread: Array = NOTHING,
-    ) -> None:
-        """Watch `robot`; messages of the healthy arm go to `healthy`.
-
-        A `blind` one rests without joint angles, too; those that there are spread by `spread`.
-        """
-        self._robot, self._healthy, self._spread = robot, healthy, spread
-        self.anomaly = False  # closes the gate
-        # Messages that no sensor measures, and rests that are not learned from, by reason.
-        self.rejected: Counter[str] = Counter()
-        self._detector = RestDetector(settings, blind, robot.kinematics.radian)
-        self._hole = max(HOLE, settings.rest_time)
-        self._plausibility = Plausibility(robot)
-        self.plausible = True  # whether muscles of this arm can say what came last
-        self._direction = FrictionDirection()
-        self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
-        self._time = self._skipped = 0.0
-        self._closed_until = 0.0
-
-    def step(
-        self,
-        tension: Array,
-        length: Array,
-        dt: float,
-        theta: Array | None = None,
-        gravity: Array = NOTHING,
-    ) -> list[Sample]:
-        """Take T [N], l [m] (M,), `dt` [s] after the ones before, and θ [rad] (D,) if measured.
-
-        And what IMUs read of gravity, see `Sample`. Returns the rests that count from now on.
-        """
-        dt += self._skipped
-        if dt > self._hole:
-            self._direction.reset()
-            dt = self._hole
-        judge = self._plausibility
-        error = judge.levels(tension, length)
-        self.plausible = error is None
-        if error is None and theta is not None:
-            error = judge.outside(np.where(np.isnan(theta), self._robot.lower, theta))
-        if error:
-            self.rejected[error.reason] += 1
-            self._skipped = dt
-            return []
-        self._skipped = 0.0
-        self._time += dt
-        direction = self._direction.step(length)
-        nothing = np.full(self._robot.joint_count, np.nan)
-        theta = nothing if theta is None else theta
-        reading = Sample(theta, tension, length, direction, self._spread, gravity)
-        rest = self._detector.step(reading, dt)
-        if rest is not None and np.isnan(rest.gravity).all():
-            rest = rest._replace(gravity=NOTHING)
-        if self.anomaly or self._time < self._closed_until:
-            if rest is not None:
-                self.rejected['anomaly'] += 1
-            return []
-        self._waiting.append(Waiting(self._time, dt, reading, rest))
-        rests = []
-        while self._waiting and self._time - self._waiting[0].time >= MARGIN:
-            passed = self._waiting.popleft()
-            self._healthy.step(passed.reading, passed.dt)
-            if passed.rest is not None:
-                rests.append(passed.rest)
-        return rests
-
-    def set_anomaly(self, detected: bool) -> None:
-        """Close the gate on an anomaly, open it some time after the reset."""
-        if detected and not self.anomaly:
-            if lost := sum(waiting.rest is not None for waiting in self._waiting):
-                self.rejected['anomaly'] += lost
-            self._waiting.clear()
-        if self.anomaly and not detected:
-            self._closed_until = self._time + MARGIN
-        self.anomaly = detected
-
-    def reset(self) -> None:
-        """Forget what does not count yet, as after a backward jump of the clock."""
-        self._skipped = 0.0
-        self._detector.reset()
-        self._direction.reset()
-        self._waiting.clear()

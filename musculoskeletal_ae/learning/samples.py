@@ -40,6 +40,9 @@ class Sample(NamedTuple):
     spread: Array = NOTHING
     #: direction of gravity in the frames of the tree's joints, (3J,); NaN or nothing: no IMU there
     gravity: Array = NOTHING
+    #: version of the `BodyState` under which it was taken, and the muscles that were isolated then
+    body_version: int = 0
+    isolated: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,11 @@ class SampleStore:
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
 
+    @property
+    def body_version(self) -> int:
+        """The newest version of the body state that a stored sample was taken under."""
+        return max((sample.body_version for sample in self.samples), default=0)
+
     def clear(self) -> None:
         """Forget all samples."""
         self.samples: list[Sample] = []  # the oldest first
@@ -140,9 +148,9 @@ class SampleStore:
 
     def observations(self) -> Observations:
         """Return all samples as arrays."""
-        *columns, spreads, gravities = zip(*self.samples, strict=True)
-        theta, tension, length, direction = map(np.array, columns)
-        spread, gravity = _filled(spreads, 0.0), _filled(gravities, np.nan)
+        columns = [*zip(*self.samples, strict=True)]
+        theta, tension, length, direction = map(np.array, columns[:4])
+        spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
         # Without angles, wires that creep look like postures that drift.
         read = np.isfinite(theta).all(axis=1).mean()

@@ -19,7 +19,10 @@ Values = tuple[float, ...]
 
 
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
-    """One `Sample`, its number among all ever accepted, and which muscles it describes."""
+    """One `Sample`, its number among all ever accepted, and which muscles it describes.
+
+    `isolated` are positions among the muscles of the saved state.
+    """
 
     number: int
     theta: Values
@@ -29,6 +32,8 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
     spread: Values
     gravity: Values
     known: tuple[bool, ...]
+    body_version: int
+    isolated: tuple[int, ...]
 
 
 class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,11 +48,26 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
     """Return what is to be saved."""
     stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
-    saved = tuple(
-        SavedSample(number, *(tuple(part.tolist()) for part in (*sample, known)))
-        for number, sample, known in stored
-    )
+    saved = tuple(_saved(number, sample, known) for number, sample, known in stored)
     return SavedState(robot.joints, robot.muscles, saved, network)
+
+
+def _saved(number: int, sample: Sample, known: Bools) -> SavedSample:
+    theta, tension, length, direction, spread, gravity = (
+        tuple(part.tolist()) for part in sample[:6]
+    )
+    return SavedSample(
+        number,
+        theta,
+        tension,
+        length,
+        direction,
+        spread,
+        gravity,
+        tuple(known.tolist()),
+        sample.body_version,
+        sample.isolated,
+    )
 
 
 def to_bytes(state: SavedState) -> bytes:
@@ -94,6 +114,7 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
         and all(len(part) == muscle_count for part in of_muscles)
         and len(sample.spread) in (0, joint_count)
         and len(sample.gravity) in (0, gravity_size)
+        and all(0 <= muscle < muscle_count for muscle in sample.isolated)
     )
 
 
@@ -112,7 +133,10 @@ def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> No
         direction[places] = saved.direction
         known[places] = saved.known
         spread, gravity = np.array(saved.spread), np.array(saved.gravity)
-        sample = Sample(theta, tension, length, direction, spread, gravity)
+        isolated = tuple(sorted(places[muscle] for muscle in saved.isolated))
+        sample = Sample(
+            theta, tension, length, direction, spread, gravity, saved.body_version, isolated
+        )
         samples.add(sample, known, saved.number)
 
 

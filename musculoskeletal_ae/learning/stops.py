@@ -14,11 +14,17 @@ where a stop gives way. Sensors are as often zeroed well as roughly (p(z) is a s
 normal distribution), and limits may be no stops: then no reading says anything.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.learning.posture_model import PostureModel
 
 # Where a joint slides, [rad] below are times RACK [m].
 ZERO, ZEROED = np.deg2rad(2.0), 0.003  # spread of zeros that are set roughly, or well [rad]
@@ -28,6 +34,10 @@ NO_STOPS, NOT_REACHED = 0.1, 0.5  # how often limits are no stops, and a stop is
 SHARES, WIDTHS = (0.03, 0.1, 0.3), (0.001, 0.002, 0.004)  # π and σ [rad] that are tried else
 GIVE = 2.0  # σ beyond the limit, in units of that within
 BEYOND = 0.01  # density of readings beyond a limit, as a share of that within
+#: from a limit, where a joint that muscles push there is taken to be at its stop [rad], and how
+#: many spreads of the torque that is usually left that takes
+NEAR_STOP, PUSHED = 0.05, 3.0
+SMALL = 1e-6  # weight of every angle, as a share of that of a stop
 NEAR = 0.3  # a limit, so that a reading has to do with it [rad]
 #: rests are different if another joint is so much elsewhere, or the reading itself [rad]
 ELSEWHERE, SAME = 0.1, 0.01
@@ -98,3 +108,49 @@ def _different(own: Array, elsewhere: Bools) -> Array:
 def _normal(x: Array, sigma: float) -> Array:
     density: Array = np.exp(-0.5 * (x / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
     return density
+
+
+class Stops:
+    """Which joints of a group lean on their stops, and what draws joints back that passed one."""
+
+    def __init__(self, model: PostureModel) -> None:
+        """Start with no joint at a stop."""
+        robot, seen = model.body.robot, model.seen
+        self._lower, self._upper = robot.lower, robot.upper
+        self._radian = robot.kinematics.radian
+        self._by_sensor = model.by_sensor
+        self._near = self._radian * np.where(model.by_sensor, 2.0 * ZERO, NEAR_STOP)
+        # The torque of a muscle that was changed since is not that of the one there is.
+        changed = ~seen.known & (seen.tension > 0.0)  # 0 N: isolated
+        #: whose balance of torques says something, (N, D)
+        self.is_balanced = ~(changed @ robot.routes.crossed)
+        self._at = np.full(model.by_sensor.shape, np.nan)  # the stops that joints lean on [rad]
+
+    def lean(self, own: Array, score: Array) -> Bools:
+        """Find the joints at their stops; return those whose balance says something, (N, D).
+
+        Args:
+            own: θ [rad], (N, D).
+            score: The torque that is left at each joint, in units of what is usually left, (N, D).
+                It pushes the joint; at a stop it is the stop's own.
+        """
+        # A joint that a sensor reads leans on its stop until it would have to be held there.
+        # Another joint would be held by a stop that it was taken to once, and all others would be
+        # bent after it.
+        enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, PUSHED)
+        above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
+        below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)
+        self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
+        return self.is_balanced & ~(above | below)
+
+    def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
+        """Return how far joints are from the stops they lean on or passed [rad], and weights."""
+        goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
+        is_pulled = ~np.isnan(self._at) | (goal != own)
+        return goal - own, is_pulled / (STOP * self._radian) ** 2 / repeated
+
+    @property
+    def least_weight(self) -> Array:
+        """A weight of every angle that keeps the equations regular, (D,)."""
+        weight: Array = SMALL / (STOP * self._radian) ** 2
+        return weight

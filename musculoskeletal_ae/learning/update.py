@@ -3,7 +3,7 @@
 
 Preset `default` finds out the body from the samples, then lets the network learn that:
 
-1. Fit the corrected body to the samples (`body`), and move the network by what lengths changed by
+1. Fit the calibrated body to the samples (`body`), and move the network by what lengths changed by
    everywhere: zeros, and wires that creep, need no training, and no average of weights lags behind.
 2. Draw synthetic samples of it, and put real ones in the place of some: rests, and messages of the
    moving arm, of which there are many more and which say what rests do not (how wires slide, what
@@ -17,31 +17,35 @@ needs many, and gets them from the body. Preset `paper` trains on the samples al
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 import time
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
-from scipy.special import gammaincinv
-from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CorrectedBody, Fit, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.body_fit import (
+    LEAST_CHANGE,
+    OUTLIER,
+    BodyFit,
+    contradicted_muscles,
+)
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
+from musculoskeletal_ae.learning.covariance import MANY, estimate_covariance, observed_theta
+from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.training import Job, Update
+from musculoskeletal_ae.learning.synthetic import TrainingData, synthetic_samples
+from musculoskeletal_ae.learning.trainer import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.residuals import TouchStatistics
-from musculoskeletal_ae.mae.training import TINY, highest_tensions, loss, one_thread
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, State
+from musculoskeletal_ae.mae.training import loss, one_thread
 from musculoskeletal_ae.presets import PAPER, Preset
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -53,17 +57,20 @@ NEWEST = 20  # samples that tell how good the estimates are
 class Updater(ABC):
     """A way of learning online; keeps network and optimiser from update to update."""
 
-    body: CorrectedBody | None = None  # as it was fitted last; None where none is
-
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network; `seed` draws what is random."""
         self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
+
+    @property
+    def body(self) -> CalibratedBody | None:
+        """The body as it was fitted last; None where none is."""
+        return None
 
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
         begun, newest = time.perf_counter(), job.seen[-NEWEST:]
         mae = self._mae.without(job.isolated)
-        estimate = _estimate(mae, newest)
+        estimate = observed_theta(mae, newest)
         seen = np.isfinite(newest.theta)
         away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
@@ -97,11 +104,6 @@ class Updater(ABC):
             mae = replace(mae, covariance=covariance)
         self._mae = mae
         return mae
-
-
-def _estimate(mae: Mae, seen: Observations) -> Array:
-    """Return θ (N, D) as a network has it."""
-    return mae.estimate(seen.end_tension(mae.friction), seen.length).theta
 
 
 def make_updater(robot: Robot, mae: Mae, preset: Preset, seed: int = 0) -> Updater:
@@ -170,49 +172,40 @@ class PaperUpdater(Updater):
 
 REAL_SHARE = 0.1
 #: share of synthetic samples that many messages of the moving arm take the place of; half of that,
-#: when there are so many
-MOVING_SHARE, MANY = 0.3, 200
-PROBES = 200  # postures that the mean of a body's lengths is taken over
+#: when there are `MANY`
+MOVING_SHARE = 0.3
 #: how often a synthetic sample is used before it is forgotten
 USES = 3
 #: a real sample that fits the body worse than this weight is not shown to the network
 TRUSTED = 0.3
-#: so many newest samples in a row that contradict the body mean that a muscle has changed …
-IN_A_ROW = 4
-#: … by more than this [m] and this many σ, provided that there were so many samples before
-LEAST_CHANGE, OUTLIER, LEAST_BEFORE = 0.004, 6.0, 8
 
 
 class BodyUpdater(Updater):
-    """Learns by the corrected body."""
-
-    body: CorrectedBody
+    """Learns by the calibrated body."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Go on from a network, and from the body that it knows if it has learned one."""
         super().__init__(robot, mae, seed)
-        self.body = CorrectedBody(robot, seed=seed)
-        #: what the network knew of the body, in the place of the geometric model
-        self._prior_mean: list[Array] | None = None
-        if learned_steps(mae):
-            fit_to_network(self.body, mae, seed)
-            self._prior_mean = list(self.body.parameters)
-        self._prior_mean_confirmed = False
-        rng = np.random.default_rng([seed, 0x3E])
-        self._probe = robot.random_postures(PROBES, rng), _tensions(robot, PROBES, rng)
-        self._known = self._mean_length()  # of the body that the network knows [m], (M,)
-        self._trainer = Trainer(from_mae(mae), seed, learned_steps(mae))
+        steps = learned_steps(mae)
+        self.body_fit = BodyFit(robot, mae if steps else None, seed)
+        self._trainer = NetworkTrainer(from_mae(mae), seed, steps)
         self._rng = np.random.default_rng([seed, 0xD2])
         self._statistics_held = True
 
+    @property
+    def body(self) -> CalibratedBody:
+        """The body as it was fitted last."""
+        return self.body_fit.body
+
     def _learn(self, job: Job) -> Update:
         seen = job.seen
-        body = self.body = self._body_to_go_on_from(seen)
-        fit = fit_body(body, seen, self._prior_mean, _estimate(self._mae, seen))
+        if self.body_fit.is_of_another_arm(seen):
+            self.body_fit.start_anew()
+            self._trainer.restart()
+        fit = self.body_fit.fit(seen, observed_theta(self._mae, seen))
         learned, judging = map(self._at_angles, (job.healthy.learned, job.healthy.judging))
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
-        known, self._known = self._known, self._mean_length()
-        self._trainer.move(self._known - known)
+        self._trainer.move(self.body_fit.lengthened())
         contradicted = contradicted_muscles(seen, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
         # the robust weights leave such samples out until they are the rule.
@@ -221,7 +214,7 @@ class BodyUpdater(Updater):
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
-        data = synthetic_samples(body, fit.noise, count, self._rng)
+        data = synthetic_samples(self.body, fit.noise, count, self._rng)
         self._mix_in_real(data, replace(seen, theta=fit.theta), fit)
         if job.healthy.learned is not None:
             self._mix_in_moving(data, job.healthy.learned, fit.noise)
@@ -237,28 +230,6 @@ class BodyUpdater(Updater):
     def _at_angles(self, read: Observations | None) -> Observations | None:
         """Return messages with θ less what the joint sensors' zeros were found to be."""
         return read and replace(read, theta=read.theta - self.body.zero)
-
-    def _body_to_go_on_from(self, seen: Observations) -> CorrectedBody:
-        """Return the body so far, unless the network's turns out to be that of another arm.
-
-        That shows once there are a few samples, and is worse than no body at all.
-        """
-        seen = seen.seen_whole()
-        if self._prior_mean is None or self._prior_mean_confirmed or len(seen) < IN_A_ROW:
-            return self.body
-        self._prior_mean_confirmed = True
-        body = CorrectedBody(self._robot, self._prior_mean, smooth=self.body.smooth)
-        (length,) = body.lengths(seen.theta, seen.tension, seen.direction)
-        if np.median(np.abs(seen.length - length)[seen.known]) <= LEAST_CHANGE:
-            return self.body
-        self._prior_mean = None
-        self._trainer.restart()
-        return CorrectedBody(self._robot, smooth=self.body.smooth)
-
-    def _mean_length(self) -> Array:
-        """Return l [m] (M,) of the body, averaged over always the same postures and tensions."""
-        (length,) = self.body.lengths(*self._probe, np.zeros_like(self._probe[1]))
-        return length.mean(axis=0)
 
     def _mix_in_real(self, data: TrainingData, seen: Observations, fit: Fit) -> None:
         """Put real samples in the place of some."""
@@ -282,228 +253,3 @@ class BodyUpdater(Updater):
         data.seen[places] = state.scaled()
         length = real.length + self.body.crept(real.age)
         data.true[places] = state._replace(length=length).scaled()
-
-
-def contradicted_muscles(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return muscles whose newest samples contradict the body in one direction, and how many."""
-    muscles = []
-    for m, noise in enumerate(fit.noise):
-        residual = fit.residual[seen.known[:, m], m]
-        odd = np.abs(residual) > max(OUTLIER * noise, LEAST_CHANGE)
-        same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
-        fits = np.flatnonzero(~same)
-        run = len(same) - 1 - fits[-1] if len(fits) else 0
-        if run >= IN_A_ROW and len(same) - run >= LEAST_BEFORE:
-            muscles.append((m, int(run)))
-    return tuple(muscles)
-
-
-# -- synthetic samples ----------------------------------------------------------------------------
-
-#: share with most muscles near T_bias, as muscle stiffness control holds them
-HELD_SHARE = 0.5
-# The arm reaches its limits, and friction or a push carries it a little beyond.
-MARGIN = 0.02
-
-
-class TrainingData(NamedTuple):
-    """N samples in scaled units, shape (N, D+2M) each."""
-
-    seen: Array  # with scattered lengths
-    true: Array  # what the network is to restore
-
-
-UNSURE = 0.25  # share of the friction that the direction of sliding, as lengths tell it, misses
-
-
-def synthetic_samples(
-    body: CorrectedBody,
-    noise: Array,
-    count: int,
-    rng: np.random.Generator,
-) -> TrainingData:
-    """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
-
-        (θ, T, l) = (θ_r, T_r, l(θ_r, T_r; s = 0)),   seen as (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
-
-    T_r is at the elastic units. An estimator knows that but for the share u (UNSURE) of friction,
-    so that the network sees lengths with this and the sensors' scatter and is asked for those
-    without: ② then learns to weigh muscles by how far their lengths can be trusted, as weighted
-    least squares do.
-    """
-    robot = body.robot
-    shape = count, robot.muscle_count
-    theta = robot.random_postures(count, rng, MARGIN)
-    tension = _tensions(robot, count, rng)
-    # Mostly at either end of [−1, 1], where sliding leaves it.
-    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
-    length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
-    scattered = scattered + noise * rng.standard_normal(shape)
-    true, seen = State(theta, tension, length), State(theta, tension, scattered)
-    return TrainingData(seen.scaled(), true.scaled())
-
-
-#: bodies that the samples allow, many more than joints (of few, an ellipsoid holds what it was made
-#: of, and less of others), and samples of each
-BODIES, EACH = 100, 10
-INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
-
-
-def estimate_covariance(
-    mae: Mae,
-    body: CorrectedBody,
-    fit: Fit,
-    tension: Array,
-    seed: int,
-    judging: Observations | None,
-) -> Array:
-    """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
-
-    It is that of drawn errors, with postures anywhere and tensions [N] (N, M) of the samples. How
-    far drawn errors are too large or too small is told by messages that judge, if there are MANY:
-    by their own errors beside those drawn in their postures, most of which are near the samples.
-    """
-    rng = np.random.default_rng(seed)
-
-    def expected(theta: Array) -> Array:
-        # The same bodies and errors of lengths in all postures, or chance would tell them apart.
-        same = np.random.default_rng(seed)
-        return _spread(_drawn_errors(mae, body, fit, theta, tension, same))
-
-    covariance = expected(body.robot.random_postures(BODIES * EACH, rng))
-    if judging is None or len(judging) < MANY:
-        return covariance
-    here = expected(judging.theta[rng.integers(len(judging), size=BODIES * EACH)])
-    return covariance * _excess(here, _estimate(mae, judging) - judging.theta)
-
-
-def _drawn_errors(
-    mae: Mae,
-    body: CorrectedBody,
-    fit: Fit,
-    theta: Array,
-    tension: Array,
-    rng: np.random.Generator,
-) -> Array:
-    """Return θ_est − θ [rad] (BODIES · EACH, D) at as many postures.
-
-    What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
-    taken as linear in it), and what the network says of such bodies' lengths is compared with where
-    they are.
-    """
-    bodies = np.repeat(np.arange(BODIES), EACH)
-    tension = tension[rng.integers(len(tension), size=len(bodies))]
-    direction = UNSURE * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
-    poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
-    for muscles, root in fit.root:
-        steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
-        ends = np.cumsum([body.layouts[m].size for m in muscles])
-        for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
-            smooth = body.smooth[m].at(theta)
-            seen, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
-            length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
-    error: Array = mae.estimate(tension, length).theta - theta
-    return error
-
-
-def _spread(error: Array) -> Array:
-    """Return a covariance whose ellipsoid of 95 % holds as many errors, (N, D).
-
-    They have heavier tails than a normal distribution.
-    """
-    covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
-    covariance = 0.5 * (covariance + covariance.T)
-    return covariance * _excess(covariance, error)
-
-
-def _excess(covariance: Array, error: Array) -> float:
-    """Return by what to multiply a covariance for its ellipsoid to hold INSIDE of (N, D) errors."""
-    return float(np.quantile(ellipsoids(covariance, error), INSIDE))
-
-
-def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return by what to multiply a covariance for each of (N, D) errors to lie on its ellipsoid.
-
-    The ellipsoid is that of the share INSIDE of a normal distribution; (N,).
-    """
-    squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    # χ² of as many degrees as joints; scipy.stats has the same, and takes 0.7 s to import.
-    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], INSIDE))
-    return bounded
-
-
-def _tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
-    anywhere = rng.uniform(0.0, 1.0, shape) * highest
-    lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
-    held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
-    return np.where(rng.uniform(size=(count, 1)) < HELD_SHARE, held, anywhere)
-
-
-# -- the network ----------------------------------------------------------------------------------
-
-STEP_SIZE = 2e-3
-BATCH = 128
-#: averaged over this share of the steps so far, but at least and at most so many steps
-AVERAGED_SHARE, LEAST_AVERAGED, MOST_AVERAGED = 0.1, 20.0, 2000.0
-#: the step size falls to a half after so many steps, and at last to this share of itself, below
-#: which the average no longer wanders but a slowly changing body is still followed
-CALMING, LEAST_CALM = 2000.0, 0.1
-
-
-class Trainer:
-    """Trains the network a few steps at a time, for as long as the robot lives.
-
-    What is published is the average of the weights over about the last tenth of all steps, and the
-    step size falls as steps add up, so that the network follows a body that is still being found
-    out and becomes calm when it is known. (At a constant step size even the average wanders: ±10 %
-    of the error of an arm over hours.)
-    """
-
-    def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
-        """Go on from a network's weights, as calmly as after so many `steps`."""
-        self.network = network  # the average: what is published
-        self._restless = copy.deepcopy(network)
-        self._weights = [*zip(network.parameters(), self._restless.parameters())]
-        self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
-        self._rng = np.random.default_rng([seed, 0x7A])
-        self.steps = steps  # taken so far, in former lives too
-
-    def train(self, data: TrainingData, steps: int) -> float:
-        """Take steps on batches of the data; return the mean loss of the last half of them."""
-        seen, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
-        mask = torch.arange(3).repeat_interleave(BATCH)
-        losses = []
-        with one_thread():
-            for _ in range(steps):
-                rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
-                value = _loss(self._restless, seen[rows], true[rows], mask)
-                value.backward()
-                self._optimiser.step(max(LEAST_CALM, 1.0 / (1.0 + self.steps / CALMING)))
-                self.steps += 1
-                self._average()
-                losses.append(value.item())
-        return float(np.mean(losses[len(losses) // 2 :]))
-
-    def move(self, length: Array) -> None:
-        """Go on as the network of an arm whose lengths are all longer by so much [m], (M,)."""
-        for network in (self.network, self._restless):
-            network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
-
-    def restart(self) -> None:
-        """Take large steps again and average few: the body has changed."""
-        self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
-
-    def _average(self) -> None:
-        span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
-        with torch.no_grad():
-            for mean, now in self._weights:
-                mean.lerp_(now, 1.0 / span)
-
-
-def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
-    """Return the three norms, each in units of the spread of the data, all three masks entered."""
-    error = network.decoder(network.encode(seen.repeat(3, 1), mask))
-    error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
-    parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
-    return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

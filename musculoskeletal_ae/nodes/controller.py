@@ -34,7 +34,6 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
     read_pose,
@@ -121,8 +120,7 @@ class Controller(Shell):
         return value
 
     def _use_offsets(self, *_: object) -> None:
-        offsets = LengthOffsets(self.zeros.offset, self.zeros.deviation)
-        self.core.use_body(self.core.stream.body.with_offsets(offsets))
+        self.core.use_body(self.core.stream.body.with_offsets(self.zeros))
         self.gate.forget()
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:

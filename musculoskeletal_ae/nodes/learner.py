@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import Imu
-from std_msgs.msg import UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
-from musculoskeletal_ae.learning.training import TrainingProcess
+from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
@@ -27,7 +27,7 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
-from musculoskeletal_ae.validity import read_imu
+from musculoskeletal_ae.validity import read_imu, read_muscle_states
 
 POLL = 0.05  # [s] between looks at the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
@@ -49,7 +49,7 @@ class Learner(Shell):
             period=1.0 / self.rate,
             settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
             joint_source=value('joint_source'),
-            training=partial(TrainingProcess, device=value('device')),
+            trainer=partial(TrainerProcess, device=value('device')),
             directory=self._directory(value('state_directory')),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
@@ -68,12 +68,11 @@ class Learner(Shell):
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.listen(Imu, 'imu', self._take_imu, SENSOR)
-        self.follow_zeros(lambda known, _: core.zeros(known))
-        # length, tension, temperature
-        self.follow_muscle_states(lambda states: core.muscles(self.now(), *states[1::-1]))
+        self.follow_zeros(lambda *_: self._use_offsets())
+        self.follow_muscle_messages(self._take_muscle_states)
         self.follow_anomaly(core.anomaly)
-        self.told = False
-        self.gate = self.core.gate
+        self.has_heard_isolated = False
+        self.gate = self.core.keeper.validation
         self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
@@ -115,13 +114,21 @@ class Learner(Shell):
         prefix = self.parameter('frame_prefix')
         self.core.imu(self.now(), *read_imu(message, self.links, prefix))
 
+    def _take_muscle_states(self, message: Float64MultiArray) -> None:
+        states = read_muscle_states(message, self.robot.muscle_count, self.left_out)
+        self.core.muscles(states, self.now())
+
+    def _use_offsets(self) -> None:
+        body = self.core.body
+        self.core.use_body(body.with_offsets(self.zeros))
+
     def _isolate(self, muscles: tuple[int, ...]) -> None:
         # An estimator that has just started knows of none before it has our network.
         number = self._reception.numbers['isolated_muscles']
-        knows = number > 1 or (number == 0 and self.told)
+        knows = number > 1 or (number == 0 and self.has_heard_isolated)
         if muscles or knows or not self.core.isolated:
             self.core.isolate(muscles)
-        self.told = True
+        self.has_heard_isolated = True
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from musculoskeletal_ae.arrays import Ints
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
+from musculoskeletal_ae.friction import directions, end_tension
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -38,6 +38,7 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 UNSEEN = 5000  # states
 ENTERED = {
@@ -144,30 +145,49 @@ def learn(
     Like the estimator of a running arm, the health monitor decides when learning has to pause.
     `progress` is called with the recorded seconds that have passed since its last call.
     """
-    isolated = learner.isolated
-    health = HealthMonitor(learner.robot, learner.training.preset.name)
-    direction = FrictionDirection()
+    stream = MuscleStream(learner.robot, learner.body)
+    health = HealthMonitor(learner.robot, learner.trainer.preset.name)
     newest = None
     learner.reset()
     learner.anomaly(False)
     steps = np.diff(recording.time, prepend=recording.time[:1])
-    for dt, time_stamp, theta, length, tension, recorded in zip(steps, *recording, strict=True):
-        before, isolated = isolated, _isolated(recorded, isolated)
-        if isolated != before:
+    for dt, at, theta, length, tension, recorded in zip(steps, *recording, strict=True):
+        isolated = _isolated(recorded, learner.isolated)
+        if isolated != learner.isolated:
             learner.isolate(isolated)
+            stream.use_body(learner.body)
             health.reset()
             newest = None
         if learner.mae is not newest:
             newest = learner.mae
             mae = newest.without(isolated)
+            stream.use_friction(mae.friction)
             health.use(mae)
-        bone_tension = direction.end_tension(mae.friction, tension, length)
-        period = min(dt, LONGEST_PERIOD)
-        if health.step(observe(mae, length, tension, bone_tension, period)) is not None:
+        states = np.array([length, tension, np.full(len(length), np.nan)])
+        learner.joints(at, theta)
+        if _has_finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD)):
             learner.anomaly(True)
-        learner.step(time_stamp, theta, tension, length)
+        learner.muscles(states, at)
+        learner.poll(at)
         if progress is not None:
             progress(dt)
+
+
+def _has_finding(
+    health: HealthMonitor,
+    mae: Mae,
+    stream: MuscleStream,
+    states: Array,
+    time: float,
+    dt: float,
+) -> bool:
+    """Return whether a message shows a fault of the arm; an implausible message shows none."""
+    try:
+        sample = stream.take_states(states, time)
+    except RejectionError:
+        return False
+    observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)
+    return health.step(observation) is not None
 
 
 def error(mae: Mae, recording: Pairs) -> float:

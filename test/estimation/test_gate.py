@@ -16,7 +16,7 @@ from musculoskeletal_ae.estimation.gate import FLOOR, LIMITS, MOST_USED, NOTICED
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.training import Update
+from musculoskeletal_ae.learning.trainer import Trainer, Update
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
@@ -142,18 +142,27 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
         assert after[name].max() < 2.0 * before[name].max() + 1e-3
 
 
+class Answering(Trainer):
+    """A trainer whose updates the test chooses."""
+
+    answer = None
+
+    def poll(self):
+        mae, self.answer = self.answer, None
+        return None if mae is None else Update(mae, 0.0)
+
+
 def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(trained):
-    learner = Learner(ROBOT, trained['default'], preset='default')
+    learner = Learner(ROBOT, trained['default'], preset='default', trainer=Answering)
     good = learner.poll(0.0)
     with pytest.raises(GateError):
         learner.replace(ATTACKS['weights × 1.5'](trained['default']))
-    update = Update(ATTACKS['weights × 1.5'](trained['default']), 0.0)
-    learner._take(update)
+    learner.trainer.answer = ATTACKS['weights × 1.5'](trained['default'])
     assert learner.poll(10.0) is None
-    assert learner.refused == 1
+    assert learner.keeper.rejected == 1
     assert 'limit' in learner.report().values['last refused']
     assert learner.checkpoint == good
-    learner._take(Update(trained['paper'], 0.0))
+    learner.trainer.answer = trained['paper']
     assert learner.poll(20.0) is not None
     learner.anomaly(True)
     assert learner.poll(30.0) is not None

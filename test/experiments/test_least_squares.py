@@ -13,7 +13,7 @@ from musculoskeletal_ae.experiments.least_squares import (
     oracle_errors,
 )
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.robot import Robot
 
 COUNT = 50
@@ -30,7 +30,7 @@ def body(robot, name):
         individual = Individual(robot, 3)
         return oracle(robot, individual), individual.muscle_lengths
     if name == 'learned':
-        fitted = CorrectedBody(robot)
+        fitted = CalibratedBody(robot)
         for parameters in fitted.parameters:
             parameters += 1e-3 * np.random.default_rng(0).standard_normal(len(parameters))
         return learned(robot, fitted), lambda *at: fitted.lengths(*at, np.zeros_like(at[1]))[0]
@@ -51,7 +51,7 @@ def test_least_squares_is_exact_on_its_own_body(robot, name):
 
 def test_the_jacobian_of_the_learned_body_is_its_slope(robot):
     theta = robot.random_postures(5, np.random.default_rng(0))
-    geometric = learned(robot, CorrectedBody(robot)).muscle_jacobian(theta)
+    geometric = learned(robot, CalibratedBody(robot)).muscle_jacobian(theta)
     np.testing.assert_allclose(geometric, robot.routes.muscle_jacobian(theta), atol=1e-4)
 
 

@@ -6,10 +6,11 @@ import copy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.body import CorrectedBody, Prior
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.priors import PRIOR
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.training import Job
+from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -25,24 +26,24 @@ def initial(trained):
     return trained['default']
 
 
-def drawn_body(robot, features: int, seed: int, scale: float) -> CorrectedBody:
+def drawn_body(robot, features: int, seed: int, scale: float) -> CalibratedBody:
     """Return a body drawn from the prior, wrapping and all; it does not creep."""
-    body, rng = CorrectedBody(robot, seed=features), np.random.default_rng(seed)
+    body, rng = CalibratedBody(robot, seed=features), np.random.default_rng(seed)
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
-        body.parameters[m] = Prior().mean(layout) + scale * Prior().spread(layout) * draw
+        body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout) * draw
     return body
 
 
 @pytest.fixture(scope='session')
-def other_body(arm26) -> CorrectedBody:
+def other_body(arm26) -> CalibratedBody:
     return drawn_body(arm26, 7, 3, 0.7)
 
 
 class Stage:
     """Gives samples of a body at rest."""
 
-    def __init__(self, body: CorrectedBody, seed: int = 0) -> None:
+    def __init__(self, body: CalibratedBody, seed: int = 0) -> None:
         self.body, self.rng = body, np.random.default_rng(seed)
 
     def sample(self) -> Sample:

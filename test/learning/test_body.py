@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The corrected body and its fit."""
+"""The calibrated body and its fit."""
 
 from dataclasses import replace
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.learning.body import CorrectedBody, Smooth, fit_body, fit_to_network
+from musculoskeletal_ae.learning.body import CalibratedBody, ResidualModel
+from musculoskeletal_ae.learning.fit import fit_body, fit_to_network
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
@@ -20,7 +21,7 @@ def rms(body, theta, tension, length):
 def test_a_body_without_corrections_is_the_geometric_model(arm26):
     rng = np.random.default_rng(0)
     theta, tension = arm26.random_postures(50, rng), rng.uniform(0.0, 300.0, (50, 6))
-    (length,) = CorrectedBody(arm26).lengths(theta, tension, np.zeros((50, 6)))
+    (length,) = CalibratedBody(arm26).lengths(theta, tension, np.zeros((50, 6)))
     np.testing.assert_allclose(length, arm26.muscle_lengths(theta, tension), atol=1e-12)
 
 
@@ -42,7 +43,7 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
     rng = np.random.default_rng(m)
     theta, tension = arm26.random_postures(5, rng), rng.uniform(20.0, 200.0, 5)
     direction = rng.uniform(-1.0, 1.0, 5)
-    body = CorrectedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
+    body = CalibratedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
     poses, smooth = body.poses(theta), body.smooth[m].at(theta)
     _, jacobian = body.linearised(poses, smooth, tension, direction, m)
     step = 1e-6
@@ -61,7 +62,7 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
 def test_the_slope_of_the_residual_model_is_its_derivative(other_body, arm26, joint):
     theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
     for single in other_body.smooth:
-        smooth = Smooth(*(part.astype(float) for part in single))
+        smooth = ResidualModel(*(part.astype(float) for part in single))
         (slope,) = smooth.slope(theta, np.array([joint]))
         difference = smooth.at(theta + step) - smooth.at(theta - step)
         np.testing.assert_allclose(slope, difference / 2e-6, atol=1e-7)
@@ -71,18 +72,18 @@ def test_the_slope_of_the_residual_model_is_its_derivative(other_body, arm26, jo
 
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):
     states = stage.states(300)
-    nominal, body = CorrectedBody(arm26), CorrectedBody(arm26)
+    nominal, body = CalibratedBody(arm26), CalibratedBody(arm26)
     fit_body(body, stage.store(20).observations())
     assert rms(body, *states) < rms(nominal, *states) / 3.0
 
 
 def test_bad_samples_do_not_poison_the_fit(arm26, stage):
     store = stage.store(60)
-    clean = CorrectedBody(arm26)
+    clean = CalibratedBody(arm26)
     fit_body(clean, store.observations())
     for n in range(0, 60, 10):
         store.samples[n] = store.samples[n]._replace(length=store.samples[n].length + 0.05)
-    poisoned = CorrectedBody(arm26)
+    poisoned = CalibratedBody(arm26)
     fit = fit_body(poisoned, store.observations())
     states = stage.states(300)
     assert rms(poisoned, *states) < 1.5 * rms(clean, *states)
@@ -97,7 +98,7 @@ def test_tendons_that_creep_are_followed_without_limit(arm26, stage):
         store.add(sample._replace(length=sample.length + n * creep))
         still.add(sample)
     theta, tension, length = stage.states(300)
-    body, spared = CorrectedBody(arm26), CorrectedBody(arm26)
+    body, spared = CalibratedBody(arm26), CalibratedBody(arm26)
     fit_body(body, store.observations())
     fit_body(spared, replace(still.observations(), age=np.zeros(100)))
     rates = [p[at.creep] for p, at in zip(body.parameters, body.layouts, strict=True)]
@@ -110,7 +111,7 @@ def test_samples_without_known_muscles_change_nothing(arm26, stage):
     observations = stage.store(1).observations()
     nothing = observations[:]
     nothing.known[:] = False
-    body = CorrectedBody(arm26)
+    body = CalibratedBody(arm26)
     fit_body(body, nothing)
     states = stage.states(50)
     np.testing.assert_allclose(
@@ -124,14 +125,14 @@ def test_a_body_begins_with_the_tendon_friction_of_its_network(arm26, initial):
     friction = np.linspace(0.0, 0.4, 6)
     statistics = TouchStatistics(friction, np.ones(2))
     for touch, known in ((None, np.full(6, 0.05)), (statistics, friction)):
-        body = CorrectedBody(arm26)
+        body = CalibratedBody(arm26)
         fit_to_network(body, replace(initial, touch=touch))
         np.testing.assert_allclose(body.frictions(), known, atol=1e-3)
 
 
 def test_a_relearned_muscle_takes_a_new_offset_and_the_others_keep_theirs(arm26, stage):
     store = stage.store(60)
-    body = CorrectedBody(arm26)
+    body = CalibratedBody(arm26)
     fit_body(body, store.observations())
     states = stage.states(100)
     (known,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
@@ -149,12 +150,12 @@ def test_a_relearned_muscle_takes_a_new_offset_and_the_others_keep_theirs(arm26,
 
 def test_a_muscle_without_samples_gets_a_large_noise(arm26, stage):
     store = stage.store(30)
-    known = fit_body(CorrectedBody(arm26), store.observations()).noise
+    known = fit_body(CalibratedBody(arm26), store.observations()).noise
     store.forget(1)
-    forgotten = fit_body(CorrectedBody(arm26), store.observations()).noise
+    forgotten = fit_body(CalibratedBody(arm26), store.observations()).noise
     for _ in range(10):
         store.add(stage.sample())
-    again = fit_body(CorrectedBody(arm26), store.observations()).noise
+    again = fit_body(CalibratedBody(arm26), store.observations()).noise
     others = np.arange(arm26.muscle_count) != 1
     # Over drawn bodies it is 2 % at most: a group is fitted together.
     np.testing.assert_allclose(forgotten[others], known[others], rtol=0.06)

@@ -36,27 +36,30 @@ def test_readings_of_an_isolated_muscle_do_not_change_its_body(learned):
 def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     arm26, initial, stage, tmp_path
 ):
-    learner = Learner(arm26, initial, training=Prepared, directory=tmp_path)
+    learner = Learner(arm26, initial, trainer=Prepared, directory=tmp_path)
     for _ in range(3):
         learner.accept(stage.sample())
     learner.isolate((LOST,))
-    learner.accept(stage.sample())
+    body = learner.body
+    learner.accept(stage.sample()._replace(body_version=body.version, isolated=body.isolated))
     assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
-    assert learner.training.jobs == []
+    assert learner.trainer.jobs == []
     data = learner.poll(0.0)
     assert checkpoint.from_bytes(data, arm26).isolated == (LOST,)
-    assert learner.training.jobs[-1].isolated == (LOST,)
+    assert learner.trainer.jobs[-1].isolated == (LOST,)
     learner.close()
-    again = Learner(arm26, training=Prepared, directory=tmp_path)
+    again = Learner(arm26, trainer=Prepared, directory=tmp_path)
     assert again.isolated == again.mae.isolated == (LOST,)
     assert len(again.samples) == 4
+    assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
+    assert again.body.version > again.samples.body_version  # versions are used once
     again.isolate(())
     assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
     again.close()
 
 
 def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
-    learner = Learner(arm26, initial, training=Prepared)
+    learner = Learner(arm26, initial, trainer=Prepared)
     learner.anomaly(True)
     version = learner.mae.version
     learner.isolate((LOST,))

@@ -8,15 +8,16 @@ import pytest
 from robots import write_robot
 
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.rest import MARGIN
-from musculoskeletal_ae.learning.training import Training, Update
+from musculoskeletal_ae.learning.margin import MARGIN
+from musculoskeletal_ae.learning.trainer import Trainer, Update
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 DT = 0.01
 
 
-class Prepared(Training):
+class Prepared(Trainer):
     """Answers with the network that it began with, when the test lets it."""
 
     def __init__(self, *arguments) -> None:
@@ -49,7 +50,7 @@ class Prepared(Training):
 
 @pytest.fixture
 def learner(arm26, initial):
-    return Learner(arm26, initial, training=Prepared)
+    return Learner(arm26, initial, trainer=Prepared)
 
 
 def accept(learner, stage, count):
@@ -57,20 +58,36 @@ def accept(learner, stage, count):
         learner.accept(stage.sample())
 
 
+def between(start, end, count):
+    """Return samples on the way, without those at its ends, which rest."""
+    for share in np.linspace(0.0, 1.0, count + 2)[1:-1]:
+        yield end._replace(length=(1.0 - share) * start.length + share * end.length)
+
+
 class Arm:
     """Rests in one posture after another, on a clock of its own."""
 
+    MOVES = 10  # messages on the way from one to the next
+
     def __init__(self, learner, stage, time=0.0):
         self.learner, self.stage, self.time, self.published = learner, stage, time, []
+        self.last = None
 
     def rest(self, seconds, sample=None):
         sample = sample or self.stage.sample()
+        if self.last is not None:
+            for moving in between(self.last, sample, self.MOVES):
+                self.send(moving)
+        self.last = sample
         for _ in range(round(seconds / DT)):
-            self.time += DT
-            data = self.learner.step(self.time, sample.theta, sample.tension, sample.length)
-            if data is not None:
-                self.published.append(self.time)
+            self.send(sample)
         return sample
+
+    def send(self, sample):
+        self.time += DT
+        data = self.learner.step(self.time, sample.theta, sample.tension, sample.length)
+        if data is not None:
+            self.published.append(self.time)
 
 
 def test_the_same_stream_gives_the_same_network(arm26, initial, stage):
@@ -93,7 +110,7 @@ def test_a_rest_becomes_one_sample_and_the_same_posture_no_second_one(learner, s
     assert len(learner.samples) == 1
     arm.rest(5.0, posture)
     assert len(learner.samples) == 1
-    assert learner.rejected['like a stored one'] > 0
+    assert learner.collector.rejected['like a stored one'] > 0
     arm.rest(1.0 + MARGIN + 0.5)
     assert len(learner.samples) == 2
 
@@ -114,48 +131,48 @@ def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner
     learner.accept(stage.sample())
     for now in np.arange(0.0, 5.0, 0.25):
         learner.poll(now)
-    assert learner.training.jobs == []  # two samples at least
+    assert learner.trainer.jobs == []  # two samples at least
     times = []
     for now in np.arange(5.0, 10.0, 0.25):
         if now < 6.0:
             learner.accept(stage.sample())
-        before = len(learner.training.jobs)
+        before = len(learner.trainer.jobs)
         learner.poll(now)
-        times += [now] * (len(learner.training.jobs) - before)
+        times += [now] * (len(learner.trainer.jobs) - before)
     assert times == [5.0, 6.0]
-    assert [len(job.seen) for job in learner.training.jobs] == [2, 5]
+    assert [len(job.seen) for job in learner.trainer.jobs] == [2, 5]
 
 
 def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm26, initial, stage):
-    learner = Learner(arm26, initial, 'paper', training=Prepared)
+    learner = Learner(arm26, initial, 'paper', trainer=Prepared)
     for count in range(1, 23):
         learner.accept(stage.sample())
         for now in (3.0 * count, 3.0 * count + 1.5):
             learner.poll(now)
-    assert [len(job.seen) for job in learner.training.jobs] == [21, 22]
+    assert [len(job.seen) for job in learner.trainer.jobs] == [21, 22]
 
 
 def test_a_sample_received_during_an_update_is_learned_in_the_next(learner, stage):
     accept(learner, stage, 2)
-    learner.training.released = False
+    learner.trainer.released = False
     learner.poll(0.0)
     learner.accept(stage.sample())
     learner.poll(2.0)
-    assert len(learner.training.jobs) == 1
-    learner.training.released = True
+    assert len(learner.trainer.jobs) == 1
+    learner.trainer.released = True
     for now in (3.0, 4.0, 5.0, 6.0):
         learner.poll(now)
-    assert [len(job.seen) for job in learner.training.jobs] == [2, 3]
+    assert [len(job.seen) for job in learner.trainer.jobs] == [2, 3]
 
 
 def test_at_most_one_checkpoint_a_second_is_published_the_latest(learner, initial):
     assert learner.poll(100.0) is not None
-    learner._use(learner._numbered(initial))
-    learner._use(learner._numbered(initial))
+    learner.keeper.use(initial)
+    learner.keeper.use(initial)
     assert learner.poll(100.5) is None
     assert learner.poll(101.0) == learner.checkpoint
     assert learner.poll(102.0) is None
-    assert learner.published == 2
+    assert learner.keeper.publication.count == 2
 
 
 def test_a_clock_that_goes_back_stops_neither_updates_nor_checkpoints(learner, stage):
@@ -165,11 +182,11 @@ def test_a_clock_that_goes_back_stops_neither_updates_nor_checkpoints(learner, s
         learner.accept(stage.sample())
         learner.poll(arm.time)
     learner.accept(stage.sample())
-    jobs, published = len(learner.training.jobs), learner.published
+    jobs, published = len(learner.trainer.jobs), learner.keeper.publication.count
     arm.time = 0.0
     arm.rest(0.1)
-    assert len(learner.training.jobs) == jobs + 1
-    assert learner.published == published + 1
+    assert len(learner.trainer.jobs) == jobs + 1
+    assert learner.keeper.publication.count == published + 1
 
 
 def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
@@ -177,12 +194,12 @@ def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
     learner.anomaly(True)
     arm = Arm(learner, stage)
     arm.rest(10.0)
-    assert learner.training.jobs == []
+    assert learner.trainer.jobs == []
     assert len(learner.samples) == 2
     learner.anomaly(False)
     arm.rest(2.0 * MARGIN + 1.5)
     assert len(learner.samples) == 3
-    assert learner.training.jobs
+    assert learner.trainer.jobs
 
 
 def test_a_disabled_learner_learns_nothing(learner, stage):
@@ -190,11 +207,22 @@ def test_a_disabled_learner_learns_nothing(learner, stage):
     learner.enable(False)
     arm = Arm(learner, stage)
     arm.rest(10.0)
-    assert learner.training.jobs == []
+    assert learner.trainer.jobs == []
     assert len(learner.samples) == 2
     learner.enable(True)
     arm.rest(MARGIN + 1.5)
     assert len(learner.samples) == 3
+
+
+def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage):
+    learner.use_body(learner.body.with_offsets(LengthOffsets.unknown(6)))
+    arm = Arm(learner, stage)
+    arm.rest(2.0 * MARGIN)
+    assert len(learner.samples) == 0
+    assert 'length zeros' in learner.report().message
+    learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
+    arm.rest(2.0 * MARGIN)
+    assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
 
 
 def calibrated(learner):
@@ -203,21 +231,21 @@ def calibrated(learner):
 
 def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learner, stage):
     accept(learner, stage, 3)
-    learner.training.calibrated, learner.training.released = True, False
+    learner.trainer.calibrated, learner.trainer.released = True, False
     learner.poll(0.0)
     learner.relearn([2])
-    learner.training.released = True
+    learner.trainer.released = True
     learner.poll(0.5)
     assert not calibrated(learner)
     assert not any(known[2] for known in learner.samples.known)
     learner.poll(1.5)  # begun after the change: its statistics are of the arm as it is
-    assert not learner.training.jobs[-1].statistics_hold
+    assert not learner.trainer.jobs[-1].statistics_hold
     assert calibrated(learner)
 
 
 def test_a_changed_muscle_is_relearned_from_the_samples_since_its_change(learner, stage):
     accept(learner, stage, 6)
-    learner.training.calibrated, learner.training.changed = True, ((1, 4),)
+    learner.trainer.calibrated, learner.trainer.changed = True, ((1, 4),)
     learner.poll(0.0)
     assert [bool(known[1]) for known in learner.samples.known] == [False] * 2 + [True] * 4
     assert not calibrated(learner)
@@ -231,10 +259,10 @@ def test_distinct_rests_are_counted_since_the_arm_was_changed(learner, stage):
     for _ in range(2):
         learner.poll(arm.time)
         arm.rest(1.0, posture)
-    assert learner.training.jobs[-1].healthy.rests == len(learner.samples) >= 3
+    assert learner.trainer.jobs[-1].healthy.rests == len(learner.samples) >= 3
     learner.relearn([0])
     arm.rest(2.0 + MARGIN, posture)
-    assert learner.training.jobs[-1].healthy.rests <= 1
+    assert learner.trainer.jobs[-1].healthy.rests <= 1
 
 
 def test_a_roll_back_does_not_restore_the_calibration_of_the_arm_before(learner, initial, stage):
@@ -281,20 +309,23 @@ class Partly(Arm):
         theta = theta if self.read else None
         return super().rest(seconds, sample._replace(theta=theta))
 
+    def send(self, sample):
+        super().send(sample if self.read else sample._replace(theta=None))
+
 
 def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial, stage):
-    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
     arm = Partly(learner, stage)
     for _ in range(25):
         arm.rest(1.1)
     assert len(learner.samples) >= 20
     assert np.isnan(learner.samples.observations().theta).all()
-    assert len(learner.training.jobs[0].seen) == 20  # fewer say too little
+    assert len(learner.trainer.jobs[0].seen) == 20  # fewer say too little
 
 
 def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial, stage):
     for read, samples in (((), 0), ((1,), 3)):
-        learner = Learner(arm26, initial, training=Prepared)
+        learner = Learner(arm26, initial, trainer=Prepared)
         arm = Partly(learner, stage)
         arm.read = read
         for _ in range(6):
@@ -308,22 +339,16 @@ def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial
 UP = np.array([0.0, 0.0, 9.8])  # [m/s²] of an accelerometer that hangs as its link does
 
 
-def moving(start, end):
-    """Return samples on the way, without those at its ends, which rest."""
-    for share in np.linspace(0.1, 0.9, 40):
-        yield end._replace(length=(1.0 - share) * start.length + share * end.length)
-
-
 def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_received_in(
     arm26, initial, stage
 ):
-    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
     arm, last, rests = Partly(learner, stage), stage.sample(), []
     for heard in (['upper_arm'], ['upper_arm', 'forearm'], []):
         last, before = stage.sample(), last
         rests.append((last, heard))
-        for sample in moving(before, last):
-            arm.rest(DT, sample)
+        for sample in between(before, last, 40):
+            arm.send(sample)
         for _ in range(11):
             arm.rest(0.1, last)
             for link in heard:
@@ -340,11 +365,11 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
 
 
 def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26, initial, stage):
-    learner = Learner(arm26, initial, training=Prepared, joint_source='none')
+    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
     arm, start, end = Partly(learner, stage), stage.sample(), stage.sample()
     arm.rest(1.0, start)
-    for sample in moving(start, end):
-        arm.rest(DT, sample)
+    for sample in between(start, end, 40):
+        arm.send(sample)
         learner.imu(arm.time, 'forearm', UP)
     arm.rest(1.0 + MARGIN + 0.1, end)
     assert len(learner.samples) >= 2
@@ -358,17 +383,17 @@ def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26,
 def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stage, stop, goes_back):
     accept(learner, stage, 3)
     learner.poll(0.0)
-    learner.training.released = False
+    learner.trainer.released = False
     learner.accept(stage.sample())
     learner.poll(2.0)
     checkpoint, updates = learner.checkpoint, learner.updates
     stop(learner, True)
-    learner.training.released = True
+    learner.trainer.released = True
     published = learner.poll(4.0)
-    assert learner.training.ready and learner.updates == updates
+    assert learner.trainer.ready and learner.updates == updates
     if not goes_back:  # to the network before, as on an anomaly
         assert published is None and learner.checkpoint == checkpoint
     stop(learner, False)
-    jobs = len(learner.training.jobs)
+    jobs = len(learner.trainer.jobs)
     learner.poll(6.0)
-    assert len(learner.training.jobs) == jobs + 1  # it is learned then
+    assert len(learner.trainer.jobs) == jobs + 1  # it is learned then

@@ -10,10 +10,11 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.experiments.least_squares import learned
-from musculoskeletal_ae.learning.body import CorrectedBody, fit_body
-from musculoskeletal_ae.learning.postures import Bent, _GroupFit
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.covariance import ellipsoids, estimate_covariance
+from musculoskeletal_ae.learning.fit import fit_body
+from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.update import ellipsoids, estimate_covariance
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -64,7 +65,7 @@ def errors(arm26, observed, truth) -> tuple[float, float]:
     """Return how far postures are off before and after the fit [rad]."""
     rng = np.random.default_rng(1)
     guess = truth + rng.normal(0.0, 0.15, truth.shape)
-    found = fit_body(CorrectedBody(arm26), observed, guess=guess).theta
+    found = fit_body(CalibratedBody(arm26), observed, guess=guess).theta
     return tuple(float(np.linalg.norm(t - truth, axis=1).mean()) for t in (guess, found))
 
 
@@ -74,7 +75,7 @@ def test_postures_are_found_from_the_muscles_alone(arm26, observed):
 
 
 def test_a_fit_is_run_until_it_has_converged(arm26, observed):
-    body, rng = CorrectedBody(arm26), np.random.default_rng(1)
+    body, rng = CalibratedBody(arm26), np.random.default_rng(1)
     guess = observed.theta + rng.normal(0.0, 0.3, observed.theta.shape)
     first = fit_body(body, blind(observed), guess=guess).theta
     second = fit_body(body, blind(observed), guess=first).theta
@@ -91,7 +92,7 @@ def test_learning_without_joint_angles_improves_the_estimate(arm26, tmp_path, ot
     def estimate(body, at):
         return learned(robot, body).estimate(at.tension, at.length)
 
-    before, body = CorrectedBody(robot), CorrectedBody(robot)
+    before, body = CalibratedBody(robot), CalibratedBody(robot)
     fit_body(body, blind(observed), guess=estimate(before, observed))
     off = [np.linalg.norm(estimate(b, test) - test.theta, axis=1).mean() for b in (body, before)]
     assert off[0] < off[1]
@@ -118,14 +119,14 @@ def test_each_additional_sensor_improves_the_postures(arm26, observed):
 
 def test_a_joint_sensor_offset_is_not_taken_for_an_error_of_the_body(arm26, observed):
     off = replace(observed, theta=observed.theta + [0.03, 0.0])
-    found = fit_body(CorrectedBody(arm26), off).theta
+    found = fit_body(CalibratedBody(arm26), off).theta
     left = np.abs(found - observed.theta).mean(axis=0)
     assert left[0] < 0.03
     assert left[1] < 0.01
 
 
 def test_measured_joint_angles_stay_where_they_were_measured(arm26, observed):
-    found = fit_body(CorrectedBody(arm26), observed).theta
+    found = fit_body(CalibratedBody(arm26), observed).theta
     assert np.abs(found - observed.theta).max() < 0.03
 
 
@@ -133,26 +134,24 @@ def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(t
     robot, off = Robot.load(write_robot(tmp_path, slider=True)), []
     for seed in range(4):
         observed = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
-        off.append(fit_body(CorrectedBody(robot), observed).theta[:, -1] - observed.theta[:, -1])
+        off.append(fit_body(CalibratedBody(robot), observed).theta[:, -1] - observed.theta[:, -1])
     # 0.2 mm; 0.7 mm if zeros of sensors were thought to be off by 2° in metres.
     assert np.abs(off).mean() < 4e-4
 
 
 def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting, observed):
     part = observed[np.arange(8)]
-    body = CorrectedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
+    body = CalibratedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
     joints, muscles = np.arange(2), np.arange(6)
-    mean = [np.zeros(layout.size) for layout in body.layouts]
-    spread = [np.ones(layout.size) for layout in body.layouts]
-    fit = _GroupFit(body, part, joints, muscles, mean, spread, 3e-4, Bent.unknown(8, 2))
-    zero, step = np.zeros(2), 1e-6
-    rows = fit.rows(part.theta, zero)
+    model = PostureModel(body, part, joints, muscles, Bent.unknown(8, 2))
+    unknowns, step = Unknowns(part.theta, np.zeros(2), body.parameters), 1e-6
+    rows = model.residuals(unknowns)
     column = 0
     for m, layout in enumerate(body.layouts):
         for k in (0, layout.friction, layout.size - 1):
             at = body.parameters[m][k]
             body.parameters[m][k] = at + step
-            moved = fit.rows(part.theta, zero)
+            moved = model.residuals(unknowns)
             body.parameters[m][k] = at
             # Residuals are what was seen less the body's.
             slope = -(moved.length[:, m] - rows.length[:, m]) / step
@@ -168,7 +167,7 @@ def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_sample
     for seed in (0, 2, 4):  # bodies that are found worst
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
         observed, test = resting.observations(60), resting.observations(40)
-        body = CorrectedBody(arm26)
+        body = CalibratedBody(arm26)
         fit = fit_body(
             body, blind(observed), guess=learned(arm26, body).estimate(*observed.state()[1:])
         )

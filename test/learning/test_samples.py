@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.learning.calibration import Reservoir
-from musculoskeletal_ae.learning.rest import (
-    HOLE,
-    MARGIN,
-    RestCollector,
-    RestDetector,
-)
+from musculoskeletal_ae.learning.collector import SampleCollector
+from musculoskeletal_ae.learning.margin import MARGIN
+from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.limits import LIMITS
 
 DT = 0.01
 SLIDES = np.array([1.0, RACK])  # what counts as a radian where the second of two joints slides
@@ -170,14 +169,34 @@ def test_a_full_store_keeps_the_newest_and_its_coverage():
     assert store.accepted == 504
 
 
-@pytest.fixture
-def healthy():
-    return Reservoir(6)
+class Messages:
+    """Sends messages of an arm to a collector, on a clock of its own."""
+
+    def __init__(self, robot):
+        self.robot, self.time = robot, 0.0
+        self.collector = SampleCollector(robot, SampleStore(), Reservoir(6), DEFAULT)
+
+    def send(self, theta, pull, length, dt=DT):
+        """Return the new samples of one message."""
+        self.time += dt
+        self.collector.joints(self.time, theta)
+        states = np.array([length, pull, np.full(6, np.nan)])
+        paired = self.collector.muscles(self.time, states)
+        return [] if paired is None else self.collector.collect(paired)
+
+    def rest(self, theta, seconds, tension=60.0, dt=DT):
+        """Return the new samples of an arm that rests; `dt` [s] before its first message."""
+        pull = np.full(6, tension)
+        length = self.robot.muscle_lengths(theta, pull)
+        samples = self.send(theta, pull, length, dt)
+        for _ in range(round(seconds / DT)):
+            samples += self.send(theta, pull, length)
+        return samples
 
 
 @pytest.fixture
-def collector(arm26, healthy):
-    return RestCollector(arm26, DEFAULT, healthy)
+def messages(arm26):
+    return Messages(arm26)
 
 
 def middle(robot):
@@ -186,62 +205,74 @@ def middle(robot):
     return theta, tension, robot.muscle_lengths(theta, tension)
 
 
-def rests_at(collector, arm26, theta, seconds, tension=60.0):
-    pull = np.full(6, tension)
-    length = arm26.muscle_lengths(theta, pull)
-    rests = []
-    for _ in range(round(seconds / DT)):
-        rests += collector.step(pull, length, DT, theta)
-    return rests
-
-
-def test_a_rest_counts_after_the_margin(collector, arm26):
+def test_a_rest_counts_after_the_margin(messages, arm26):
     theta, _, _ = middle(arm26)
-    assert rests_at(collector, arm26, theta, MARGIN) == []
-    (rest, *_) = rests_at(collector, arm26, theta, 1.5)
-    np.testing.assert_allclose(rest.theta, theta)
+    assert messages.rest(theta, MARGIN) == []
+    (sample,) = messages.rest(theta, 1.5)
+    np.testing.assert_allclose(sample.theta, theta)
 
 
-def test_samples_shortly_before_an_anomaly_are_not_learned(collector, arm26, healthy):
+def test_samples_shortly_before_an_anomaly_are_not_learned(messages, arm26):
     theta, _, _ = middle(arm26)
-    rests_at(collector, arm26, theta, 2.0)
+    collector = messages.collector
+    messages.rest(theta, 2.0)
     collector.set_anomaly(True)
-    assert rests_at(collector, arm26, theta, 10.0) == []
+    assert messages.rest(theta, 10.0) == []
     assert collector.rejected['anomaly'] > 5
-    observed = healthy.time
+    observed = collector.healthy.time
     collector.set_anomaly(False)
-    assert rests_at(collector, arm26, theta, MARGIN) == []
-    assert len(rests_at(collector, arm26, theta, MARGIN + 1.5)) >= 1
-    assert healthy.time > observed
+    assert messages.rest(theta, MARGIN) == []
+    assert len(messages.rest(theta, MARGIN + 1.5)) == 1
+    assert collector.healthy.time > observed
 
 
-def test_implausible_readings_are_rejected_by_reason(collector, arm26):
-    assert rests_at(collector, arm26, arm26.upper + 1.0, 5.0) == []
-    assert rests_at(collector, arm26, arm26.upper, 5.0, tension=1000.0) == []
-    assert set(collector.rejected) == {
+def test_implausible_readings_are_rejected_by_reason(messages, arm26):
+    assert messages.rest(arm26.upper + 1.0, 5.0) == []
+    assert messages.rest(arm26.upper, 5.0, tension=1000.0) == []
+    assert set(messages.collector.rejected) == {
         'θ far outside the joint limits',
         'tension beyond the maximum',
     }
 
 
-def test_a_glitch_is_rejected_from_rests_and_healthy_messages(collector, arm26, healthy):
+def test_a_glitch_is_rejected_from_rests_and_healthy_messages(messages, arm26):
     theta, pull, length = middle(arm26)
-    rests = []
+    samples = []
     for n in range(800):
         glitch = n in (300, 500)
-        rests += collector.step(pull, length + (0.5 if glitch else 0.0), DT, theta)
-    assert collector.rejected['length beyond what the joints allow'] == 2
-    for rest in rests:
-        np.testing.assert_allclose(rest.length, length)
-    assert np.ptp(healthy.healthy().messages, axis=0).max() < 1e-6
+        samples += messages.send(theta, pull, length + (0.5 if glitch else 0.0))
+    assert messages.collector.rejected['length beyond what the joints allow'] == 2
+    (sample,) = samples
+    np.testing.assert_allclose(sample.length, length)
+    assert np.ptp(messages.collector.healthy.healthy().messages, axis=0).max() < 1e-6
 
 
-def test_the_direction_of_friction_is_unknown_after_a_gap_in_the_stream(collector, arm26):
+def test_the_direction_of_friction_is_unknown_after_a_gap_in_the_stream(messages, arm26):
     theta, pull, length = middle(arm26)
     for n in range(50):  # wound in, so that friction has a direction
-        collector.step(pull, length + 0.01 - 0.0002 * n, DT, theta)
-    rest, *_ = rests_at(collector, arm26, theta, 1.0 + MARGIN + 0.1)
-    assert (rest.direction > 0.5).all()
-    collector.step(pull, length, HOLE + 1.0, theta)
-    *_, rest = rests_at(collector, arm26, theta, 2.0 + MARGIN)
-    assert (rest.direction == 0.0).all()
+        messages.send(theta, pull, length + 0.01 - 0.0002 * n)
+    (sample,) = messages.rest(theta, 1.0 + MARGIN + 0.1)
+    assert (sample.direction > 0.5).all()
+    (sample,) = messages.rest(theta, 2.0 + MARGIN, tension=80.0, dt=LIMITS.pause + 1.0)
+    assert (sample.direction == 0.0).all()
+
+
+def test_a_sample_carries_the_body_state_it_was_taken_under(messages, arm26):
+    theta, _, _ = middle(arm26)
+    collector = messages.collector
+    (healthy,) = messages.rest(theta, 2.0 + MARGIN)
+    assert (healthy.body_version, healthy.isolated) == (0, ())
+    body = collector.body.with_isolated([2])
+    collector.use_body(body)
+    (isolated,) = messages.rest(theta, 2.0 + MARGIN, tension=80.0)
+    assert (isolated.body_version, isolated.isolated) == (body.version, (2,))
+    assert isolated.length[2] == isolated.tension[2] == 0.0
+    offsets = LengthOffsets(np.full(6, 0.003), np.zeros(6))
+    body = body.with_isolated([]).with_offsets(offsets)
+    collector.use_body(body)
+    (moved,) = messages.rest(theta, 2.0 + MARGIN, tension=100.0)
+    assert (moved.body_version, moved.isolated) == (body.version, ())
+    pull = np.full(6, 100.0)
+    np.testing.assert_allclose(moved.length, arm26.muscle_lengths(theta, pull) - 0.003)
+    assert [sample.body_version for sample in collector.samples.samples] == [0, 1, body.version]
+    assert collector.samples.body_version == body.version

@@ -87,7 +87,10 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     gravity[3:6] = 0.0, 0.6, -0.8
     plain = Sample(np.array([0.1, np.nan]), np.full(6, 50.0), np.zeros(6), np.ones(6))
     store = SampleStore()
-    for sample in (plain, plain._replace(spread=np.full(2, 0.02), gravity=gravity)):
+    for sample in (
+        plain,
+        plain._replace(spread=np.full(2, 0.02), gravity=gravity, body_version=3, isolated=(1, 4)),
+    ):
         store.add(sample)
     store.forget(1, newest=1)
     with closing(StateStore(tmp_path, arm26)) as state:
@@ -196,7 +199,7 @@ def test_where_no_state_can_be_used_learning_starts_anew_and_says_so(
     written(tmp_path, arm26, stage, 3)
     for name in (NEWEST, PREVIOUS):
         damage(tmp_path / name)
-    with closing(Learner(arm26, initial, training=Prepared, directory=tmp_path)) as learner:
+    with closing(Learner(arm26, initial, trainer=Prepared, directory=tmp_path)) as learner:
         message = learner.report().values['saved state not used']
         assert 'starts anew' in message
         assert 'backup-1.state' in message and 'backup-2.state' in message
@@ -235,15 +238,17 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     network = initial_mae(small, 'default', steps=2).mae
     store = SampleStore()
     for _ in range(4):
-        theta, *parts, spread, gravity = stage.sample()
-        store.add(Sample(theta, *(part[kept] for part in parts), spread, gravity))
+        theta, *parts, spread, gravity, _, _ = stage.sample()
+        measured = theta, *(part[kept] for part in parts), spread, gravity
+        store.add(Sample(*measured, isolated=(added,)))  # the muscle after the added one
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
-    with closing(Learner(arm26, initial, directory=tmp_path, training=Prepared)) as learner:
+    with closing(Learner(arm26, initial, directory=tmp_path, trainer=Prepared)) as learner:
         found = learner.samples
         assert found.numbers == store.numbers
         for one, other in zip(found.samples, store.samples, strict=True):
+            assert one.isolated == (added + 1,) and other.isolated == (added,)
             np.testing.assert_array_equal(one.theta, other.theta)
             np.testing.assert_array_equal(one.length[kept], other.length)
             np.testing.assert_array_equal(one.direction[kept], other.direction)
@@ -285,7 +290,7 @@ def begun(arm26, initial, tmp_path):
     def begin():
         for learner in learners:
             learner.close()
-        learners.append(Learner(arm26, initial, training=Prepared, directory=tmp_path / 'state'))
+        learners.append(Learner(arm26, initial, trainer=Prepared, directory=tmp_path / 'state'))
         return learners[-1]
 
     yield begin
@@ -391,7 +396,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
         patch.setattr(Gate, 'check', refuse)
         messages = []
         for _ in range(2):  # no network replaces it
-            with closing(Learner(arm26, training=Prepared, directory=tmp_path / 'state')) as again:
+            with closing(Learner(arm26, trainer=Prepared, directory=tmp_path / 'state')) as again:
                 assert_same(again.samples, before.samples)
                 messages.append(again.report().values.get('saved state not used', ''))
     assert 'does not explain the arm' in messages[0] and BACKUP in messages[0]

@@ -7,15 +7,14 @@ import torch
 from scipy.stats import chi2
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.body import CorrectedBody
-from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
+from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import (
-    UNSURE,
     BodyUpdater,
     PaperUpdater,
-    Trainer,
     learned_steps,
-    synthetic_samples,
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.network import from_mae
@@ -36,7 +35,7 @@ def test_twenty_samples_halve_the_error(learned, initial):
 
 
 def test_constant_length_differences_are_learned_in_one_step(arm26, initial):
-    longer = CorrectedBody(arm26)
+    longer = CalibratedBody(arm26)
     for parameters, layout in zip(longer.parameters, longer.layouts, strict=True):
         parameters[layout.offset] = 0.008
     stage = Stage(longer)
@@ -58,7 +57,7 @@ def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
 
 
 class Giving(Stage):
-    """An arm whose points give way, which no corrected body can describe."""
+    """An arm whose points give way, which no calibrated body can describe."""
 
     def sample(self):
         sample = super().sample()
@@ -134,7 +133,7 @@ def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial
 def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body):
     data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
     with torch.device('meta'):  # computes nothing, so that a loss has no value in the end
-        trainer = Trainer(from_mae(initial))
+        trainer = NetworkTrainer(from_mae(initial))
         with pytest.raises(RuntimeError, match='item'):
             trainer.train(data, 1)
     assert trainer.steps == 1
@@ -178,7 +177,7 @@ def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26,
 
 def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
     with pytest.raises(MusculoskeletalError, match='default, paper'):
-        Training(arm26, 'best')
+        Trainer(arm26, 'best')
 
 
 def test_an_update_on_few_samples_keeps_most_of_a_learned_network(learned, arm26, initial):

@@ -16,9 +16,9 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.learning.rest import MARGIN
+from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.state import NEWEST
-from musculoskeletal_ae.learning.training import Training
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
@@ -28,7 +28,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
 # Faster than on a robot, so that a test takes seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}
-REST = 0.8  # [s] in one posture
+REST, MOVE = 0.8, 0.1  # [s] in one posture, and from one to the next
 DT = 0.01
 
 
@@ -41,17 +41,28 @@ class Arm:
         self.joints = graph.publisher(JointState, 'joint_states')
         self.muscles = graph.publisher(Float64MultiArray, 'muscle_states')
         self.time = self.until = 0.0
+        self.theta, self.tension = self.draw()
+
+    def draw(self):
+        """Return a posture and tensions at random."""
+        tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
+        return self.robot.random_postures(1, self.rng)[0], tension
 
     def publish(self):
-        """Publish one message of each kind, of a new posture now and then."""
+        """Publish one message of each kind; the arm goes to a new posture now and then."""
         self.time += DT
         if self.time > self.until:
-            self.theta = self.robot.random_postures(1, self.rng)[0]
-            self.tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
-            self.until = self.time + REST
-        length = self.robot.muscle_lengths(self.theta, self.tension) + 0.005
-        rows = np.stack([length, self.tension, np.full(self.robot.muscle_count, 25.0)])
-        self.joints.publish(JointState(name=self.robot.joints, position=self.theta.tolist()))
+            self.before, self.begun = (self.theta, self.tension), self.time
+            self.theta, self.tension = self.draw()
+            self.until = self.time + MOVE + REST
+        share = min(1.0, (self.time - self.begun) / MOVE)
+        theta, tension = (
+            (1.0 - share) * old + share * new
+            for old, new in zip(self.before, (self.theta, self.tension), strict=True)
+        )
+        length = self.robot.muscle_lengths(theta, tension) + 0.005
+        rows = np.stack([length, tension, np.full(self.robot.muscle_count, 25.0)])
+        self.joints.publish(JointState(name=self.robot.joints, position=theta.tolist()))
         self.muscles.publish(array_message(rows, 'quantity', 'muscle'))
 
     def step(self):
@@ -110,7 +121,7 @@ class HostedLearner:
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}'
             self.step()
-            if not self.node.core.training.ready:  # what trains may have the processor
+            if not self.node.core.trainer.ready:  # what trains may have the processor
                 time.sleep(DT)
 
 
@@ -125,8 +136,8 @@ def host(graph, arm26, trained_file, monkeypatch):
 
     def make(process=False, **parameters):
         if not process:
-            here = 'musculoskeletal_ae.nodes.learner.TrainingProcess'
-            monkeypatch.setattr(here, lambda *given, device: Training(*given))  # noqa: ARG005
+            here = 'musculoskeletal_ae.nodes.learner.TrainerProcess'
+            monkeypatch.setattr(here, lambda *given, device: Trainer(*given))  # noqa: ARG005
         given = {'checkpoint': trained_file, 'state_directory': '', **parameters}
         return HostedLearner(graph, arm26, **given)
 
@@ -164,7 +175,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     learner.learn(lambda: learner.updates >= 1, 'an update')
     detected.publish(Bool(data=True))
     learner.learn(lambda: 'anomaly' in learner.report().message, 'the gate')
-    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
     samples, updates = learner.samples, learner.updates
     learner.run(2.0 * MARGIN + 2.0)
     assert (learner.samples, learner.updates) == (samples, updates)
@@ -179,7 +190,7 @@ def test_learner_enable_stops_and_resumes_learning(host, graph):
     learner.learn(lambda: learner.updates >= 1, 'an update')
     assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
     assert 'enable' in learner.report().message
-    learner.learn(lambda: learner.node.core.training.ready, 'the end of the last update')
+    learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
     samples, updates = learner.samples, learner.updates
     learner.run(2.0 * MARGIN + 2.0)
     assert (learner.samples, learner.updates) == (samples, updates)
@@ -283,7 +294,7 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
         return learner.node.core.mae.isolated
 
     isolated.publish(String(data=''))  # of an estimator that has just started
-    graph.wait(lambda: learner.node.told, 'what it says')
+    graph.wait(lambda: learner.node.has_heard_isolated, 'what it says')
     assert known() == (4,)
     for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
         isolated.publish(String(data=text))

@@ -10,7 +10,7 @@ from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.learning.body import CorrectedBody
+from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segments
@@ -142,7 +142,7 @@ def test_the_emulator_without_differences_is_the_geometric_model(robot):
 def test_an_uncorrected_body_wraps_too(robot):
     theta = robot.random_postures(9, np.random.default_rng(2))
     tension = np.full((9, robot.muscle_count), 40.0)
-    (length,) = CorrectedBody(robot).lengths(theta, tension, np.zeros_like(tension))
+    (length,) = CalibratedBody(robot).lengths(theta, tension, np.zeros_like(tension))
     np.testing.assert_allclose(length, robot.muscle_lengths(theta, tension), atol=1e-9)
 
 

@@ -36,7 +36,7 @@ from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from musculoskeletal_ae.learning.body import CorrectedBody
+    from musculoskeletal_ae.learning.body import CalibratedBody
     from musculoskeletal_ae.learning.update import Updater
 
 
@@ -64,7 +64,7 @@ class Update(NamedTuple):
     device: str = 'cpu'  # where it was trained
 
 
-class Training:
+class Trainer:
     """Makes an update at once, where it is submitted; one job at a time."""
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
@@ -87,8 +87,8 @@ class Training:
         return self._updater is not None and self._update is None
 
     @property
-    def body(self) -> CorrectedBody | None:
-        """The corrected body as it was fitted last; None where none is, or it is elsewhere."""
+    def body(self) -> CalibratedBody | None:
+        """The calibrated body as it was fitted last; None where none is, or it is elsewhere."""
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
@@ -121,7 +121,7 @@ PATIENCE_AT_FIRST, PATIENCE, PATIENCE_PER_STEP = 300.0, 60.0, 0.1
 ENDING = 2.0  # [s] that the operating system has to end a process
 
 
-class TrainingProcess(Training):
+class TrainerProcess(Trainer):
     """Makes updates in another process, and in the next one if that dies or hangs.
 
     No call waits for the process: a thread does. A job that was lost with one is given to the next.
@@ -279,12 +279,12 @@ def serve(connection: Connection, directory: Path, preset: str, seed: int, devic
     except MusculoskeletalError as error:
         print(f'{error}; learning on the CPU', file=sys.stderr, flush=True)
     robot = Robot.load(directory)
-    training = Training(robot, preset, seed)
+    trainer = Trainer(robot, preset, seed)
     try:
-        training.begin(checkpoint.from_bytes(connection.recv(), robot))
+        trainer.begin(checkpoint.from_bytes(connection.recv(), robot))
         while True:
-            training.submit(connection.recv())
-            update = training.poll()
+            trainer.submit(connection.recv())
+            update = trainer.poll()
             assert update is not None
             # A checkpoint, so that it is checked where it arrives.
             connection.send((checkpoint.to_bytes(update.mae), *update[1:]))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from musculoskeletal_ae.learning import training
-from musculoskeletal_ae.learning.training import Training, TrainingProcess
+from musculoskeletal_ae.learning import trainer as trainers
+from musculoskeletal_ae.learning.trainer import Trainer, TrainerProcess
 
 from .conftest import job
 
@@ -19,8 +19,8 @@ PATIENCE = 300.0  # [s] until a test is given up: a machine at work starts a pro
 
 @pytest.fixture
 def process(arm26, monkeypatch):
-    monkeypatch.setattr(training, 'FIRST_PAUSE', 0.0)
-    process = TrainingProcess(arm26, 'default')
+    monkeypatch.setattr(trainers, 'FIRST_PAUSE', 0.0)
+    process = TrainerProcess(arm26, 'default')
     yield process
     process.close()
 
@@ -49,7 +49,7 @@ def test_the_training_process_learns_the_same_network_as_training_in_this_proces
     process, arm26, initial, stage
 ):
     work = job(stage.store(3), steps=3)
-    here = Training(arm26, 'default')
+    here = Trainer(arm26, 'default')
     for place in (here, process):
         place.begin(initial)
         assert place.ready
@@ -62,7 +62,7 @@ def test_the_training_process_learns_the_same_network_as_training_in_this_proces
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='it learns there')
 def test_without_a_gpu_training_falls_back_to_the_cpu_with_a_warning(arm26, initial, stage, capfd):
-    process = TrainingProcess(arm26, 'default', device='cuda')
+    process = TrainerProcess(arm26, 'default', device='cuda')
     process.begin(initial)
     process.submit(job(stage.store(3), steps=1))
     assert answer(process).device == 'cpu'
@@ -79,7 +79,7 @@ def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
     first = process.pid
     os.kill(first, signal.SIGSTOP)
     with monkeypatch.context() as patch:
-        patch.setattr(training, 'PATIENCE', 0.3)
+        patch.setattr(trainers, 'PATIENCE', 0.3)
         process._patience = 0.3
         # More than a pipe holds, so that sending it hangs, too.
         process.submit(job(stage.store(300), steps=1))
@@ -108,7 +108,7 @@ def test_a_training_process_that_cannot_be_started_is_started_later(
         raise OSError('Cannot allocate memory')
 
     with monkeypatch.context() as patch:
-        patch.setattr(training.SpawnProcess, 'start', full)
+        patch.setattr(trainers.SpawnProcess, 'start', full)
         process.begin(initial)
     assert 'Cannot allocate memory' in process.trouble
     assert not process.ready

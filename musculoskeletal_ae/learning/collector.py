@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From raw messages to samples: which rests of the arm are new and may be learned from.
+
+    l, T ─► plausible (`signals.muscle_stream`) ─┐
+    θ, gravity ──────────────────────────────────┴► paired by time (`pairing`)
+         ─► θ plausible ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
+
+Values of isolated muscles become 0 before anything else is done with them. A sample carries the
+version of the body state and the isolated muscles under which it was taken.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.margin import AnomalyMargin
+from musculoskeletal_ae.learning.rest import RestDetector
+from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
+from musculoskeletal_ae.learning.settings import Settings
+from musculoskeletal_ae.pairing import Paired, Pairing
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.limits import LIMITS, check_posture
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+
+#: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
+SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
+SPREAD = 0.02  # standard deviation of θ by a camera [rad]; of a prismatic joint times RACK [m]
+
+
+class SampleCollector:
+    """Collects samples of one arm from its messages.
+
+    Attributes:
+        samples: The samples so far.
+        healthy: Messages of the healthy arm, moving or resting.
+        rejected: How many messages and rests were not used, by reason.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        samples: SampleStore,
+        healthy: Reservoir,
+        settings: Settings,
+        period: float = 0.01,
+        joint_source: str = SENSOR,
+    ) -> None:
+        """Start with nothing.
+
+        Args:
+            robot: The nominal body.
+            samples: Where new samples are stored.
+            healthy: Takes the messages of the healthy arm.
+            settings: What counts as rest.
+            period: Of the messages of the muscle modules [s].
+            joint_source: What θ comes from: `SENSOR`, `MARKER` or `NONE`.
+        """
+        radian = robot.kinematics.radian
+        self.samples, self.healthy = samples, healthy
+        self.rejected: Counter[str] = Counter()
+        self._robot = robot
+        self._stream = MuscleStream(robot)
+        self._pairing = Pairing[MuscleSample](period)
+        self._detector = RestDetector(settings, joint_source != SENSOR, radian)
+        self._margin = AnomalyMargin()
+        self._spread = SPREAD * radian if joint_source == MARKER else NOTHING
+        # θ and the directions of gravity (see `Sample`) are paired as one array.
+        self._unmeasured = np.full(robot.joint_count + 3 * len(robot.kinematics.parent), np.nan)
+        self._longest_pause = max(LIMITS.pause, settings.rest_time)
+        self._skipped = 0.0  # time of the messages that were not used since the last [s]
+
+    @property
+    def body(self) -> BodyState:
+        """The body state under which samples are taken."""
+        return self._stream.body
+
+    @property
+    def is_anomaly(self) -> bool:
+        """Whether an anomaly is present."""
+        return self._margin.is_anomaly
+
+    # -- what comes -----------------------------------------------------------------------------
+
+    def joints(self, time: float, theta: Array) -> None:
+        """Take θ [rad] (D,) that came at `time` [s]; NaN of joints that were not measured."""
+        self._measure(time, 0, theta)
+
+    def imu(self, time: float, link: str, acceleration: Array) -> None:
+        """Take what an accelerometer read in the axes of a link [m/s²], (3,).
+
+        At rest it reads what holds it against gravity, which shows where down is. What it reads in
+        motion is not used.
+        """
+        joint, placement = self._robot.kinematics.placement(link)
+        down = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
+        self._measure(time, self._robot.joint_count + 3 * joint, down)
+
+    def _measure(self, time: float, first: int, values: Array) -> None:
+        measured = self._unmeasured.copy()
+        measured[first : first + len(values)] = values
+        self._pairing.joints(time, measured)
+
+    def muscles(self, time: float, states: Array) -> Paired[MuscleSample] | None:
+        """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s].
+
+        Returns the message before, with the θ that belongs to it, or None. A message that is not
+        plausible is counted in `rejected`.
+        """
+        try:
+            sample = self._stream.take_states(states, time)
+        except RejectionError as error:
+            self.rejected[error.reason] += 1
+            return None
+        if self.body.isolated:
+            used = sample.usable
+            sample = replace(
+                sample,
+                length=np.where(used, sample.length, 0.0),
+                motor_tension=np.where(used, sample.motor_tension, 0.0),
+                sliding=np.where(used, sample.sliding, 0.0),
+            )
+        return self._pairing.muscles(time, sample)
+
+    def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
+        """Take a message that may be learned from; return the samples that are new with it."""
+        dt = min(paired.dt + self._skipped, self._longest_pause)
+        measured = self._unmeasured if paired.theta is None else paired.theta
+        theta, gravity = np.split(measured, [self._robot.joint_count])
+        try:
+            check_posture(self._robot, theta, LIMITS.joint_outside)
+        except MessageError as error:
+            self.rejected[error.reason] += 1
+            self._skipped = dt
+            return []
+        self._skipped = 0.0
+        message = paired.message
+        reading = Sample(
+            theta,
+            message.motor_tension,
+            message.length,
+            message.sliding,
+            self._spread,
+            gravity,
+            self.body.version,
+            self.body.isolated,
+        )
+        self._margin.pass_time(dt)
+        rest = self._detector.step(reading, dt)
+        if rest is not None and np.isnan(rest.gravity).all():
+            rest = rest._replace(gravity=NOTHING)
+        if self._margin.is_closed:
+            if rest is not None:
+                self.rejected['anomaly'] += 1
+            return []
+        new = []
+        for waited in self._margin.hold(dt, reading, rest):
+            self.healthy.step(waited.reading, waited.dt)
+            if waited.rest is not None and self._is_new(waited.rest):
+                self.accept(waited.rest)
+                new.append(waited.rest)
+        return new
+
+    def _is_new(self, rest: Sample) -> bool:
+        self.healthy.rest(rest)
+        if self.samples.is_new(rest):
+            return True
+        self.rejected['like a stored one'] += 1
+        return False
+
+    def accept(self, sample: Sample) -> None:
+        """Store a sample; it describes the muscles that are not isolated."""
+        self.samples.add(sample, self.body.used.copy())
+
+    # -- what changes ---------------------------------------------------------------------------
+
+    def use_body(self, body: BodyState) -> None:
+        """Take samples under another body state from now on; forget what is no sample yet."""
+        self._stream.use_body(body)
+        self.healthy.use_isolated(body.isolated)
+        self.reset()
+
+    def set_anomaly(self, is_anomaly: bool) -> None:
+        """Collect nothing from just before an anomaly until some time after its reset."""
+        if lost := self._margin.set_anomaly(is_anomaly):
+            self.rejected['anomaly'] += lost
+
+    def reset(self) -> None:
+        """Forget what is no sample yet, as after a backward jump of the clock."""
+        self._stream.reset()
+        self._pairing.reset()
+        self._detector.reset()
+        self._margin.reset()
+        self._skipped = 0.0

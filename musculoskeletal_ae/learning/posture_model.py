@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibrated body says that resting samples should have measured: residuals, derivatives.
+
+    length    l_nm − l_m(θ_n, T_n; w)
+    torque    τ_nj = −(g(θ_n) + Gᵀ T_end)_j, which is 0 at rest
+    angle     y_nj − θ_nj − z_j
+    gravity   u_ni − R_iᵀ(θ_n) ĝ
+
+w are the parameters of the body, θ_n the postures of the samples, z the offsets of the joint
+sensors; see `postures`.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.friction import end_tension
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.robot.stiffness import muscle_hessian
+
+DIFFERENCE = 1e-6  # [rad] or [m]
+#: turn of a joint over which Σ T ∂²l/∂θ² of the geometric model is as it was [rad], for prismatic
+#: joints times RACK [m]
+BENT = 0.05
+SMALL = 1e-6
+
+
+class Unknowns(NamedTuple):
+    """A value of all that is to be found for one group of D joints and M muscles."""
+
+    theta: Array  # θ of all joints of the body [rad], (N, all joints)
+    zero: Array  # z [rad], (D,)
+    parameters: list[Array]  # w of each muscle
+
+
+class Residuals(NamedTuple):
+    """Residuals and derivatives at one point."""
+
+    length: Array  # (N, M)
+    muscle_jacobian: Array  # G, (N, M, D)
+    by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
+    torque: Array  # (N, D)
+    torque_by_body: Array  # ∂τ/∂w, (N, D, W)
+    load: Array  # what muscles exert at each joint, in either direction [N·m], (D,)
+    angle: Array  # (N, D); 0 where nothing is known
+    gravity: Array  # (N, 3J)
+    gravity_by_posture: Array  # (N, 3J, D)
+
+
+class Bent(NamedTuple):
+    """Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
+
+    theta: Array  # where it was taken last [rad], (N, D)
+    stiffness: Array  # [N·m/rad], (N, D, D)
+
+    @classmethod
+    def unknown(cls, count: int, joint_count: int) -> Bent:
+        """Return that of postures it has never been taken of."""
+        nowhere = np.full((count, joint_count), np.nan)
+        return cls(nowhere, np.zeros((count, joint_count, joint_count)))
+
+
+class PostureModel:
+    """What the calibrated body says that N samples of one group should have measured."""
+
+    def __init__(
+        self, body: CalibratedBody, seen: Observations, joints: Ints, muscles: Ints, bent: Bent
+    ) -> None:
+        """Take the whole body, all samples, and the joints and muscles of the group.
+
+        `bent` is that of the whole body; it is brought up to date in place.
+        """
+        self.body, self.seen = body.limb(joints, muscles), seen.limb(joints, muscles)
+        self.joints = joints
+        self._kinematics = body.robot.kinematics  # of the whole body
+        ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
+        #: where the parameters of each muscle are in w
+        self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
+        self._crossed = self.body.robot.routes.crossed
+        of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
+        #: the parameters of the muscles that cross each joint
+        self.acting = [np.flatnonzero(own) for own in of_muscle]
+        self.is_read = np.isfinite(self.seen.theta)
+        self.by_sensor = self.is_read & (self.seen.spread == 0.0)  # of a joint sensor
+        self.is_tilt_known = np.isfinite(self.seen.gravity)
+        self._tilt = np.where(self.is_tilt_known, self.seen.gravity, 0.0)
+        self._bent = bent
+
+    @property
+    def parameter_count(self) -> int:
+        """The size of w."""
+        return self.columns[-1].stop
+
+    def residuals(self, at: Unknowns) -> Residuals:
+        """Return residuals and derivatives at a point."""
+        body, seen, columns = self.body.with_parameters(at.parameters), self.seen, self.columns
+        own = at.theta[:, self.joints]
+        count, places = own.shape
+        # The postures, then all of them with each joint turned a little.
+        flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
+        poses = body.poses(flat.reshape(-1, places))
+        length, end = np.empty_like(seen.length), np.empty_like(seen.length)
+        slope = np.zeros((*length.shape, places))
+        by_body = []
+        torque_by_body = np.zeros((count, places, self.parameter_count))
+        for m in range(length.shape[1]):
+            pull, way = seen.tension[:, m], seen.direction[:, m]
+            turns = np.flatnonzero(self._crossed[m])  # the other joints do not move it
+            parts = np.append(0, 1 + turns)
+            rows = (count * parts[:, None] + np.arange(count)).ravel()
+            placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))
+            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, seen.age))
+            still = body.smooth[m].at(own)
+            turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
+            smooth = np.concatenate([still, *turned])
+            l_m, j_m = body.linearised(placed, smooth, pulls, ways, m, age)
+            l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
+            length[:, m] = seen.length[:, m] - l_m[0]
+            by_body.append(j_m[0])
+            slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
+            end[:, m] = end_tension(body.friction(m), pull, way)
+            block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
+            block[:, :, body.layouts[m].friction] -= way * end[:, m] * slope[:, m, turns].T
+            torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
+        muscular = end[:, :, None] * slope
+        weight = self._kinematics.holding_torque(at.theta)[:, self.joints]
+        down = self._down(at.theta)
+        return Residuals(
+            length,
+            slope,
+            by_body,
+            -weight - muscular.sum(axis=1),
+            torque_by_body,
+            np.median(np.abs(muscular).sum(axis=1), axis=0),
+            np.where(self.is_read, seen.theta - own - self.by_sensor * at.zero, 0.0),
+            self.is_tilt_known * (self._tilt - down[0]),
+            np.moveaxis(down[1:] - down[0], 0, -1) / DIFFERENCE,
+        )
+
+    def _down(self, theta: Array) -> Array:
+        """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
+
+        At θ, then with each joint of the group turned by `DIFFERENCE`; 0 columns without an IMU.
+        """
+        if not self._tilt.size:
+            return np.zeros((1 + len(self.joints), len(theta), 0))
+        gravity = self._kinematics.model.gravity.linear
+        turned = theta + DIFFERENCE * np.eye(theta.shape[1])[self.joints, None]
+        flat = np.concatenate([theta[None], turned]).reshape(-1, theta.shape[1])
+        rotation = self._kinematics.joint_poses(flat).rotation
+        down = np.einsum('njba,b->nja', rotation, gravity / max(np.linalg.norm(gravity), SMALL))
+        return down.reshape(-1, *self._tilt.shape)
+
+    def stiffness(self, theta: Array) -> Array:
+        """Return ∂τ/∂θ [N·m/rad] (N, D, D), where the muscles' part is the geometric model's."""
+        within = self.joints[:, None], self.joints
+        gravity = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
+        stiffness: Array = gravity[:, within[0], within[1]]
+        return stiffness + self._muscle_stiffness(theta[:, self.joints])
+
+    def _muscle_stiffness(self, own: Array) -> Array:
+        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
+        joints, radian = self.joints, self.body.robot.kinematics.radian
+        at = self._bent.theta[:, joints]
+        moved = np.flatnonzero(~(np.abs(own - at) < BENT * radian).all(axis=1))
+        hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
+        self._bent.theta[np.ix_(moved, joints)] = own[moved]
+        self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(
+            'nm,nmij->nij', self.seen.tension[moved], hessian
+        )
+        return self._bent.stiffness[:, joints[:, None], joints]

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the learner shows on /diagnostics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from musculoskeletal_ae.learning.calibration import is_calibrated
+from musculoskeletal_ae.learning.trainer import Update
+from musculoskeletal_ae.report import Level, Report
+from musculoskeletal_ae.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.learning.learner import Learner
+
+
+def learner_report(learner: Learner) -> Report:
+    """Return how a learner is."""
+    level: Level = 'warn'
+    if trouble := learner.trouble:
+        level, message = 'error', trouble
+    elif learner.checkpoint is None:
+        message = 'waiting for a checkpoint: set the parameter `checkpoint`'
+    elif not learner.enabled:
+        message = 'stopped by learner/enable'
+    elif not learner.body.offsets.known:
+        message = 'waiting until the estimator has found the length zeros'
+    elif learner.collector.is_anomaly:
+        message = 'stopped by an anomaly until estimator/reset'
+    else:
+        level, message = 'ok', 'learning'
+    return Report(level, message, {**_values(learner), 'state': message})
+
+
+def _values(learner: Learner) -> dict[str, str]:
+    keeper, collector = learner.keeper, learner.collector
+    values = {
+        'samples': str(len(learner.samples)),
+        'accepted': str(learner.samples.accepted),
+        'checkpoints': str(keeper.publication.count),
+        'checkpoint version': str(0 if keeper.mae is None else keeper.mae.version),
+        'preset': learner.trainer.preset.name,
+        'healthy time': f'{collector.healthy.time:.0f} s',
+        **learner.trainer.values(),
+    }
+    if learner.isolated:
+        values['isolated muscles'] = learner.robot.names(learner.isolated)
+    values |= keeper.values()
+    if learner.last_update is not None:
+        values |= _update_values(learner.robot, learner.last_update)
+    return values | {f'not learned: {why}': str(n) for why, n in collector.rejected.items()}
+
+
+def _update_values(robot: Robot, update: Update) -> dict[str, str]:
+    values = {
+        'error at newest samples': f'{update.error:.4f} rad',
+        'loss': f'{update.loss:.4f}',
+        'update': f'{update.seconds:.2f} s on {update.device}',
+        'anomaly calibrated': str(is_calibrated(update.mae)),
+    }
+    if len(update.noise):
+        worst = int(update.noise.argmax())
+        values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({robot.muscles[worst]})'
+    if update.contradicted:
+        names = robot.names(update.contradicted)
+        what = 'newest samples contradict several muscles'
+        values[what] = f'{names}; look at the joint sensors'
+    return values
