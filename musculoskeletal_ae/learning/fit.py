@@ -126,11 +126,15 @@ class MuscleFit:
         self._poses, self._smooth = poses, body.smooth[m].at(seen.theta)
         self._seen = seen
         self._known = used.astype(float)[:, None]
-        self._mean, self._precision = prior.mean, 1.0 / prior.spread**2
+        self._mean = prior.mean
         self._least_noise = least_noise
         self._noise = np.array([FIRST_NOISE])
         self._determined = np.zeros(1)
-        self.usual = np.zeros(0), self._precision
+        self.usual = np.zeros(0), 1.0 / prior.spread**2
+
+    @property
+    def _precision(self) -> Array:
+        return self.usual[1]
 
     def run(self) -> Array:
         """Return the parameters that fit, from the present ones of the body."""
