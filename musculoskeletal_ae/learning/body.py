@@ -122,10 +122,11 @@ class CalibratedBody:
             points = np.append(routes.first[segments], routes.second[segments[-1]])
             self.layouts.append(Layout(points, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
-        #: where a fit starts: zeros of the joint sensors [rad]; θ (D,) of samples by their lengths,
-        #: with a row of `postures.Bent`
+        # Where the next fit starts:
+        #: offsets of the joint sensors [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
-        self.found: dict[bytes, tuple[Array, ...]] = {}
+        #: θ (D,) of samples, with a row of `posture_model.Bent`, by the bytes of their lengths
+        self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
         """Return the body of one group, with the parameters of its muscles."""

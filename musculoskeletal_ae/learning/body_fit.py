@@ -43,27 +43,27 @@ class BodyFit:
         self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
         self._mean_length = self._probe_lengths()  # of the body that the network knows [m], (M,)
 
-    def is_of_another_arm(self, seen: Observations) -> bool:
+    def is_of_another_arm(self, observed: Observations) -> bool:
         """Whether samples contradict what the network knew of the body.
 
         That shows once there are a few samples; it is looked at once.
         """
-        seen = seen.seen_whole()
-        if self._prior_mean is None or self._is_prior_confirmed or len(seen) < IN_A_ROW:
+        observed = observed.with_all_angles()
+        if self._prior_mean is None or self._is_prior_confirmed or len(observed) < IN_A_ROW:
             return False
         self._is_prior_confirmed = True
         body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
-        (length,) = body.lengths(seen.theta, seen.tension, seen.direction)
-        return bool(np.median(np.abs(seen.length - length)[seen.known]) > LEAST_CHANGE)
+        (length,) = body.lengths(observed.theta, observed.tension, observed.direction)
+        return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
         """Begin with the geometric model: a wrong prior is worse than none."""
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot, smooth=self.body.smooth)
 
-    def fit(self, seen: Observations, guess: Array) -> Fit:
+    def fit(self, observed: Observations, guess: Array) -> Fit:
         """Fit the body to samples; θ that was not read is looked for from `guess` [rad] (N, D)."""
-        return fit_body(self.body, seen, self._prior_mean, guess)
+        return fit_body(self.body, observed, self._prior_mean, guess)
 
     def lengthened(self) -> Array:
         """Return by how much all lengths have grown since this was last asked [m], (M,)."""
@@ -76,11 +76,11 @@ class BodyFit:
         return length.mean(axis=0)
 
 
-def contradicted_muscles(seen: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
+def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
     """Return muscles whose newest samples contradict the body in one direction, and how many."""
     muscles = []
     for m, noise in enumerate(fit.noise):
-        residual = fit.residual[seen.known[:, m], m]
+        residual = fit.residual[observed.known[:, m], m]
         odd = np.abs(residual) > max(OUTLIER * noise, LEAST_CHANGE)
         same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
         fits = np.flatnonzero(~same)

@@ -125,9 +125,9 @@ class Reservoir:
         # 0 N: it was isolated then, or slack.
         whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
         known = np.ones(tension.shape, dtype=bool)
-        seen = Observations(theta, tension, length, direction, known, age=age)
+        observed = Observations(theta, tension, length, direction, known, age=age)
         place, second = np.flatnonzero(whole), np.arange(len(rows))[whole] % 2
-        parts = seen[place[second == 0]], seen[place[second == 1]]
+        parts = observed[place[second == 0]], observed[place[second == 1]]
         return Healthy(rows[:, : 3 * m], self.time, count, *parts)
 
 

@@ -72,8 +72,8 @@ def _drawn_errors(
         ends = np.cumsum([body.layouts[m].size for m in muscles])
         for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
             smooth = body.smooth[m].at(theta)
-            seen, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
-            length[:, m] += seen + (slope * step[bodies]).sum(axis=1)
+            observed, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
+            length[:, m] += observed + (slope * step[bodies]).sum(axis=1)
     error: Array = mae.estimate(tension, length).theta - theta
     return error
 
@@ -104,6 +104,6 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
     return bounded
 
 
-def observed_theta(mae: Mae, seen: Observations) -> Array:
+def observed_theta(mae: Mae, observed: Observations) -> Array:
     """Return θ [rad] (N, D) as a network estimates it from observations."""
-    return mae.estimate(seen.end_tension(mae.friction), seen.length).theta
+    return mae.estimate(observed.end_tension(mae.friction), observed.length).theta

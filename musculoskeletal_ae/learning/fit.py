@@ -50,7 +50,7 @@ class Fit(NamedTuple):
 
 def fit_body(
     body: CalibratedBody,
-    seen: Observations,
+    observed: Observations,
     prior_mean: list[Array] | None = None,
     guess: Array | None = None,
 ) -> Fit:
@@ -58,7 +58,7 @@ def fit_body(
 
     Args:
         body: The body.
-        seen: The samples.
+        observed: The samples.
         prior_mean: Parameters in the place of the geometric model's, if some were learned before
             without the samples that they came from.
         guess: Where angles that were not read are looked for [rad], (N, D); by default the middle
@@ -69,24 +69,26 @@ def fit_body(
     """
     robot = body.robot
     if guess is None:
-        guess = np.tile(0.5 * (robot.lower + robot.upper), (len(seen), 1))
-    start = np.where(np.isnan(seen.theta), np.clip(guess, robot.lower, robot.upper), seen.theta)
+        guess = np.tile(0.5 * (robot.lower + robot.upper), (len(observed), 1))
+    start = np.where(
+        np.isnan(observed.theta), np.clip(guess, robot.lower, robot.upper), observed.theta
+    )
     priors = []
     for m in range(len(body.layouts)):
-        prior = _prior(body, seen, m)
+        prior = _prior(body, observed, m)
         if prior_mean is not None:
             prior = prior._replace(mean=prior_mean[m])
-        priors.append(_reopened(body, replace(seen, theta=start), prior, m))
+        priors.append(_reopened(body, replace(observed, theta=start), prior, m))
     means, spreads = map(list, zip(*priors, strict=True))
-    return Fit(*fit_jointly(body, seen, start, means, spreads, LEAST_NOISE))
+    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE))
 
 
-def _prior(body: CalibratedBody, seen: Observations, m: int) -> MusclePrior:
+def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle round the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
     # The offset that is expected to be near 0 is that from before all creep.
-    spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * seen.age.max(initial=0.0))
+    spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 
 
@@ -115,7 +117,7 @@ class MuscleFit:
         self,
         body: CalibratedBody,
         poses: Poses,
-        seen: Observations,
+        observed: Observations,
         used: Bools,
         prior: MusclePrior,
         least_noise: float,
@@ -123,14 +125,18 @@ class MuscleFit:
     ) -> None:
         """Fit muscle `m` of a body to those of the samples (N,) that are used."""
         self._body, self._m = body, m
-        self._poses, self._smooth = poses, body.smooth[m].at(seen.theta)
-        self._seen = seen
+        self._poses, self._smooth = poses, body.smooth[m].at(observed.theta)
+        self._seen = observed
         self._known = used.astype(float)[:, None]
-        self._mean, self._precision = prior.mean, 1.0 / prior.spread**2
+        self._mean = prior.mean
         self._least_noise = least_noise
         self._noise = np.array([FIRST_NOISE])
         self._determined = np.zeros(1)
-        self.usual = np.zeros(0), self._precision
+        self.usual = np.zeros(0), 1.0 / prior.spread**2
+
+    @property
+    def _precision(self) -> Array:
+        return self.usual[1]
 
     def run(self) -> Array:
         """Return the parameters that fit, from the present ones of the body."""
@@ -140,13 +146,18 @@ class MuscleFit:
 
     def point(self, parameters: Array) -> MusclePoint:
         """Return a point with its residuals."""
-        m, seen = self._m, self._seen
+        m, observed = self._m, self._seen
         of_all = list(self._body.parameters)
         of_all[m] = parameters
         length, jacobian = self._body.with_parameters(of_all).linearised(
-            self._poses, self._smooth, seen.tension[:, m], seen.direction[:, m], m, seen.age
+            self._poses,
+            self._smooth,
+            observed.tension[:, m],
+            observed.direction[:, m],
+            m,
+            observed.age,
         )
-        return MusclePoint(parameters, (seen.length[:, m] - length)[:, None], jacobian)
+        return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
 
     def weigh(self, point: MusclePoint) -> None:
         """Take noise and weights from the residuals at a point."""
@@ -193,12 +204,12 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     tension = rng.uniform(robot.tension.bias, robot.tension.limit, shape)
     everything = np.ones(shape, dtype=bool)
     lengths = mae.lengths(theta, tension)
-    seen = Observations(theta, tension, lengths, np.zeros(shape), everything)
+    observed = Observations(theta, tension, lengths, np.zeros(shape), everything)
     poses = body.poses(theta)
     for m, layout in enumerate(body.layouts):
         mean = PRIOR.mean(layout)
         if mae.touch is not None:  # of friction, lengths say nothing
             mean[layout.friction] = mae.friction[m]
         prior = MusclePrior(mean, PRIOR.spread(layout))
-        problem = MuscleFit(body, poses, seen, everything[:, m], prior, NETWORK_ERROR, m)
+        problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()

@@ -43,13 +43,13 @@ class NetworkTrainer:
 
     def train(self, data: TrainingData, steps: int) -> float:
         """Take steps on batches of the data; return the mean loss of the last half of them."""
-        seen, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
+        entered, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
         mask = torch.arange(3).repeat_interleave(BATCH)
         losses = []
         with one_thread():
             for _ in range(steps):
-                rows = torch.as_tensor(self._rng.integers(len(seen), size=BATCH))
-                value = _loss(self._restless, seen[rows], true[rows], mask)
+                rows = torch.as_tensor(self._rng.integers(len(entered), size=BATCH))
+                value = _loss(self._restless, entered[rows], true[rows], mask)
                 value.backward()
                 self._optimiser.step(max(LEAST_CALM, 1.0 / (1.0 + self.steps / CALMING)))
                 self.steps += 1
@@ -73,9 +73,9 @@ class NetworkTrainer:
                 mean.lerp_(now, 1.0 / span)
 
 
-def _loss(network: Network, seen: Tensor, true: Tensor, mask: Tensor) -> Tensor:
+def _loss(network: Network, entered: Tensor, true: Tensor, mask: Tensor) -> Tensor:
     """Return the three norms, each in units of the spread of the data, all three masks entered."""
-    error = network.decoder(network.encode(seen.repeat(3, 1), mask))
+    error = network.decoder(network.encode(entered.repeat(3, 1), mask))
     error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
     return torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts]).sum()

@@ -69,13 +69,13 @@ class PostureModel:
     """What the calibrated body says that N samples of one group should have measured."""
 
     def __init__(
-        self, body: CalibratedBody, seen: Observations, joints: Ints, muscles: Ints, bent: Bent
+        self, body: CalibratedBody, observed: Observations, joints: Ints, muscles: Ints, bent: Bent
     ) -> None:
         """Take the whole body, all samples, and the joints and muscles of the group.
 
         `bent` is that of the whole body; it is brought up to date in place.
         """
-        self.body, self.seen = body.limb(joints, muscles), seen.limb(joints, muscles)
+        self.body, self.observed = body.limb(joints, muscles), observed.limb(joints, muscles)
         self.joints = joints
         self._kinematics = body.robot.kinematics  # of the whole body
         ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
@@ -85,10 +85,10 @@ class PostureModel:
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
         #: the parameters of the muscles that cross each joint
         self.acting = [np.flatnonzero(own) for own in of_muscle]
-        self.is_read = np.isfinite(self.seen.theta)
-        self.by_sensor = self.is_read & (self.seen.spread == 0.0)  # of a joint sensor
-        self.is_tilt_known = np.isfinite(self.seen.gravity)
-        self._tilt = np.where(self.is_tilt_known, self.seen.gravity, 0.0)
+        self.is_read = np.isfinite(self.observed.theta)
+        self.by_sensor = self.is_read & (self.observed.spread == 0.0)  # of a joint sensor
+        self.is_tilt_known = np.isfinite(self.observed.gravity)
+        self._tilt = np.where(self.is_tilt_known, self.observed.gravity, 0.0)
         self._bent = bent
 
     @property
@@ -98,29 +98,33 @@ class PostureModel:
 
     def residuals(self, at: Unknowns) -> Residuals:
         """Return residuals and derivatives at a point."""
-        body, seen, columns = self.body.with_parameters(at.parameters), self.seen, self.columns
+        body, observed, columns = (
+            self.body.with_parameters(at.parameters),
+            self.observed,
+            self.columns,
+        )
         own = at.theta[:, self.joints]
         count, places = own.shape
         # The postures, then all of them with each joint turned a little.
         flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
         poses = body.poses(flat.reshape(-1, places))
-        length, end = np.empty_like(seen.length), np.empty_like(seen.length)
+        length, end = np.empty_like(observed.length), np.empty_like(observed.length)
         slope = np.zeros((*length.shape, places))
         by_body = []
         torque_by_body = np.zeros((count, places, self.parameter_count))
         for m in range(length.shape[1]):
-            pull, way = seen.tension[:, m], seen.direction[:, m]
+            pull, way = observed.tension[:, m], observed.direction[:, m]
             turns = np.flatnonzero(self._crossed[m])  # the other joints do not move it
             parts = np.append(0, 1 + turns)
             rows = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))
-            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, seen.age))
+            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, observed.age))
             still = body.smooth[m].at(own)
             turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
             smooth = np.concatenate([still, *turned])
             l_m, j_m = body.linearised(placed, smooth, pulls, ways, m, age)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
-            length[:, m] = seen.length[:, m] - l_m[0]
+            length[:, m] = observed.length[:, m] - l_m[0]
             by_body.append(j_m[0])
             slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
             end[:, m] = end_tension(body.friction(m), pull, way)
@@ -137,7 +141,7 @@ class PostureModel:
             -weight - muscular.sum(axis=1),
             torque_by_body,
             np.median(np.abs(muscular).sum(axis=1), axis=0),
-            np.where(self.is_read, seen.theta - own - self.by_sensor * at.zero, 0.0),
+            np.where(self.is_read, observed.theta - own - self.by_sensor * at.zero, 0.0),
             self.is_tilt_known * (self._tilt - down[0]),
             np.moveaxis(down[1:] - down[0], 0, -1) / DIFFERENCE,
         )
@@ -171,6 +175,6 @@ class PostureModel:
         hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
         self._bent.theta[np.ix_(moved, joints)] = own[moved]
         self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(
-            'nm,nmij->nij', self.seen.tension[moved], hessian
+            'nm,nmij->nij', self.observed.tension[moved], hessian
         )
         return self._bent.stiffness[:, joints[:, None], joints]

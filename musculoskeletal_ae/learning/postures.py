@@ -96,7 +96,7 @@ class GroupFit:
         self.model, self.stops = model, Stops(model)
         self.prior = GroupPrior.of(model, mean, spread)
         self._least_noise = least_noise
-        self._known = model.seen.known.astype(float)
+        self._known = model.observed.known.astype(float)
         self.noise = np.full(len(mean), FIRST_NOISE)
         self.weight = self._known
         self._determined = np.zeros(len(mean))  # unknowns that each muscle's lengths determine
@@ -244,7 +244,7 @@ class GroupFit:
 
 def fit_jointly(
     body: CalibratedBody,
-    seen: Observations,
+    observed: Observations,
     start: Array,
     mean: list[Array],
     spread: list[Array],
@@ -254,17 +254,17 @@ def fit_jointly(
 
     Returns what `Fit` holds.
     """
-    own, zero = np.isfinite(seen.theta) & (seen.spread == 0.0), body.zero
-    theta, samples = start - own * zero, [length.tobytes() for length in seen.length]
+    own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
+    theta, samples = start - own * zero, [length.tobytes() for length in observed.length]
     bent = Bent.unknown(*theta.shape)
     for n, sample in enumerate(samples):
-        if sample in body.found:
-            theta[n], bent.theta[n], bent.stiffness[n] = body.found[sample]
-    weight = np.zeros_like(seen.length)
-    noise, root = np.empty(seen.length.shape[1]), []
+        if sample in body.last_postures:
+            theta[n], bent.theta[n], bent.stiffness[n] = body.last_postures[sample]
+    weight = np.zeros_like(observed.length)
+    noise, root = np.empty(observed.length.shape[1]), []
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
-        model = PostureModel(body, seen, joints, muscles, bent)
+        model = PostureModel(body, observed, joints, muscles, bent)
         fit = GroupFit(model, [mean[m] for m in muscles], [spread[m] for m in muscles], least_noise)
         begin = Unknowns(theta, zero[joints], [body.parameters[m] for m in muscles])
         found, group_root = fit.run(begin)
@@ -273,8 +273,8 @@ def fit_jointly(
             body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, group_root))
-    body.found = dict(zip(samples, zip(theta, *bent), strict=True))
+    body.last_postures = dict(zip(samples, zip(theta, *bent), strict=True))
     # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
-    read = np.where(np.isnan(seen.theta), theta, seen.theta - own * zero)
-    (length,) = body.lengths(read, seen.tension, seen.direction)
-    return seen.length + body.crept(seen.age) - length, noise, weight, theta, root
+    read = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
+    (length,) = body.lengths(read, observed.tension, observed.direction)
+    return observed.length + body.crept(observed.age) - length, noise, weight, theta, root

@@ -88,11 +88,11 @@ class GroupPrior:
     @classmethod
     def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
         """Return that of a group; `mean` and `spread` are those of its muscles."""
-        seen, robot, by_sensor = model.seen, model.body.robot, model.by_sensor
+        observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
         radian = robot.kinematics.radian
-        angle_spread = np.where(by_sensor, SENSOR * radian, seen.spread)
+        angle_spread = np.where(by_sensor, SENSOR * radian, observed.spread)
         repeated = np.maximum(1.0, by_sensor.sum(axis=0) / ALIKE)
-        readings = np.where(by_sensor, seen.theta, np.nan)
+        readings = np.where(by_sensor, observed.theta, np.nan)
         zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper, radian)
         return cls(
             mean=np.concatenate(mean),

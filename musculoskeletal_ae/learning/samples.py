@@ -91,7 +91,7 @@ class Observations:
         """Return T at the elastic units [N] (N, M), by μ (M,): what networks take for T."""
         return end_tension(friction, self.tension, self.direction)
 
-    def seen_whole(self) -> Observations:
+    def with_all_angles(self) -> Observations:
         """Return those of which all joint angles are known."""
         return self[np.flatnonzero(np.isfinite(self.theta).all(axis=1))]
 

@@ -115,13 +115,13 @@ class Stops:
 
     def __init__(self, model: PostureModel) -> None:
         """Start with no joint at a stop."""
-        robot, seen = model.body.robot, model.seen
+        robot, observed = model.body.robot, model.observed
         self._lower, self._upper = robot.lower, robot.upper
         self._radian = robot.kinematics.radian
         self._by_sensor = model.by_sensor
         self._near = self._radian * np.where(model.by_sensor, 2.0 * ZERO, NEAR_STOP)
         # The torque of a muscle that was changed since is not that of the one there is.
-        changed = ~seen.known & (seen.tension > 0.0)  # 0 N: isolated
+        changed = ~observed.known & (observed.tension > 0.0)  # 0 N: isolated
         #: whose balance of torques says something, (N, D)
         self.is_balanced = ~(changed @ robot.routes.crossed)
         self._at = np.full(model.by_sensor.shape, np.nan)  # the stops that joints lean on [rad]

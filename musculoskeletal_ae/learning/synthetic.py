@@ -20,7 +20,7 @@ MARGIN = 0.02
 class TrainingData(NamedTuple):
     """N samples in scaled units, shape (N, D+2M) each."""
 
-    seen: Array  # with scattered lengths
+    entered: Array  # with scattered lengths
     true: Array  # what the network is to restore
 
 
@@ -50,8 +50,8 @@ def synthetic_samples(
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
-    true, seen = State(theta, tension, length), State(theta, tension, scattered)
-    return TrainingData(seen.scaled(), true.scaled())
+    true, entered = State(theta, tension, length), State(theta, tension, scattered)
+    return TrainingData(entered.scaled(), true.scaled())
 
 
 def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 class Job(NamedTuple):
     """What an update may use."""
 
-    seen: Observations  # the samples, the oldest first
+    observed: Observations  # the samples, the oldest first
     healthy: Healthy  # what was seen of the healthy arm
     statistics_hold: bool  # the statistics so far are of the arm as it is: no muscle has changed
     steps: int  # of training

@@ -68,11 +68,11 @@ class Updater(ABC):
 
     def update(self, job: Job) -> Update:
         """Learn a little; bounded time for a bounded store."""
-        begun, newest = time.perf_counter(), job.seen[-NEWEST:]
+        begun, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)
-        seen = np.isfinite(newest.theta)
-        away = np.where(seen, estimate - newest.theta, 0.0)[seen.any(axis=1)]
+        observed = np.isfinite(newest.theta)
+        away = np.where(observed, estimate - newest.theta, 0.0)[observed.any(axis=1)]
         error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
         update = self._learn(job)
         seconds, device = time.perf_counter() - begun, str(torch.get_default_device())
@@ -85,7 +85,7 @@ class Updater(ABC):
         self, network: Network, preset: str, steps: int, job: Job, fit: Fit | None = None
     ) -> Mae:
         """Return the network that runs, with its statistics, and with what it has learned."""
-        origin, samples = self._origin, len(job.seen)
+        origin, samples = self._origin, len(job.observed)
         history = (
             f'{origin.training.split(LEARNED)[0]}{LEARNED}'
             f'{samples} samples at rest, preset {preset}, {steps} steps'
@@ -99,7 +99,7 @@ class Updater(ABC):
             mae = replace(mae, touch=touch)
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
-            tension, judging = job.seen.end_tension(mae.friction), job.healthy.judging
+            tension, judging = job.observed.end_tension(mae.friction), job.healthy.judging
             covariance = estimate_covariance(mae, self.body, fit, tension, self._seed, judging)
             mae = replace(mae, covariance=covariance)
         self._mae = mae
@@ -148,8 +148,8 @@ class PaperUpdater(Updater):
     def _learn(self, job: Job) -> Update:
         """Learn one newest sample among stored ones; `job.steps` is the paper's own here."""
         # The print knows no changed muscle: a sample that says nothing about one is none.
-        seen = job.seen.seen_whole()
-        values = seen[np.flatnonzero(seen.known.all(axis=1))].state().scaled()
+        observed = job.observed.with_all_angles()
+        values = observed[np.flatnonzero(observed.known.all(axis=1))].state().scaled()
         batches = []
         for _ in range(BATCHES if len(values) >= PAPER.least_samples else 0):
             stored = self._rng.choice(len(values) - 1, DATA, replace=False)
@@ -198,15 +198,15 @@ class BodyUpdater(Updater):
         return self.body_fit.body
 
     def _learn(self, job: Job) -> Update:
-        seen = job.seen
-        if self.body_fit.is_of_another_arm(seen):
+        observed = job.observed
+        if self.body_fit.is_of_another_arm(observed):
             self.body_fit.start_anew()
             self._trainer.restart()
-        fit = self.body_fit.fit(seen, observed_theta(self._mae, seen))
+        fit = self.body_fit.fit(observed, observed_theta(self._mae, observed))
         learned, judging = map(self._at_angles, (job.healthy.learned, job.healthy.judging))
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         self._trainer.move(self.body_fit.lengthened())
-        contradicted = contradicted_muscles(seen, fit)
+        contradicted = contradicted_muscles(observed, fit)
         # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
         # the robust weights leave such samples out until they are the rule.
         alone = len(contradicted) == 1
@@ -215,7 +215,7 @@ class BodyUpdater(Updater):
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
         data = synthetic_samples(self.body, fit.noise, count, self._rng)
-        self._mix_in_real(data, replace(seen, theta=fit.theta), fit)
+        self._mix_in_real(data, replace(observed, theta=fit.theta), fit)
         if job.healthy.learned is not None:
             self._mix_in_moving(data, job.healthy.learned, fit.noise)
         loss_now = self._trainer.train(data, job.steps)
@@ -231,25 +231,27 @@ class BodyUpdater(Updater):
         """Return messages with θ less what the joint sensors' zeros were found to be."""
         return read and replace(read, theta=read.theta - self.body.zero)
 
-    def _mix_in_real(self, data: TrainingData, seen: Observations, fit: Fit) -> None:
+    def _mix_in_real(self, data: TrainingData, observed: Observations, fit: Fit) -> None:
         """Put real samples in the place of some."""
         trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
-        self._put(data, seen[trusted], slice(int(REAL_SHARE * len(data.seen))))
+        self._put(data, observed[trusted], slice(int(REAL_SHARE * len(data.entered))))
 
-    def _mix_in_moving(self, data: TrainingData, seen: Observations, noise: Array) -> None:
+    def _mix_in_moving(self, data: TrainingData, observed: Observations, noise: Array) -> None:
         """Put messages in the place of some, but none that contradict the body."""
-        (length,) = self.body.lengths(seen.theta, seen.tension, seen.direction)
-        off = np.abs(seen.length + self.body.crept(seen.age) - length)
+        (length,) = self.body.lengths(observed.theta, observed.tension, observed.direction)
+        off = np.abs(observed.length + self.body.crept(observed.age) - length)
         sound = np.flatnonzero((off <= np.maximum(OUTLIER * noise, LEAST_CHANGE)).all(axis=1))
         share = MOVING_SHARE * len(sound) / (len(sound) + MANY)
-        self._put(data, seen[sound], slice(len(data.seen) - int(share * len(data.seen)), None))
+        self._put(
+            data, observed[sound], slice(len(data.entered) - int(share * len(data.entered)), None)
+        )
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
         """Put some of what was measured there, with T as the elastic units have it."""
         if len(real) == 0:
             return
-        real = real[self._rng.integers(len(real), size=len(data.seen[places]))]
+        real = real[self._rng.integers(len(real), size=len(data.entered[places]))]
         state = real.state()._replace(tension=real.end_tension(self.body.frictions()))
-        data.seen[places] = state.scaled()
+        data.entered[places] = state.scaled()
         length = real.length + self.body.crept(real.age)
         data.true[places] = state._replace(length=length).scaled()

@@ -140,7 +140,7 @@ def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner
         learner.poll(now)
         times += [now] * (len(learner.trainer.jobs) - before)
     assert times == [5.0, 6.0]
-    assert [len(job.seen) for job in learner.trainer.jobs] == [2, 5]
+    assert [len(job.observed) for job in learner.trainer.jobs] == [2, 5]
 
 
 def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm26, initial, stage):
@@ -149,7 +149,7 @@ def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm2
         learner.accept(stage.sample())
         for now in (3.0 * count, 3.0 * count + 1.5):
             learner.poll(now)
-    assert [len(job.seen) for job in learner.trainer.jobs] == [21, 22]
+    assert [len(job.observed) for job in learner.trainer.jobs] == [21, 22]
 
 
 def test_a_sample_received_during_an_update_is_learned_in_the_next(learner, stage):
@@ -162,7 +162,7 @@ def test_a_sample_received_during_an_update_is_learned_in_the_next(learner, stag
     learner.trainer.released = True
     for now in (3.0, 4.0, 5.0, 6.0):
         learner.poll(now)
-    assert [len(job.seen) for job in learner.trainer.jobs] == [2, 3]
+    assert [len(job.observed) for job in learner.trainer.jobs] == [2, 3]
 
 
 def test_at_most_one_checkpoint_a_second_is_published_the_latest(learner, initial):
@@ -320,7 +320,7 @@ def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial,
         arm.rest(1.1)
     assert len(learner.samples) >= 20
     assert np.isnan(learner.samples.observations().theta).all()
-    assert len(learner.trainer.jobs[0].seen) == 20  # fewer say too little
+    assert len(learner.trainer.jobs[0].observed) == 20  # fewer say too little
 
 
 def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial, stage):

@@ -143,7 +143,7 @@ def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
     data = synthetic_samples(other_body, np.zeros(6), 2000, np.random.default_rng(0))
     scale = scale_vector(2, 6)
     theta, tension, length = np.split(data.true / scale, [2, 8], axis=1)
-    observed = data.seen / scale
+    observed = data.entered / scale
     off = observed[:, 8:] - length
     np.testing.assert_array_equal(observed[:, :8], np.hstack([theta, tension]))
     all_of_it = [
