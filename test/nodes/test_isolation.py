@@ -12,7 +12,6 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED
-from musculoskeletal_ae.nodes.situation import VERIFYING
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 
@@ -33,7 +32,8 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
-    graph.wait(lambda: graph.report('estimator').message.endswith(VERIFYING), 'what is done')
+    graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
+    graph.wait(lambda: 'verifying' in graph.report('estimator').message, 'what is done')
     assert graph.report('estimator').values['suspect muscle'] == name
     graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
     assert arm.estimator.core.verified == f'{name}: ruptured'
