@@ -29,8 +29,8 @@ DOING = {
 def report(core: Controller, now: float) -> Report:
     """Return the state that /diagnostics shows: a stop, else why it waits, else all warnings.
 
-    The values `mode` and `stop cause` are stable identifiers for programs; `remedy` says how to go
-    on. The message is for people.
+    The values `mode` and `stop cause` are stable identifiers for programs. The message is for
+    people, and so are the values `stop`, what happened, and `remedy`, how to go on.
     """
     supervisor = core.supervisor
     values = {
@@ -41,7 +41,11 @@ def report(core: Controller, now: float) -> Report:
     warnings = _warnings(core, values)
     condition = supervisor.condition
     if condition is not None:
-        values |= {'stop cause': condition.cause.identifier, 'remedy': condition.cause.remedy}
+        values |= {
+            'stop cause': condition.cause.identifier,
+            'stop': str(condition),
+            'remedy': condition.cause.remedy,
+        }
         if supervisor.is_latched:
             return Report('error', f'stopped: {condition}', values)
         return Report('warn', f'paused: {condition}', values)

@@ -42,6 +42,7 @@ class Declaration(NamedTuple):
 
 
 RESET = 'call controller/reset'
+REPAIR = 'repair the muscle; call estimator/reset'
 EXPLORE = 'controller/explore explores again'
 
 
@@ -109,7 +110,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'anomaly detected',
-            f'repair the muscle; call estimator/reset; {RESET}',
+            f'{REPAIR}; {RESET}',
         ),
     )
     SECOND_PUBLISHER = (

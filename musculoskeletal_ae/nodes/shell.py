@@ -468,7 +468,8 @@ class Shell(Node):
             self.on_callback_error(TIMER, error)
             report = Report('error', self._fault, {})
         if self._fault:
-            report, self._fault = Report('error', self._fault, report.values), ''
+            values = {**report.values, 'fault': self._fault}
+            report, self._fault = Report('error', self._fault, values), ''
         received = self._diagnostics.tell(report)
         self._tell_waiting([topic for topic in self.needed if topic not in received])
 

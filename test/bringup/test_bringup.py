@@ -174,7 +174,7 @@ def test_a_cut_muscle_is_detected_and_a_dead_node_named(environment):
     _, output = run.ended()
     assert run.process.returncode == 1
     assert 'ANOMALY: brachialis' in output
-    assert '(to go on: mend it, estimator/reset' in output
+    assert '(to go on: repair the muscle; call estimator/reset' in output
     assert 'estimator ended with status' in output
     assert left_behind(run) == ''
 

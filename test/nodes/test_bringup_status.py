@@ -4,8 +4,10 @@
 import math
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.situation import Situation, figures
 
@@ -47,44 +49,74 @@ def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
     assert 'error waits for joint_states' in capsys.readouterr().out
 
 
-def test_trouble_of_this_arm_alone_is_told_with_every_step_to_take():
+def stopped(cause, mode='stopped'):
+    """Return what the controller in /left reports of a stop, as it reports it."""
+    values = {
+        'mode': mode,
+        'stop_cause': cause.identifier,
+        'stop': str(Condition(cause)),
+        'remedy': cause.remedy,
+    }
+    return said('/left/controller', f'stopped: {cause.text}', DiagnosticStatus.ERROR, **values)
+
+
+RESET = '(to go on: call controller/reset)'
+REPAIR = '(to go on: repair the muscle; call estimator/reset)'
+
+
+def test_a_stop_of_this_arm_alone_is_shown_with_its_remedy():
     told = Situation('/left')
-    told.diagnosed(said('/right/controller', 'stopped: by request'))
+    told.diagnosed(said('/right/controller', mode='stopped', stop='another arm'))
     assert told.trouble() == ''
-    told.diagnosed(said('/left/controller', 'exploring'))
+    told.diagnosed(said('/left/controller', mode='holding'))
     assert told.trouble() == ''
-    told.diagnosed(said('/left/controller', 'stopped: anomaly'))
+    told.diagnosed(stopped(StopCause.OPERATOR))
+    assert told.trouble() == f'STOPPED: controller/stop was called {RESET}'
+    told.diagnosed(said('/left/controller', mode='paused', stop_cause='stale_estimate'))
+    assert told.trouble() == ''  # it goes on by itself
+
+
+@pytest.mark.parametrize('cause', StopCause)
+def test_every_stop_is_shown_with_the_remedy_of_its_cause(cause):
+    told = Situation('/left')
+    told.diagnosed(stopped(cause))
+    assert told.trouble() == f'STOPPED: {cause.text} (to go on: {cause.remedy})'
+
+
+def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
+    told = Situation('/left')
     told.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
-    told.detected = True
-    assert told.trouble() == (
-        'ANOMALY: biceps, STOPPED: anomaly (to go on: mend it, estimator/reset, controller/reset, '
-        'controller/explore)'
-    )
     assert (told.distance, told.limit) == (12.5, 9.0)
+    told.detected = True
+    assert told.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
+    told.diagnosed(said('/left/controller', mode='exploring'))
+    told.diagnosed(stopped(StopCause.ANOMALY))
+    assert told.trouble() == (
+        'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
+        'call estimator/reset; call controller/reset; controller/explore explores again)'
+    )
     told.detected = False
-    told.diagnosed(said('/left/controller', 'holding'))
+    told.diagnosed(said('/left/controller', mode='holding'))
     assert told.trouble() == ''
-    told.diagnosed(said('/left/controller', 'stopped: a cause'))
-    assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
 
 
-def test_a_suspect_that_is_verified_is_not_to_be_mended_yet():
-    told, anomaly = Situation('/left'), 'anomaly_detected; call estimator/reset when it is mended'
-    told.diagnosed(said('/left/controller', f'stopped: {anomaly}'))
-    cause = 'anomaly detected: biceps: d 12.5 above 9.0'
-    told.diagnosed(said('/left/estimator', cause, suspect_muscle='biceps', verification='running'))
+def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
+    told = Situation('/left')
+    told.diagnosed(said('/left/estimator', suspect_muscle='biceps'))
+    told.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
     told.detected = True
     assert told.trouble() == 'ANOMALY: biceps is being verified'
-    told.diagnosed(said('/left/controller', 'stopped: controller/stop was called'))
+    told.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
     assert told.trouble() == (
-        'ANOMALY: biceps is being verified, '
-        'STOPPED: controller/stop was called (to go on: controller/reset)'
+        f'ANOMALY: biceps is being verified, STOPPED: controller/stop was called {RESET}'
     )
-    told.diagnosed(said('/left/estimator', cause, suspect_muscle='biceps'))
-    assert 'mend it' in told.trouble()
+    told.diagnosed(stopped(StopCause.OPERATOR))
+    assert told.trouble() == (
+        f'ANOMALY: biceps {REPAIR}, STOPPED: controller/stop was called {RESET}'
+    )
 
 
-def test_an_error_of_any_node_is_told_until_it_is_over():
+def test_an_error_of_any_node_is_shown_until_it_is_over():
     error = DiagnosticStatus.ERROR
     alone = Situation('/')
     alone.diagnosed(said('/right/learner', 'the disk is full', error))
@@ -93,13 +125,14 @@ def test_an_error_of_any_node_is_told_until_it_is_over():
     assert alone.trouble() == '/learner: the disk is full'
     told = Situation('/left')
     told.diagnosed(said('/right/learner', 'the disk is full', error))
-    told.diagnosed(said('/left/controller', 'stopped: a cause', error))
-    assert told.trouble() == 'STOPPED: a cause (to go on: controller/reset)'
+    told.diagnosed(said('/left/controller', 'a KeyError escaped', error, fault='a KeyError'))
+    assert told.trouble() == '/left/controller: a KeyError escaped'
+    told.diagnosed(stopped(StopCause.OPERATOR))
+    stop = f'STOPPED: controller/stop was called {RESET}'
+    assert told.trouble() == stop
     told.diagnosed(said('/left/learner', 'the disk is full', error))
-    assert told.trouble() == (
-        'STOPPED: a cause (to go on: controller/reset), /left/learner: the disk is full'
-    )
-    told.diagnosed(said('/left/controller', 'holding'))
+    assert told.trouble() == f'{stop}, /left/learner: the disk is full'
+    told.diagnosed(said('/left/controller', 'holding', mode='holding'))
     assert told.trouble() == '/left/learner: the disk is full'
     told.diagnosed(said('/left/learner', 'learning'))
     assert told.trouble() == ''

@@ -61,7 +61,7 @@ def test_the_seconds_before_a_stop_are_saved_as_a_bag(moving, tmp_path, monkeypa
 def test_a_killed_estimator_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm = moving('estimator')
     arm.kill(arm.estimator)
-    arm.says('estimated_joint_states older')
+    arm.says('stale_estimate')
     answer = reset(arm)
     assert not answer.success
     assert 'estimated_joint_states' in answer.message
@@ -77,9 +77,9 @@ def test_a_killed_estimator_stops_the_arm_and_a_new_one_lets_it_resume(moving):
 def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm = moving()
     arm.graph.end(arm.hardware)
-    arm.says('muscle_states older')
+    arm.says('stale_muscle_states')
     refused = reset(arm).message
-    assert refused.startswith('refused: muscle_states older') and 'call again once' in refused
+    assert refused.startswith('refused: muscle_states are too old') and 'call again once' in refused
     before = len(arm.sent())
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'commands to nobody')
     arm.start('hardware_emulator', seed=1)
@@ -109,7 +109,7 @@ def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(movin
     arm = moving()
     muscle = arm.robot.muscles[0]
     assert arm.graph.set_parameter('hardware_emulator', 'ruptured_muscles', [muscle])[0]
-    arm.says('stopped: anomaly_detected')
+    arm.says('anomaly_detected')
     answer = reset(arm)
     assert not answer.success
     assert 'anomaly' in answer.message

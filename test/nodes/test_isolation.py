@@ -32,6 +32,7 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
+    graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
     graph.wait(
         lambda: graph.report('estimator').values['verification'] == 'running', 'what is done'
     )

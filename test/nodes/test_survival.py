@@ -133,8 +133,11 @@ def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
     shouting = [
         DiagnosticStatus(
             name=f'{graph.namespace}/{name}: state',
-            message='stopped: \x1b[2J\x9b1m',
-            values=[KeyValue(key='samples', value='\x1b]0;owned\x07')],
+            values=[
+                KeyValue(key='samples', value='\x1b]0;owned\x07'),
+                KeyValue(key='mode', value='stopped'),
+                KeyValue(key='stop', value='\x1b[2J\x9b1m'),
+            ],
         )
         for name in ('controller', 'learner')
     ]

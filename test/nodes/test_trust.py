@@ -114,7 +114,8 @@ def test_impossible_length_offsets_are_refused_and_move_nothing(arm):
 def test_a_second_publisher_of_muscle_states_stops_the_arm_until_it_is_gone(arm):
     stranger = arm.graph.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
     space = arm.graph.namespace
-    arm.says(f'stopped: muscle_states come from {space}/hardware_emulator and {space}/test')
+    arm.says('second_publisher')
+    assert f'{space}/hardware_emulator and {space}/test' in arm.state().message
     assert not arm.graph.call(Trigger, 'controller/reset').success
     refused = arm.estimator.rejected
     arm.graph.wait(lambda: refused['muscle_states: several publishers'], 'a refusal')
@@ -147,14 +148,15 @@ def test_impossible_lengths_stop_the_arm_with_their_cause_and_without_a_jump(arm
     arm.goes_to(HERE)
     done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.15])
     assert done
-    arm.says('stopped: muscle_states: length ')  # jumped, or beyond what the joints allow
+    # Jumped, or beyond what the joints allow.
+    arm.says('stopped: muscle_states are implausible: length ')
     assert any(reason.startswith('muscle_states: length ') for reason in arm.estimator.rejected)
     arm.never_jumped()
     # The modules wind by their own law until the stop, which a busy machine handles late.
     assert np.linalg.norm(arm.posture() - HERE) < 0.7
 
 
-def test_with_use_sim_time_a_ramp_follows_the_clock(graph, arm26, trained_file):
+def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_file):
     pace = 0.3  # seconds of /clock in a second
     sent = graph.listen(Float64MultiArray, 'muscle_length_command', 1000)
     node = graph.host(
@@ -173,6 +175,7 @@ def test_with_use_sim_time_a_ramp_follows_the_clock(graph, arm26, trained_file):
     targets = graph.publisher(JointState, 'target_joint_states')
     bias = np.full(arm26.muscle_count, arm26.tension.bias)
     rows = np.stack([arm26.muscle_lengths(HERE, bias), bias, np.full_like(bias, 25.0)])
+    follower = node.core.activities.follower
     started, done_at = time.monotonic(), None
     while done_at is None:
         now = 100.0 + pace * (time.monotonic() - started)
@@ -184,14 +187,14 @@ def test_with_use_sim_time_a_ramp_follows_the_clock(graph, arm26, trained_file):
         if node.core.target_state.theta is None and now > 101.0:
             targets.publish(JointState(name=arm26.joints, position=[-0.2, -0.8]))
             begun = now
-        ramp = node.core.posture._ramp
-        if ramp is not None and ramp.done:
+        if follower.trajectory is not None and not follower.is_moving:
             done_at = now
         graph.spin(0.01)
         assert time.monotonic() - started < 60.0
     assert node.core.supervisor.is_running
     # By the steady clock it would be over after 0.6 s of this one.
-    assert done_at - begun >= 0.9 * ramp.duration
+    assert follower.trajectory.duration >= 2.0
+    assert done_at - begun >= 0.9 * follower.trajectory.duration
     assert len(sent) > 0
 
 
