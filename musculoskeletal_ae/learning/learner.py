@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
@@ -95,7 +95,7 @@ class Learner:
         # Where they do not, the network says that its detector is not calibrated.
         self._statistics_hold = True
         self._forgot = False  # a muscle, since the update began
-        self.gate = Gate(robot)
+        self.gate = CheckpointValidator(robot)
         self._spoiled = np.zeros(robot.muscle_count, dtype=bool)  # healthy messages lack these
         self._gate_time = 0.0  # [s] of the messages
         self.refused = 0  # updates that the gate did not let through

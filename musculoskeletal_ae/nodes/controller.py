@@ -59,7 +59,7 @@ class Controller(Shell):
         checks = {'joint_stiffness': self._check_stiffness, 'method': self._check_method}
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name), checks.get(name))
-        self.follow_checkpoints(
+        self.follow_accepted_checkpoints(
             self.core.use, lambda why: self.core.stop(f'unfit checkpoint: {why}')
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
@@ -117,21 +117,15 @@ class Controller(Shell):
 
     def _shift(self, known: bool, less: Array) -> None:
         self.core.zeros(known, less)
-        self.gate.forget()
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
-        self.gate.isolated = muscles
         self.core.isolate(muscles)
 
     def _muscles(self, states: Array) -> None:
-        muscles, now = Muscles(*states), time.monotonic()
-        self.core.muscles(muscles, now)
-        if self.zeros.known:
-            self.gate.message(muscles.tension, muscles.length, now)
+        self.core.muscles(Muscles(*states), time.monotonic())
 
     def _anomaly(self, detected: bool) -> None:
         self.core.anomaly(detected)
-        self.take_anomaly(detected)
 
     def _estimated(self, theta: Array) -> None:
         self.core.estimated(theta, time.monotonic())

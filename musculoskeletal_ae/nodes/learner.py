@@ -73,7 +73,6 @@ class Learner(Shell):
         self.follow_muscle_states(lambda states: core.muscles(self.now(), *states[1::-1]))
         self.follow_anomaly(core.anomaly)
         self.told = False
-        self.gate = self.core.gate
         self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
