@@ -185,7 +185,8 @@ class Attack:
             self._subscribe(message_class(f'std_msgs/msg/{KINDS_OF[topic]}'), topic, OWN)
         for topic in ('joint_states', 'estimated_joint_states', 'target_joint_states'):
             self._subscribe(JointState, topic, OWN)
-        self._subscribe(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        for topic in ('mae_checkpoint', 'accepted_checkpoint'):
+            self._subscribe(UInt8MultiArray, topic, LATCHED)
         take = self._diagnosed
         self.node.create_subscription(DiagnosticArray, '/diagnostics', take, OWN)  # type: ignore[arg-type]
 
@@ -333,7 +334,7 @@ class Attack:
     def hostile(self, topic: str, kind: Any) -> Any:
         """Return a message: one that was heard, changed; or one that was never sane."""
         rng, last = self.rng, self.genuine.get(topic)
-        if topic == 'mae_checkpoint' and last is not None and rng.random() < 0.7:
+        if topic.endswith('_checkpoint') and last is not None and rng.random() < 0.7:
             return bytes_message(self._network(bytes(last.data)))
         if last is None or rng.random() < 0.3:
             return filled(kind(), rng)
@@ -432,7 +433,7 @@ class Attack:
         self.publishers.clear()
 
 
-LATCHING = ('mae_checkpoint', 'anomaly_detected')
+LATCHING = ('mae_checkpoint', 'accepted_checkpoint', 'anomaly_detected')
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
 
 

@@ -21,7 +21,13 @@ from network_attacks import ATTACKS
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation.gate import FLOOR, LEAST_CUT, LIMITS, WORSE, Gate
+from musculoskeletal_ae.estimation.checkpoint_validation import (
+    FLOOR,
+    LEAST_CUT,
+    LIMITS,
+    WORSE,
+    CheckpointValidator,
+)
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
@@ -72,7 +78,7 @@ class Spread:
         self.most: defaultdict[str, float] = defaultdict(float)
         self.least_cut, self.refused, self.count = np.inf, list[str](), 0
 
-    def take(self, gate: Gate, mae: Mae, name: str) -> None:
+    def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
         """Measure a network, and try it."""
         self.count += 1
         values = {key: share.max() for key, share in filter(None, gate.posture_errors(mae))}
@@ -94,7 +100,7 @@ class Spread:
 
 def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
     """Let a learner learn of one individual, each of its checkpoints through a gate; the last."""
-    robot, gate = arm.robot, Gate(arm.robot)
+    robot, gate = arm.robot, CheckpointValidator(arm.robot)
 
     def script(arm: Arm, time: float) -> None:
         arm.set_payload(LOAD * (time // MINUTE % 2))
@@ -137,7 +143,7 @@ def main(argv: list[str]) -> int:
     initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
     networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
     for _, mae in networks:
-        spread.take(Gate(robot), mae, 'initial')
+        spread.take(CheckpointValidator(robot), mae, 'initial')
     for seed in args.seeds:
         for preset, mae in initial.items():
             arm = make_arm(robot, seed, args.reality)
@@ -153,7 +159,7 @@ def main(argv: list[str]) -> int:
         passed = []
         for name, mae in networks:
             try:
-                Gate(robot).check(change(mae))
+                CheckpointValidator(robot).check(change(mae))
                 passed.append(name)
             except GateError:
                 pass

@@ -32,7 +32,10 @@ class CheckpointError(MusculoskeletalError):
 
 
 class GateError(CheckpointError):
-    """A checkpoint that does not explain the arm (`estimation/gate.py`); the one in use stays."""
+    """A checkpoint that does not explain the arm; the one in use stays.
+
+    `estimation/checkpoint_validation.py` has the rules.
+    """
 
     reason = 'does not explain the arm'
 

@@ -97,7 +97,7 @@ def parameters_of(settings: type) -> dict[str, Parameter]:
 ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')
 RATE = Parameter(100.0, 'rate of the muscle modules', 'Hz', (1.0, 1000.0))
 CHECKPOINT = Parameter(
-    '', 'file of a trained network (empty: wait for one on mae_checkpoint)', settable=True
+    '', 'file of a trained network (empty: wait for one by topic)', settable=True
 )
 PRESET = Parameter(
     DEFAULT.name, 'the best we can measure, or as printed in the paper', legal=tuple(PRESETS)

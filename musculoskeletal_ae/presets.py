@@ -72,7 +72,8 @@ class Preset(Strict, frozen=True):
     training: TrainingSettings  # initial training
     corrected_body: bool  # learn online by fitting the calibrated body; else on the samples alone
     least_samples: Count  # from how many samples on it learns online
-    gated: bool  # the learner tries what it learned by `estimation.gate`; as printed it does not
+    #: the learner validates what it learned (`estimation.checkpoint_validation`); as printed not
+    gated: bool
     equilibrium: bool  # control, simulate by the solved balance of torques; else as printed
     to_limits: Share  # share of a joint's targets that exploration takes at its limits
     whitened: bool  # d, physics and posture decide what is an anomaly; else A alone, as printed

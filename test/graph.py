@@ -119,7 +119,7 @@ class Graph:
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.processes: list[Process] = []
         self.hosted: list[Node] = []
-        self.networks: Any = None  # their publisher, once there is one
+        self.networks: dict[str, Any] = {}  # their publishers, by topic
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -167,11 +167,11 @@ class Graph:
         self.wait(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {topic}')
         return publisher
 
-    def send_network(self, data: bytes) -> None:
+    def send_network(self, data: bytes, topic: str = 'mae_checkpoint') -> None:
         """Publish the bytes of a checkpoint once somebody listens."""
-        if self.networks is None:
-            self.networks = self.publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        self.networks.publish(bytes_message(data))
+        if topic not in self.networks:
+            self.networks[topic] = self.publisher(UInt8MultiArray, topic, LATCHED)
+        self.networks[topic].publish(bytes_message(data))
 
     def spin(self, seconds: float) -> None:
         """Handle messages for a while."""

@@ -90,7 +90,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'unfit checkpoint',
-            f'stop whoever publishes mae_checkpoint of another robot; {RESET}',
+            f'stop whoever publishes accepted_checkpoint of another robot; {RESET}',
         ),
     )
     NO_CHECKPOINT = (

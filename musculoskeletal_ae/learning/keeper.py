@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning.samples import SampleStore
@@ -86,7 +86,7 @@ class CheckpointKeeper:
             StateError: If the directory cannot be used.
         """
         self.mae: Mae | None = None
-        self.validation = Gate(robot)
+        self.validation = CheckpointValidator(robot)
         self.publication = Publication()
         self.rejected, self.last_rejected = 0, ''
         self._torque = HealthyTorque(robot)

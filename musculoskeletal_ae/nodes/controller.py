@@ -62,7 +62,7 @@ class Controller(Shell):
         checks = {'joint_stiffness': self._check_stiffness, 'method': self._check_method}
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name), checks.get(name))
-        self.follow_checkpoints(
+        self.follow_accepted_checkpoints(
             self.core.use, lambda reason: self.core.stop(StopCause.UNFIT_CHECKPOINT, reason)
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
@@ -121,22 +121,15 @@ class Controller(Shell):
 
     def _use_offsets(self, *_: object) -> None:
         self.core.use_body(self.core.stream.body.with_offsets(self.zeros))
-        self.gate.forget()
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
-        self.gate.isolated = muscles
         self.core.use_body(self.core.stream.body.with_isolated(muscles))
 
     def _muscles(self, message: Float64MultiArray) -> None:
-        now = time.monotonic()
-        self.core.take(message, now)
-        if self.zeros.known and self.core.sample is not None:
-            length, tension, _ = self.core.sample.newest
-            self.gate.message(tension, length, now)
+        self.core.take(message, time.monotonic())
 
     def _anomaly(self, detected: bool) -> None:
         self.core.anomaly(detected)
-        self.take_anomaly(detected)
 
     def _estimated(self, theta: Array) -> None:
         self.core.estimated(theta, time.monotonic())

@@ -26,6 +26,7 @@ from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Frames, Markers
+from musculoskeletal_ae.nodes.candidates import Candidates
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
     RELIABLE,
@@ -49,6 +50,7 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
+        self.candidates = Candidates(self, self._use)
         self._advertise()
         # What was published last on the latched topics; None: nothing yet.
         self.published_anomaly = False
@@ -63,7 +65,7 @@ class Estimator(Shell):
             # Until there is a network, nobody moves by what the sensors read.
             self.core.forget_offsets()
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
-        self.follow_checkpoints(self._use)
+        self.candidates.follow()
         if self.parameter('isolate_muscles'):
             self._isolate(set(self.muscles_to_isolate))
         for name in parameters_of(Detection):
@@ -149,7 +151,7 @@ class Estimator(Shell):
         cause = self.core.cause
         self.core.reset()
         self.published_anomaly = False
-        self.take_anomaly(False)
+        self.candidates.on_anomaly(False)
         self.detected.publish(Bool(data=False))
         self._publish_isolated()
         return f'cleared: {cause}' if cause else 'nothing was detected'
@@ -198,7 +200,7 @@ class Estimator(Shell):
         if self.frames is not None and self.tf_source == 'estimate':
             self.frames.publish(state.theta)
         if self.core.body.offsets.known:
-            self.gate.message(sample.motor_tension, sample.length, now)
+            self.candidates.validator.message(sample.motor_tension, sample.length, now)
         self.joints.publish(joint_message(self.robot.joints, state.theta, stamp))
         if output.covariance is not None and is_heard(self.covariance):
             self.covariance.publish(array_message(output.covariance, 'joint', 'joint'))
@@ -232,21 +234,21 @@ class Estimator(Shell):
             else:
                 text = self.core.suspects.last_verification
             self.get_logger().warning(text)
-            self.take_anomaly(detected)
+            self.candidates.on_anomaly(detected)
             self._report()  # the suspect is known with the anomaly, not a second later
         self._publish_isolated()
 
     def _publish_isolated(self) -> None:
         isolated = self.core.body.isolated
         if isolated != self.published_isolated:
-            self.published_isolated = self.gate.isolated = isolated
+            self.published_isolated = self.candidates.validator.isolated = isolated
             self.isolated.publish(String(data=self.robot.names(isolated)))
 
     def _publish_offsets(self) -> None:
         offsets = self.core.body.offsets
         if offsets is not self.published_offsets:
             self.published_offsets = self.zeros = offsets
-            self.gate.forget()
+            self.candidates.validator.forget()
             rows = np.stack([offsets.offset, offsets.deviation])
             self.offsets.publish(array_message(rows, 'quantity', 'muscle'))
 

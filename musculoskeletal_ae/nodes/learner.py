@@ -72,7 +72,6 @@ class Learner(Shell):
         self.follow_muscle_messages(self._take_muscle_states)
         self.follow_anomaly(core.anomaly)
         self.has_heard_isolated = False
-        self.gate = self.core.keeper.validation
         self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')

@@ -31,7 +31,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     MessageError,
@@ -40,10 +40,7 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.checkpoint_validation import (
-    CHECKPOINT_TOPIC,
-    CheckpointValidation,
-)
+from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
@@ -106,6 +103,7 @@ class Shell(Node):
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
+        self.checkpoint_version: int | None = None  # of the network in use
         self.needed: list[str] = []  # topics without which the node has nothing to do
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
@@ -259,52 +257,63 @@ class Shell(Node):
 
     # -- checkpoints ----------------------------------------------------------------------------
 
-    def follow_checkpoints(
+    def follow_accepted_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Use checkpoints from the parameter and the topic that pass the gate.
+        """Use the network that the estimator has accepted, or until there is one that of a file.
 
-        `unfit` is told why one that came by topic cannot be used; the one in use stays. Validation
-        is given up if a file is chosen, or an anomaly is detected.
+        `unfit` is called with the reason if a network cannot be computed with; the one in use
+        stays. While several nodes publish accepted networks, none of theirs is used.
         """
-        gate = self.gate = Gate(self.robot)
+        has_accepted = False
 
-        def take(mae: Mae) -> None:
+        def put_to_use(mae: Mae) -> None:
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
                 raise CheckpointError(f'cannot be computed with ({error})') from error
-            gate.take(mae, time.monotonic())
+            self.checkpoint_version = mae.version
+            self.stop_waiting_for(ACCEPTED)
 
-        def load(path: str) -> Mae | None:
-            return checkpoint.load(path, self.robot) if path else None
-
-        def validate(message: UInt8MultiArray) -> Iterator[None]:
+        def handle(message: UInt8MultiArray) -> Iterator[None]:
             mae = checkpoint.from_bytes(bytes(message.data), self.robot)
             yield
-            yield from gate.trial(mae)
-            take(mae)
+            while self.count_publishers(topic) > 1:
+                yield
+            put_to_use(mae)
+            nonlocal has_accepted
+            has_accepted = True
 
-        self.validation = CheckpointValidation(self, self._reception, validate, unfit)
+        def use_file(mae: Mae) -> None:
+            if has_accepted:
+                raise MusculoskeletalError(
+                    'all nodes use the network of the estimator; set its `checkpoint` instead'
+                )
+            CheckpointValidator(self.robot).check(mae)
+            put_to_use(mae)
 
-        def from_file(mae: Mae) -> None:
-            gate.check(mae)
-            take(mae)
-            self.validation.give_up()
-            self.needed = [topic for topic in self.needed if topic != 'mae_checkpoint']
+        topic = self.resolve_topic_name(ACCEPTED)
+        self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
+        self.needed.append(ACCEPTED)
+        self.follow_parameter('checkpoint', use_file, self.load_checkpoint)
+        self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
-        def anomaly(detected: bool) -> None:
-            if detected and gate.mae is not None:
-                self.validation.give_up()
-            before = gate.anomaly(detected, time.monotonic())
-            if before is not None:
-                self.get_logger().warning(f'back to checkpoint version {before.version}')
-                use(before)
+    def load_checkpoint(self, path: str) -> Mae | None:
+        """Return the network of a file, which has to be one of this robot; None without a path."""
+        return checkpoint.load(path, self.robot) if path else None
 
-        self.take_anomaly = anomaly
-        self.needed.append('mae_checkpoint')
-        self.follow_parameter('checkpoint', from_file, load)
-        self.listen(UInt8MultiArray, CHECKPOINT_TOPIC, self.validation.propose, LATCHED)
+    def checkpoint_queue(
+        self,
+        topic: str,
+        handle: Callable[[UInt8MultiArray], Iterator[None]],
+        unfit: Callable[[str], None] = lambda _: None,
+    ) -> CheckpointQueue:
+        """Return what handles the checkpoints of a topic in small steps."""
+        return CheckpointQueue(self, self._reception, topic, handle, unfit)
+
+    def stop_waiting_for(self, topic: str) -> None:
+        """Report this topic as missing no longer."""
+        self.needed = [other for other in self.needed if other != topic]
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -323,7 +332,7 @@ class Shell(Node):
             topic,
             callback,
             lambda: self.count_publishers(full),
-            is_used_at_once=topic != CHECKPOINT_TOPIC,
+            is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
         )
         # rclpy accepts (message, info) callbacks; its annotations do not know them.
         raw = recording is not None
@@ -467,6 +476,8 @@ class Shell(Node):
         except Exception as error:  # noqa: BLE001 - who reports nothing seems well
             self.on_callback_error(TIMER, error)
             report = Report('error', self._fault, {})
+        if self.checkpoint_version is not None:
+            report.values.setdefault('checkpoint version', str(self.checkpoint_version))
         if self._fault:
             values = {**report.values, 'fault': self._fault}
             report, self._fault = Report('error', self._fault, values), ''

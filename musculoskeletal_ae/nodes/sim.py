@@ -7,7 +7,6 @@ sim/external_wrench, held by sim/fixed_joint_states. A command holds until the n
 the first, muscles are at T_bias. muscle_tension_command is not followed, and modules stay at 25 °C.
 """
 
-import time
 from functools import partial
 from typing import Any
 
@@ -41,13 +40,11 @@ class Sim(Arm):
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         self.needed.append('muscle_length_command')
-        self.follow_checkpoints(self._use_checkpoint)
+        self.follow_accepted_checkpoints(self._use_checkpoint)
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not self.as_robot:  # which is the modules themselves
-            self.follow_zeros(lambda *_: self.gate.forget())
-            self.follow_muscle_states(self._note)
-        self.follow_anomaly(self.take_anomaly)
+            self.follow_zeros(lambda *_: None)  # `zeros` are those of the commands
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
@@ -57,24 +54,18 @@ class Sim(Arm):
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
             if not self.as_robot:
-                arm.isolate(self.gate.isolated)
+                arm.isolate(self.left_out)
             arm.settle()
             self.arm = arm
         else:
             self.arm.use(mae)
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:
-        self.gate.isolated = muscles
         if self.arm is not None and not self.as_robot:  # whose modules pull whatever is suspected
             self.arm.isolate(muscles)
 
     def _command(self, length: Array) -> None:
         self.command = length - self.zeros.offset
-
-    def _note(self, states: Array) -> None:
-        length, tension, _ = states
-        if self.zeros.known:
-            self.gate.message(tension, length, time.monotonic())
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

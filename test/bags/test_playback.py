@@ -76,16 +76,16 @@ def test_a_window_lies_within_the_bag(bag, content):
 def test_what_was_latched_before_the_start_comes_first(bag, content):
     opened = Bag.open(bag)
     names = (
-        'anomaly_detected', 'isolated_muscles', 'mae_checkpoint', 'muscle_length_zeros',
-        'robot_description',
+        'accepted_checkpoint', 'anomaly_detected', 'isolated_muscles', 'mae_checkpoint',
+        'muscle_length_zeros', 'robot_description',
     )  # fmt: skip
     assert latched_topics(opened) == {f'/left_arm/{name}' for name in names}
     last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]
     found = list(lap(opened, opened.topics, content[40].log_time, opened.end))
-    assert sorted(m.data for m in found[:5]) == sorted(sample.data for sample in last)
+    assert sorted(m.data for m in found[: len(names)]) == sorted(sample.data for sample in last)
     # They are due at once, and do not turn back recorded time.
-    assert {m.log_time for m in found[:5]} == {content[40].log_time - 1}
-    assert [m.data for m in found[5:]] == [sample.data for sample in content[40:]]
+    assert {m.log_time for m in found[: len(names)]} == {content[40].log_time - 1}
+    assert [m.data for m in found[len(names) :]] == [sample.data for sample in content[40:]]
 
 
 def motion(tmp_path, times, first=()):

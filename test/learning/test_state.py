@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles
 
-from musculoskeletal_ae.estimation.gate import Gate
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.learner import Learner
@@ -393,7 +393,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
         raise GateError('it does not explain the arm')
 
     with monkeypatch.context() as patch:
-        patch.setattr(Gate, 'check', refuse)
+        patch.setattr(CheckpointValidator, 'check', refuse)
         messages = []
         for _ in range(2):  # no network replaces it
             with closing(Learner(arm26, trainer=Prepared, directory=tmp_path / 'state')) as again:

@@ -126,7 +126,7 @@ def test_an_unfit_checkpoint_file_is_refused_and_one_by_topic_stops_the_arm(movi
     assert 'nowhere' in reason
     arm.goes_to(HERE)
     assert 'stopped' not in arm.state().message
-    arm.graph.send_network(b'not a checkpoint')
+    arm.graph.send_network(b'not a checkpoint', 'accepted_checkpoint')
     arm.says('unfit checkpoint')
     assert reset(arm).success
     arm.says('holding')  # with the network in use

@@ -50,6 +50,7 @@ def test_commands_checkpoints_and_targets_have_one_source():
         ('muscle_length_command', 'controller'),
         ('muscle_tension_command', 'controller'),
         ('mae_checkpoint', 'learner'),
+        ('accepted_checkpoint', 'estimator'),
         ('target_joint_states', 'operator'),
         ('joint_trajectory', 'operator'),
         ('target_pose', 'operator'),

@@ -148,15 +148,21 @@ def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae,
     graph.host(Sim, robot='arm26')
     graph.wait(lambda: 'waiting for a checkpoint' in graph.report('sim').message, 'the report')
     assert not graph.received['sim/joint_states']
-    graph.send_network(b'not a network')
-    graph.wait(lambda: 'rejected mae_checkpoint' in str(graph.report('sim').values), 'the refusal')
+    graph.send_network(b'not a network', 'accepted_checkpoint')
+    graph.wait(
+        lambda: 'rejected accepted_checkpoint' in str(graph.report('sim').values), 'the refusal'
+    )
     for version in (41, 42):
-        graph.send_network(checkpoint.to_bytes(replace(mae, version=version)))
+        data = checkpoint.to_bytes(replace(mae, version=version))
+        graph.send_network(data, 'accepted_checkpoint')
         reported = f"'checkpoint version': '{version}'"
         graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
-    assert graph.set_parameter('sim', 'checkpoint', trained_file)[0]
+    # There is one network for all nodes.
+    done, reason = graph.set_parameter('sim', 'checkpoint', trained_file)
+    assert not done
+    assert 'of the estimator' in reason
 
 
 def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.estimation import gate
+from musculoskeletal_ae.estimation import checkpoint_validation
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
@@ -36,15 +36,15 @@ def arm(graph, arm26, trained_file):
     return arm
 
 
-def test_a_bad_network_is_refused_by_every_node_and_the_arm_goes_on(arm, trained, trained_file):
+def test_a_bad_network_is_rejected_for_all_nodes_and_the_arm_goes_on(arm, trained, trained_file):
+    bad = replace(ATTACKS['weights × 1.5'](trained['default']), version=66)
     sim = arm.graph.host(Sim, robot='arm26', checkpoint=trained_file)
-    nodes = [arm.controller, arm.estimator, sim]
-    before = [node.gate.mae for node in nodes]
-    arm.graph.send_network(checkpoint.to_bytes(ATTACKS['weights × 1.5'](trained['default'])))
-    arm.graph.wait(lambda: all(node.rejected[REFUSED] for node in nodes), 'the refusals')
-    assert [node.gate.mae for node in nodes] == before
-    for node in nodes:
-        assert 'unexplained on the geometric model, limit' in node._reception.last_rejected
+    arm.graph.send_network(checkpoint.to_bytes(bad))
+    arm.graph.wait(lambda: arm.estimator.rejected[REFUSED], 'the rejection')
+    why = arm.estimator._reception.last_rejected
+    assert 'unexplained on the geometric model, limit' in why
+    assert 66 not in (arm.estimator.core.mae.version, arm.controller.core.mae.version)
+    assert sim.arm.mae.version != 66
     arm.goes_to(HERE)
     assert arm.controller.core.supervisor.is_running
     arm.never_jumped()
@@ -56,48 +56,57 @@ def test_a_file_with_a_bad_network_is_refused_with_figure_and_limit(
     learner = arm.graph.host(Learner, robot='arm26', checkpoint=trained_file, state_directory='')
     bad = tmp_path / 'bad.safetensors'
     checkpoint.save(ATTACKS['noise of 100 %'](trained['default']), bad)
-    for node in ('estimator', 'controller', 'learner'):
+    for node in ('estimator', 'learner'):
         done, reason = arm.graph.set_parameter(node, 'checkpoint', str(bad))
         assert not done
         assert 'limit' in reason
     learner.core.close()
 
 
-def test_of_networks_received_during_a_validation_the_last_is_used(arm, trained):
+def test_of_networks_received_during_a_validation_the_last_is_used_by_all_nodes(arm, trained):
     nodes = arm.controller, arm.estimator
     for version in range(1, 21):
         mae = replace(trained['default'], version=version)
         arm.graph.send_network(checkpoint.to_bytes(mae))
         arm.graph.executor.spin_once(LOOK)
-    arm.graph.wait(lambda: all(node.gate.mae.version == 20 for node in nodes), 'the last')
-
-
-def try_another(arm, mae):
-    """Let the controller begin to try a network."""
-    arm.graph.send_network(checkpoint.to_bytes(mae))
-    arm.graph.wait(lambda: arm.controller.validation.is_busy, 'the trial')
+    arm.graph.wait(lambda: all(node.core.mae.version == 20 for node in nodes), 'the last')
+    for name in ('controller', 'estimator'):
+        arm.graph.wait(
+            lambda name=name: arm.graph.report(name).values.get('checkpoint version') == '20',
+            f'the version of {name}',
+        )
 
 
 def test_an_anomaly_cancels_the_validation_of_a_network(arm, trained):
-    first = arm.controller.gate.mae
-    try_another(arm, trained['paper'])
-    arm.controller.take_anomaly(True)
-    arm.graph.wait(lambda: not arm.controller.validation.is_busy, 'the end of the trial')
-    assert arm.controller.core.mae is arm.controller.gate.mae is first
-
-
-def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(arm, trained, monkeypatch):
-    monkeypatch.setattr(gate, 'PROOF', 1e6)  # however slow the machine is
-    core = arm.controller.core
-    first = arm.controller.gate.mae
+    estimator = arm.estimator
+    first, candidates = estimator.core.state.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(trained['paper']))
-    arm.graph.wait(lambda: arm.controller.gate.mae is not first, 'another network')
-    detected = arm.graph.publisher(Bool, 'anomaly_detected', LATCHED)
-    detected.publish(Bool(data=True))
-    arm.says('anomaly_detected')
-    assert arm.controller.gate.mae is core.mae is first
-    reset = arm.graph.call(Trigger, 'controller/reset')
-    assert 'anomaly' in reset.message
+    arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
+    candidates.on_anomaly(True)
+    arm.graph.wait(lambda: not candidates.queue.is_busy, 'the end of the validation')
+    assert estimator.core.state.complete_mae is first
+
+
+def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_nodes(
+    arm, trained, monkeypatch
+):
+    monkeypatch.setattr(checkpoint_validation, 'PROOF', 1e6)  # however slow the machine is
+    nodes = arm.estimator, arm.controller
+    first = trained['default'].version
+    network = replace(trained['paper'], version=first + 1)
+    arm.graph.send_network(checkpoint.to_bytes(network))
+    arm.graph.wait(lambda: all(n.core.mae.version == first + 1 for n in nodes), 'the new one')
+    arm.estimator.candidates.on_anomaly(True)
+    arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven one')
+
+
+def test_while_several_nodes_publish_accepted_networks_none_of_theirs_is_used(arm, trained):
+    controller, before = arm.controller, arm.controller.core.mae
+    stranger = replace(trained['paper'], version=77)
+    arm.graph.send_network(checkpoint.to_bytes(stranger), 'accepted_checkpoint')
+    arm.graph.wait(lambda: controller.accepted.is_busy, 'the network of the stranger')
+    arm.graph.spin(0.5)
+    assert controller.core.mae is before
 
 
 def test_impossible_length_offsets_are_refused_and_move_nothing(arm):

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A candidate network is tried beside the one in use before it takes over.
+"""Checkpoint validation: a candidate network has to explain the arm before it takes over.
 
-    postures   what it restores of (θ, T, l), and of G, through ① on a fixed set of postures of the
-               geometric model, and through ② and ③ on those with the lengths of ①: the root mean
+It is checked beside the network in use:
+
+    postures   Through ①, on a fixed set of postures of the geometric model: what it restores of
+               (θ, T, l), and of G. Through ② and ③, the same with the lengths of ①. The root mean
                square error of each joint or muscle, as a share of what there is to explain, is at
-               most LIMITS. Lengths of a real arm differ from the model's by centimetres, but ②
-               and ③ have to agree with ①.
-    messages   what it leaves of T and l through ②, and of l through ① at the θ of ②, on the last
-               seconds of the node's own healthy messages: the median of each muscle is at most
-               WORSE times that of the network in use, or FLOOR; not asked of the first network
-    detector   a calibrated one is quiet on those messages, and would not be on the same with a
-               muscle cut
+               most LIMITS. The lengths of a real arm differ from those of the model by centimetres,
+               but ② and ③ have to agree with ①.
+    messages   On the last seconds of the healthy messages of this node: what it leaves of T and l
+               through ②, and of l through ① at the θ of ②. The median of each muscle is at most
+               WORSE times that of the network in use, or FLOOR. The first network is not checked.
+    detector   A calibrated detector finds nothing on those messages, and would find a muscle that
+               is ruptured.
 
-A share of 1 is what a network reaches that always says the same. Of a joint that the muscles tell
-little of, as where several postures have the same lengths, θ may be left unexplained UNTOLD times
-as much as the best affine map of (T, l) leaves it, if that is more, but not in the mean. LIMITS,
-WORSE, FLOOR and LEAST_CUT leave a margin to the largest that healthy networks showed: initial and
-learned ones of both presets on both shipped robots and both bodies (`python -m bench gate` prints
-them, beside those of attacks).
+A network that always answers the same reaches a share of 1. Where the muscles determine a joint
+only poorly, as where several postures have the same lengths, its error may be UNDETERMINED times
+that of the best affine map of (T, l), if that is more; its mean error may not. LIMITS, WORSE, FLOOR
+and LEAST_CUT leave a margin to the largest values of healthy networks: initial and learned ones of
+both presets, on both shipped robots and both emulator models (`python -m bench gate` prints them,
+beside those of attacks).
 
-On an anomaly the newest network that has been in use for PROOF without one comes back.
+After an anomaly, the newest network that has been in use for PROOF seconds without one comes back.
 """
 
 import math
@@ -41,10 +43,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 64
 SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept
-LEAST = 20  # messages that say something
+LEAST = 20  # messages that are enough to judge by
 PROOF = 10.0  # [s]
 MOST_USED = 20  # networks that are kept to go back to
-LONGEST_PERIOD = 0.5  # [s] without messages in which a wire may have slid anywhere
+LONGEST_PERIOD = 0.5  # [s] without messages in which a tendon may have slid anywhere
 NOTICED = 2.0  # [s] before an anomaly is noticed in which messages were already wrong
 
 #: largest share left unexplained of the fixed postures
@@ -52,7 +54,7 @@ LIMITS = {
     'θ by ①': 0.6,
     'T by ①': 1.35,  # two muscles exchanged show √2
     'l by ①': 1.7,
-    'θ by ②': 1.3,  # of a joint that the muscles do not tell, 1
+    'θ by ②': 1.3,  # of a joint that the muscles do not determine, 1
     'T by ②': 1.35,
     'l by ②': 0.6,
     'θ by ③': 0.7,
@@ -64,14 +66,19 @@ LIMITS = {
 }
 #: lengths [m] and moment arms [m] that spread less are not to be explained better than larger ones
 LEAST_SPREAD, LEAST_ARM = 0.04, 0.01
-UNTOLD, AFFINE = 1.2, 1000  # postures that the affine map is fitted to; as many say what it leaves
+UNDETERMINED = 1.2
+AFFINE = 1000  # postures that the affine map is fitted to; its error is that on as many others
 WORSE = 2.0
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
 LEAST_CUT = 0.1  # d of messages with a muscle cut over the threshold, the clearest muscle
 
 
-class Gate:
-    """What a node's network has to pass. Times `now` are of one steady clock [s]."""
+class CheckpointValidator:
+    """Accepts or rejects candidates. Times `now` are of one steady clock [s].
+
+    Attributes:
+        isolated: Muscles whose messages do not count (positions in T and l).
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -82,7 +89,7 @@ class Gate:
         self._direction, self._time = FrictionDirection(), math.inf
         self._used: list[tuple[float, Mae]] = []  # since when which network was in use
         self._anomaly = False
-        self.isolated: tuple[int, ...] = ()  # muscles whose messages say nothing
+        self.isolated: tuple[int, ...] = ()
 
     def _states(self, count: int) -> tuple[Array, Array, Array]:
         """Return θ, T and l of random states of the geometric model."""
@@ -93,17 +100,17 @@ class Gate:
         return theta, pull, robot.muscle_lengths(theta, pull)
 
     @cached_property
-    def _untold(self) -> Array:
-        """The share that may be left of each joint's angle, by what the muscles tell of it (D,)."""
+    def _undetermined(self) -> Array:
+        """The share of each joint's angle that may be left, by what muscles determine of it."""
         theta, *told = self._states(2 * AFFINE)
         given = np.hstack([np.ones((2 * AFFINE, 1)), *(part / part.std() for part in told)])
         affine = np.linalg.lstsq(given[:AFFINE], theta[:AFFINE])[0]
         left: Array = _size((given @ affine - theta)[AFFINE:]) / theta.std(axis=0)
-        return UNTOLD * left
+        return UNDETERMINED * left
 
     @cached_property
     def _likely(self) -> str:
-        """What speaks for the robot's description, not the network, as the reason."""
+        """Why the robot description may be the reason and not the network, or ''."""
         told = told_of_jumps(self._robot)
         return f' ({told})' if told else ''
 
@@ -130,19 +137,23 @@ class Gate:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the messages, as when lengths are measured from other zeros."""
+        """Forget the messages, as when the length offsets change."""
         self._messages.clear()
         self._direction.reset()
 
     def check(self, mae: Mae) -> None:
-        """Try a network; a GateError says that it does not explain the arm, and why none may."""
+        """Check a network.
+
+        Raises:
+            GateError: If it does not explain the arm.
+        """
         try:
             deque(self.trial(mae), maxlen=0)
         except GateError as error:
             raise GateError(f'{error}{self._likely}') from error
 
     def trial(self, mae: Mae) -> Iterator[None]:
-        """Try a network in pieces of some milliseconds, between which a node may go on."""
+        """Check a network in steps of some milliseconds, between which a node may go on."""
         found, pieces = list[str](), self._faults(mae)
         while True:
             with np.errstate(all='ignore'):
@@ -168,7 +179,7 @@ class Gate:
             return None
         self._anomaly = detected
         if not detected:
-            self._messages.clear()  # a mended arm may be another one
+            self._messages.clear()  # a repaired arm may differ
             return None
         while self._messages and now - self._messages[-1][0] < NOTICED:
             self._messages.pop()
@@ -204,7 +215,7 @@ class Gate:
         error, size = map(_size, by_muscle)
         yield 'G by ①', error / np.maximum(size, LEAST_ARM)
 
-    def _seen_by(self, mae: Mae) -> tuple[Array, Array]:
+    def _with_friction_of(self, mae: Mae) -> tuple[Array, Array]:
         """Return T_end [N] and l [m] of the messages (N, M), by a network's friction."""
         _, tension, length, direction = map(np.array, zip(*self._messages))
         return end_tension(mae.friction, tension, direction), length
@@ -213,7 +224,7 @@ class Gate:
         """Return what is left of T [N] and l [m] of the messages, of each muscle; {} if too few."""
         if len(self._messages) < LEAST:
             return {}
-        tension, length = self._seen_by(mae)
+        tension, length = self._with_friction_of(mae)
         restored = mae.estimate(tension, length)
         used = np.delete(np.arange(self._robot.muscle_count), self.isolated)
         parts = (
@@ -235,7 +246,7 @@ class Gate:
         if statistics is None or not statistics.calibrated or len(self._messages) < LEAST:
             return
         threshold = statistics.thresholds.get(DISTANCE, np.inf)
-        tension, length = self._seen_by(mae)
+        tension, length = self._with_friction_of(mae)
 
         def distance(tension: Array, length: Array) -> float:
             state = mae.estimate(tension, length)
@@ -259,7 +270,7 @@ class Gate:
             name, share = item
             limit = np.full(len(share), LIMITS[name])
             if name[0] == 'θ' and not share.max() <= LIMITS[name]:
-                limit = np.maximum(limit, self._untold)
+                limit = np.maximum(limit, self._undetermined)
             over = share / limit
             if not over.max() <= 1.0:
                 worst = int(over.argmax())
@@ -267,7 +278,7 @@ class Gate:
                 of = 'on the geometric model' if name.endswith('①') else 'of the lengths of ①'
                 told = f'{share[worst]:.2g} unexplained {of}'
                 yield f'{name}, {who}: {told}, limit {limit[worst]:.3g}'
-        # How well a first network has to explain a body that differs from its model, nobody knows.
+        # It is unknown how well a first network has to explain a body that differs from its model.
         left = {} if self.mae is None else self.message_errors(mae)
         before = {} if self.mae is None else self.message_errors(self.mae.without(self.isolated))
         yield ''

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints from a topic are validated in small steps, so that commands stay on time."""
+"""Checkpoints from a topic are handled in small steps, so that commands stay on time."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,33 +11,36 @@ from std_msgs.msg import UInt8MultiArray
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.reception import Reception
 
-CHECKPOINT_TOPIC = 'mae_checkpoint'
-#: Time between steps [s]. A step takes a few milliseconds, so that a quarter of a core at most goes
-#: to validation: several nodes validate at once.
+#: What the learner proposes, and what the estimator has accepted for all nodes.
+CANDIDATES, ACCEPTED = 'mae_checkpoint', 'accepted_checkpoint'
+#: Time between steps [s]. A step takes a few milliseconds: at most a quarter of a core is used.
 STEP_PERIOD = 0.02
 
 
-class CheckpointValidation:
-    """Validates one candidate at a time; of those that arrive meanwhile, only the last one next."""
+class CheckpointQueue:
+    """Handles one checkpoint at a time; of those that arrive meanwhile, only the last one next."""
 
     def __init__(
         self,
         node: Node,
         reception: Reception,
-        validate: Callable[[UInt8MultiArray], Iterator[None]],
-        unfit: Callable[[str], None],
+        topic: str,
+        handle: Callable[[UInt8MultiArray], Iterator[None]],
+        unfit: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Nothing is validated yet.
+        """Begin with nothing to do.
 
         Args:
             node: Its timer makes the steps.
-            reception: Counts the candidates.
-            validate: Returns the steps of one candidate. They raise a MusculoskeletalError to
-                reject it; the last one puts it to use.
-            unfit: Is called with the reason if a candidate cannot be computed with. One that does
+            reception: Counts the checkpoints that were used and rejected.
+            topic: Where they come from.
+            handle: Returns the steps of one checkpoint. They raise a MusculoskeletalError to reject
+                it; the last one puts it to use.
+            unfit: Is called with the reason if a checkpoint cannot be computed with. One that does
                 not explain the arm (GateError) is only rejected.
         """
-        self._reception, self._validate, self._unfit = reception, validate, unfit
+        self._reception, self._topic = reception, topic
+        self._handle, self._unfit = handle, unfit
         self._next: UInt8MultiArray | None = None
         self._steps: Iterator[None] | None = None
         clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -46,17 +49,17 @@ class CheckpointValidation:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a candidate is being validated, or is the next one."""
+        """Whether a checkpoint is being handled, or is the next one."""
         return self._steps is not None or self._next is not None
 
     def propose(self, message: UInt8MultiArray) -> None:
-        """Validate a candidate as soon as the one before is done."""
+        """Handle a checkpoint as soon as the one before is done."""
         self._next = message
         if self._timer.is_canceled():
             self._timer.reset()
 
     def give_up(self) -> None:
-        """Forget the candidate that is being validated, and the next one."""
+        """Forget the checkpoint that is being handled, and the next one."""
         self._steps = self._next = None
         self._timer.cancel()
 
@@ -65,18 +68,18 @@ class CheckpointValidation:
             if self._next is None:
                 self._timer.cancel()
                 return
-            self._steps, self._next = self._validate(self._next), None
+            self._steps, self._next = self._handle(self._next), None
         steps = self._steps
         try:
             next(steps)
             return
         except StopIteration:
-            self._reception.note_used(CHECKPOINT_TOPIC)
+            self._reception.note_used(self._topic)
         except MusculoskeletalError as error:
             if isinstance(error, CheckpointError) and not isinstance(error, GateError):
                 self._unfit(str(error))
-            self._reception.reject(CHECKPOINT_TOPIC, error.reason, str(error))
+            self._reception.reject(self._topic, error.reason, str(error))
         except Exception as error:  # noqa: BLE001 - a received file may do anything
-            self._reception.reject_error(CHECKPOINT_TOPIC, error)
+            self._reception.reject_error(self._topic, error)
         if self._steps is steps:  # the last step may have given up, and started anew
             self._steps = None

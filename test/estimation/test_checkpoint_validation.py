@@ -11,8 +11,15 @@ import pytest
 from network_attacks import ATTACKS, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
+from musculoskeletal_ae.estimation.checkpoint_validation import (
+    FLOOR,
+    LIMITS,
+    MOST_USED,
+    NOTICED,
+    PROOF,
+    CheckpointValidator,
+)
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
-from musculoskeletal_ae.estimation.gate import FLOOR, LIMITS, MOST_USED, NOTICED, PROOF, Gate
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
@@ -47,7 +54,7 @@ def calibrated(mae):
 
 @pytest.mark.parametrize('preset', PRESETS)
 def test_trained_networks_pass_with_and_without_messages(trained, preset):
-    gate = Gate(ROBOT)
+    gate = CheckpointValidator(ROBOT)
     gate.check(trained[preset])
     gate.take(trained[preset], 0.0)
     seeing(gate)
@@ -63,7 +70,7 @@ def test_a_bad_network_is_refused_without_any_message_and_the_error_names_figure
     trained, preset, attack
 ):
     with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
-        Gate(ROBOT).check(ATTACKS[attack](trained[preset]))
+        CheckpointValidator(ROBOT).check(ATTACKS[attack](trained[preset]))
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
 
 
@@ -71,14 +78,14 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     arms = {name: behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items()}
     for name, robot in arms.items():
         with pytest.raises(GateError) as refusal:
-            Gate(robot).check(initial_mae(robot, steps=1).mae)
+            CheckpointValidator(robot).check(initial_mae(robot, steps=1).mae)
         reported = 'no network restores lengths that jump'
         assert (reported in str(refusal.value)) == (name == 'jumps')
     assert re.search(r': straightener \(\d+ mm\); see check_robot', str(refusal.value))
 
 
 def test_a_network_is_validated_in_many_steps_and_refused_at_the_last(trained):
-    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    gate, mae = CheckpointValidator(ROBOT), calibrated(trained['default'])
     gate.take(mae, 0.0)
     seeing(gate)
     whole = sum(1 for _ in gate.trial(mae))
@@ -91,7 +98,7 @@ def test_a_network_is_validated_in_many_steps_and_refused_at_the_last(trained):
 
 @pytest.mark.parametrize('attack', ON_MESSAGES)
 def test_a_network_that_the_geometric_model_accepts_is_refused_by_own_messages(trained, attack):
-    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    gate, mae = CheckpointValidator(ROBOT), calibrated(trained['default'])
     gate.take(mae, 0.0)
     bad = ON_MESSAGES[attack](mae)
     gate.check(bad)
@@ -101,7 +108,7 @@ def test_a_network_that_the_geometric_model_accepts_is_refused_by_own_messages(t
 
 
 def test_a_detector_with_too_high_or_too_low_threshold_is_refused(trained):
-    gate, mae = Gate(ROBOT), calibrated(trained['default'])
+    gate, mae = CheckpointValidator(ROBOT), calibrated(trained['default'])
     seeing(gate)
     gate.check(mae)
     for times, reported in (
@@ -115,7 +122,7 @@ def test_a_detector_with_too_high_or_too_low_threshold_is_refused(trained):
 
 
 def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(trained):
-    gate, old, new = Gate(ROBOT), trained['default'], trained['paper']
+    gate, old, new = CheckpointValidator(ROBOT), trained['default'], trained['paper']
     gate.take(old, 0.0)
     gate.take(new, 100.0)
     assert gate.anomaly(True, 100.0 + 0.6 * PROOF) is old
@@ -128,7 +135,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(trained)
 
 
 def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trained):
-    gate = Gate(ROBOT)
+    gate = CheckpointValidator(ROBOT)
     end = seeing(gate)
     before = gate.message_errors(trained['default'])
     tension, length = body()
@@ -170,7 +177,7 @@ def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(t
 
 
 def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(trained):
-    gate = Gate(ROBOT)
+    gate = CheckpointValidator(ROBOT)
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
         gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), 0.1 * k)
     left = gate.message_errors(trained['default'])
@@ -187,7 +194,7 @@ def test_a_learner_that_begins_anew_does_not_roll_back_to_a_network_of_before(tr
 
 
 def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
-    gate, first = Gate(ROBOT), trained['paper']
+    gate, first = CheckpointValidator(ROBOT), trained['paper']
     gate.take(first, 0.0)
     for _ in range(3 * MOST_USED):  # no message comes meanwhile
         gate.take(trained['default'], 0.0)

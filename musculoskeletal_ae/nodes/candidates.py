@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimator decides for all nodes which network is used.
+
+    mae_checkpoint (learner) ─► validation ─► accepted_checkpoint (estimator) ─► controller, sim
+
+Candidates come on the topic `mae_checkpoint`, or from a file by the parameter `checkpoint`. What is
+accepted is used by the estimator and published, latched. After an anomaly soon after a change, the
+network before is published again. No other node validates networks.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from std_msgs.msg import UInt8MultiArray
+
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.exceptions import CheckpointError
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES
+from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
+from musculoskeletal_ae.nodes.shell import Shell
+
+
+class Candidates:
+    """Validates candidates, and publishes what is accepted.
+
+    Attributes:
+        validator: The rules, and the messages that they are checked on.
+        queue: Candidates from the topic, which are validated in small steps.
+    """
+
+    def __init__(self, node: Shell, use: Callable[[Mae], None]) -> None:
+        """Begin without a network.
+
+        Args:
+            node: The estimator.
+            use: Puts an accepted network to use.
+        """
+        self._node, self._use = node, use
+        self.validator = CheckpointValidator(node.robot)
+        self._publisher = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
+        self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
+
+    def follow(self) -> None:
+        """Follow the topic, and the parameter `checkpoint`, beginning with its present value."""
+        node = self._node
+        node.needed.append(CANDIDATES)
+        node.follow_parameter('checkpoint', self._use_file, node.load_checkpoint)
+        node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
+
+    def on_anomaly(self, detected: bool) -> None:
+        """Take whether an anomaly is latched; a new network that may be its cause is replaced."""
+        if detected and self.validator.mae is not None:
+            self.queue.give_up()
+        before = self.validator.anomaly(detected, time.monotonic())
+        if before is not None:
+            self._node.get_logger().warning(f'back to checkpoint version {before.version}')
+            self._use(before)
+            self._publish(before)
+
+    def _validate(self, message: UInt8MultiArray) -> Iterator[None]:
+        mae = checkpoint.from_bytes(bytes(message.data), self._node.robot)
+        yield
+        yield from self.validator.trial(mae)
+        self._accept(mae, message)
+
+    def _use_file(self, mae: Mae) -> None:
+        self.validator.check(mae)
+        self._accept(mae)
+        self.queue.give_up()
+        self._node.stop_waiting_for(CANDIDATES)
+
+    def _accept(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+        try:
+            self._use(mae)
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            raise CheckpointError(f'cannot be computed with ({error})') from error
+        self.validator.take(mae, time.monotonic())
+        self._publish(mae, message)
+
+    def _publish(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+        self._node.checkpoint_version = mae.version
+        if message is None:
+            message = bytes_message(checkpoint.to_bytes(mae))
+        self._publisher.publish(message)
