@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from musculoskeletal_ae.control import stops_page
 from musculoskeletal_ae.robot.robot import Robot
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,6 +21,11 @@ def test_the_page_of_public_classes_is_up_to_date():
     page = make.api()
     assert '`_' not in page  # what is private is nothing to build on
     assert (ROOT / 'doc' / 'api.md').read_text('utf-8') == page, 'run: python doc/make.py'
+
+
+def test_the_page_of_stops_is_up_to_date():
+    remedy = 'run: python -m musculoskeletal_ae.control.stops_page > doc/stops.md'
+    assert (ROOT / 'doc' / 'stops.md').read_text('utf-8') == stops_page.page(), remedy
 
 
 def test_the_three_lines_of_python_of_the_readme_estimate_without_ros(trained_file, tmp_path):

@@ -33,8 +33,8 @@ class Settings:
     )
     target_duration: float = settable(
         1.2,
-        'movement to a target under `proposed`, longer where winches need it (0: a ramp of '
-        'lengths, first_duration)',
+        'movement to a target under `proposed` and `stiffness`, longer where winches need it '
+        '(0: first_duration)',
         's',
         0.0,
         60.0,

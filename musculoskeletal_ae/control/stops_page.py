@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page `doc/stops.md`, made from the declarations of modes and stop causes.
+
+python -m musculoskeletal_ae.control.stops_page > doc/stops.md
+"""
+
+from collections.abc import Iterable
+
+from musculoskeletal_ae.control import stops, supervisor
+
+INTRODUCTION = """\
+# Why the arm stops, and what lets it go on
+
+This page is generated from the code: `python -m musculoskeletal_ae.control.stops_page > \
+doc/stops.md`. While the arm is *running*, the mode that the controller reports is what the arm \
+does: {activities}. Otherwise the mode is one of {states}. A program compares these identifiers \
+and those of the causes: the latched topic `controller_mode` has the mode, or the mode and the \
+cause as `stopped:operator_stop`. The values `mode` and `stop cause` of the controller in \
+`/diagnostics` name the same.
+
+## Modes
+
+```mermaid
+{diagram}
+```
+
+## Causes
+
+The action `hold` keeps the last command; a stop that outlasts `hold_time` releases the arm. The \
+action `release` keeps the last command for `hold_time` and then pays all muscles out until each \
+pulls with T_bias. Of causes that begin together, the first in this table is reported.
+
+{table}
+"""
+
+
+def page() -> str:
+    """Return the page as Markdown."""
+    states = [state.value for state in supervisor.StopState]
+    states.remove(supervisor.StopState.RUNNING.value)
+    return INTRODUCTION.format(
+        activities=_listed(activity.value for activity in supervisor.Activity),
+        states=_listed(states),
+        diagram=supervisor.diagram(),
+        table=stops.table(),
+    )
+
+
+def _listed(identifiers: Iterable[str]) -> str:
+    return ', '.join(f'`{identifier}`' for identifier in identifiers)
+
+
+if __name__ == '__main__':
+    print(page(), end='')
