@@ -10,6 +10,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.verification import PATIENCE, Outcome, Verification
 from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 BIAS, STIFFNESS, DT = 30.0, 1e4, 0.01
 NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
@@ -104,7 +105,9 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert loop.core.cause.startswith(robot.muscles[2])
     assert loop.core.body.isolated == loop.core.mae.isolated == (2,)
     assert robot.isolated == ()  # others share it
-    assert 'verifying' in loop.core.report(loop.now).message
+    values = loop.core.report(loop.now).values
+    assert values['finding'] in ('residual_distance', 'slack_tendon')
+    assert values['verification'] == 'running'
     loop.command[2] -= 0.003
     loop.step(cut, 100)
     assert loop.core.cause == ''
@@ -118,6 +121,8 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     report = loop.core.report(loop.now)
     assert report.level == 'warn'
     assert report.values['isolated muscles'] == robot.muscles[2]
+    assert report.values['finding'] == report.values['verification'] == 'none'
+    assert report.values['last outcome'] == 'ruptured'
     loop.step(healthy, 30)  # it is repaired
     loop.core.isolate(())
     loop.step(healthy, 10)
@@ -201,6 +206,28 @@ def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, cali
         length = robot.muscle_lengths(theta, tension) + 1e-4 * rng.standard_normal(6)
         core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
     assert core.cause == ''
+
+
+@pytest.mark.parametrize(('on_anomaly', 'suspected'), [('isolate', True), ('stop', False)])
+def test_a_muscle_whose_length_jumps_and_stays_there_is_a_suspect_if_suspects_are_isolated(
+    robot, calibrated, healthy, on_anomaly, suspected
+):
+    quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
+    core, jumped, rejected = Estimator(robot), 3, 0
+    core.use(replace(calibrated, anomaly=quiet))
+    core.configure(Detection(on_anomaly=on_anomaly))
+    rng = np.random.default_rng(0)
+    for n in range(round((LIMITS.settled + 0.5) / DT)):
+        length = healthy.length + 1e-4 * rng.standard_normal(6)
+        length[jumped] += 0.05 * (n >= 20)
+        tension = healthy.tension + rng.standard_normal(6)
+        try:
+            core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+        except RejectionError:
+            rejected += 1
+    assert rejected > 50
+    assert core.body.isolated == ((jumped,) if suspected else ())
+    assert bool(core.cause) == suspected
 
 
 @pytest.mark.parametrize('scale', [1.0, 0.1])
