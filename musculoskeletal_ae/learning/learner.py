@@ -40,7 +40,6 @@ class Learner:
 
     Attributes:
         robot: The nominal body.
-        samples: What is learned from.
         collector: Turns messages into samples.
         scheduler: Decides when an update begins.
         trainer: Makes updates.
@@ -85,16 +84,14 @@ class Learner:
         self.trainer = trainer(robot, preset, seed)
         way = self.trainer.preset
         radian = robot.kinematics.radian
-        self.samples = SampleStore(settings, radian=radian)
+        samples = SampleStore(settings, radian=radian)
         healthy = Reservoir(robot.muscle_count, seed, settings, radian=radian)
-        self.collector = SampleCollector(
-            robot, self.samples, healthy, settings, period, joint_source
-        )
+        self.collector = SampleCollector(robot, samples, healthy, settings, period, joint_source)
         least = way.least_samples
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps
         )
-        self.keeper = CheckpointKeeper(robot, self.samples, directory, way.gated)
+        self.keeper = CheckpointKeeper(robot, samples, directory, way.gated)
         saved = self.keeper.load()
         if self.samples:
             # They keep the versions of the body state that they were taken under: count on.
@@ -144,6 +141,11 @@ class Learner:
         self.scheduler.note_news()
 
     # -- what others decide ---------------------------------------------------------------------
+
+    @property
+    def samples(self) -> SampleStore:
+        """What is learned from."""
+        return self.collector.samples
 
     @property
     def body(self) -> BodyState:

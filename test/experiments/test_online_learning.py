@@ -23,7 +23,7 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.sensors import SIGHTED, sighted
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.presets import PRESETS
 
@@ -102,7 +102,7 @@ def test_the_error_counts_as_halved_once_it_stays_below_half():
 
 def test_a_full_sample_store_does_not_change_how_often_a_marker_is_used(arm26):
     learner, nothing = Learner(arm26), np.zeros(arm26.muscle_count)
-    learner.samples = SampleStore(capacity=2 * SIGHTED)
+    learner.samples.capacity = 2 * SIGHTED
     observed = []
     for count in range(6 * SIGHTED):
         observed.append(sighted(learner))
