@@ -6,7 +6,7 @@
 For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
 minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
 Printed are the largest of every measure over all of them beside its limit, the same of the messages
-(`plausibility.py`, `controller`'s overload_time), what was refused (none may be), and how many of
+(`signals/limits.py`, `controller`'s overload_time), what was refused (none may be), and how many of
 the initial and the last learned networks are refused under each attack.
 
 Exit status 1 if a healthy network was refused, or an attack was not.
@@ -40,17 +40,18 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.plausibility import ESTIMATE_OUTSIDE, SLIP, TOO_TENSE, outside_limits
 from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
+from musculoskeletal_ae.signals.limits import share_outside
 
 LOAD, MINUTE = 3.6, 60.0  # [kg], [s]
 
 MESSAGES = {
-    'step of l in 10 ms [m]': SLIP,
-    'T beside tension.max': TOO_TENSE,
+    'step of l in 10 ms [m]': SIGNAL_LIMITS.step,
+    'T beside tension.max': SIGNAL_LIMITS.highest_tension,
     'time of a T above tension.limit [s]': Settings().overload_time,
-    'θ_est beyond its limits, of the range': ESTIMATE_OUTSIDE,
+    'θ_est beyond its limits, of the range': SIGNAL_LIMITS.estimate_outside,
 }
 
 
@@ -65,7 +66,7 @@ def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, flo
         np.abs(np.diff(stream.length, axis=0)).max(),
         (stream.tension / robot.tension.max).max(),
         longest,
-        max(0.0, outside_limits(robot, theta).max()),
+        max(0.0, share_outside(robot, theta).max()),
     )
     return dict(zip(MESSAGES, map(float, values), strict=True))
 

@@ -16,8 +16,8 @@ from scipy.optimize import linear_sum_assignment
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.plausibility import length_range
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states, read_posture
 
 RATE_TOLERANCE = 0.2

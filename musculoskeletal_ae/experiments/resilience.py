@@ -17,7 +17,6 @@ if there is none. Five hours of healthy exploration, over all individuals, with 
 released each minute and a push of 10 to 30 N for a second every ten: isolations there are wrong.
 """
 
-import copy
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -138,8 +137,7 @@ class Reached(NamedTuple):
 def reach(loop: Guarded, muscle: int, rng: np.random.Generator) -> Reached:
     """Measure what an arm can still hold and go to without a muscle."""
     robot, held, count = loop.arm.robot, [], 0
-    without = copy.copy(robot)
-    without.isolate([muscle])
+    without = robot.without([muscle])
     postures = robot.random_postures(TRIES, rng)
     for theta, slope in zip(postures, loop.arm.individual.muscle_jacobian(postures)):
         try:

@@ -92,19 +92,11 @@ class Robot:
 
         The copy shares the geometry with the original, which stays as it is.
         """
-        reduced = copy.copy(self)
-        reduced.isolate(muscles)
+        reduced, whole = copy.copy(self), self.description.tension
+        reduced.isolated = tuple(sorted(muscles))
+        used = reduced.used = ~np.isin(np.arange(self.muscle_count), reduced.isolated)
+        reduced.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
         return reduced
-
-    def isolate(self, muscles: Iterable[int]) -> None:
-        """Use all muscles but these, which pull nothing: the tensions that they may have are 0.
-
-        Everything that holds this object is told; who shares it with others isolates in a copy.
-        """
-        self.isolated = tuple(sorted(muscles))
-        used = self.used = ~np.isin(np.arange(self.muscle_count), self.isolated)
-        whole = self.description.tension
-        self.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""

@@ -344,13 +344,13 @@ class QuasiStatics:
         levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
         self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY)
 
-    def use(self, mae: Mae) -> None:
-        """Take a network, and the muscles that are isolated now.
+    def use(self, mae: Mae, robot: Robot) -> None:
+        """Take a network, and the robot with the muscles that are isolated now.
 
         A FloatingPointError says that the network has no finite lengths somewhere.
         """
         self.slopes.fit(mae)
-        robot, elastic, self._mae = self._robot, self._robot.series_elastic, mae
+        self._robot, elastic, self._mae = robot, robot.series_elastic, mae
         # A noisy fit may find a little less than none, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction

@@ -34,9 +34,9 @@ class PaperDescent:
     def __init__(self, robot: Robot) -> None:
         self._robot, self._load = robot, Load(robot.kinematics)
 
-    def use(self, mae: Mae) -> None:
-        """Take a network."""
-        self._mae = mae
+    def use(self, mae: Mae, robot: Robot) -> None:
+        """Take a network, and the robot with the muscles that are isolated now."""
+        self._mae, self._robot = mae, robot
 
     def step(
         self,

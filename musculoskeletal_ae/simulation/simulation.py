@@ -9,7 +9,6 @@ network may be on a GPU. `equilibrium` has the equations of preset `default`, `p
 descent.
 """
 
-import copy
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -64,7 +63,7 @@ class Simulation:
             MusculoskeletalError: If torch computes nothing there, the preset cannot, or there are
                 no arms.
         """
-        self.robot = copy.copy(robot)
+        self.robot = robot
         kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
         self._body, self._device = kind(self.robot), device
         if device is not None and kind is PaperDescent:
@@ -79,12 +78,12 @@ class Simulation:
 
         A FloatingPointError says that it cannot be simulated; the one in use stays.
         """
-        self._body.use(mae if self._device is None else _there(mae, self._device))
+        self._body.use(mae if self._device is None else _there(mae, self._device), self.robot)
         self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
-        self.robot.isolate(muscles)
+        self.robot = self.robot.without(muscles)
         self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
