@@ -188,9 +188,8 @@ def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
 
 
 def test_a_path_avoids_postures_that_cannot_be_held():
-    robot = Robot.load('musashi_left_arm')
-    whole = robot
-    robot = whole.without([robot.muscles.index('pectoralis_major')])
+    whole = Robot.load('musashi_left_arm')
+    robot = whole.without([whole.muscles.index('pectoralis_major')])
     mae = ExactMae(robot)
 
     def lack(start, path):
