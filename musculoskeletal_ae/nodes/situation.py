@@ -7,6 +7,7 @@ are shown as they are.
 
 import contextlib
 import math
+from collections import deque
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
@@ -14,6 +15,11 @@ from musculoskeletal_ae.control.stops import EXPLORE, REPAIR, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 
 OLD = 1.0  # [s] after which something that moves is no longer shown
+FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
+VERSION = 'checkpoint version'
+#: reports, one a second, in which the estimator's earlier networks are no mismatch, and after which
+#: another network is one
+REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
 ACTIVITIES = {activity.value for activity in Activity}
@@ -48,6 +54,8 @@ class Situation:
         self._control: dict[str, str] = {}  # the values that the controller reports
         self._has_explored = False  # before it stopped
         self._errors: dict[str, str] = {}  # all other errors, by node
+        self._accepted: deque[str] = deque(maxlen=REPORTS)  # the estimator's last versions
+        self._other_networks: dict[str, tuple[str, int]] = {}  # version and for how many reports
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Take a message of /diagnostics."""
@@ -62,9 +70,12 @@ class Situation:
                 self.checkpoints = values.get('checkpoints', '')
             elif name == 'estimator':
                 self._take_estimator(values)
+                self._accepted.append(values.get(VERSION, ''))
             elif name == 'controller':
                 self.doing = status.message
                 self._take_controller(values)
+            if name in FOLLOWERS:
+                self._compare_network(name, values.get(VERSION, ''))
             # An anomaly and a stop are shown with what to do about them.
             is_shown = name in ('estimator', 'controller') and 'fault' not in values
             self._errors.pop(node, None)
@@ -77,6 +88,14 @@ class Situation:
         with contextlib.suppress(ValueError):
             self.distance = float(values.get('d', 'nan'))
             self.limit = float(values.get('d limit', 'nan'))
+
+    def _compare_network(self, node: str, version: str) -> None:
+        """Note how long a node has used a network that the estimator does not use."""
+        if not version or not self._accepted or version in self._accepted:
+            self._other_networks.pop(node, None)
+            return
+        _, reports = self._other_networks.get(node, ('', 0))
+        self._other_networks[node] = version, reports + 1
 
     def _take_controller(self, values: dict[str, str]) -> None:
         self._control = values
@@ -102,6 +121,12 @@ class Situation:
             if self._has_explored:
                 remedy = f'{remedy}; {EXPLORE}'
             parts.append(_with_remedy(f'STOPPED: {self._control.get("stop", cause)}', remedy))
+        for node, (version, reports) in self._other_networks.items():
+            if reports >= REPORTS:
+                parts.append(
+                    f'{node} uses network {version}, the estimator {self._accepted[-1]}: '
+                    f'restart {node}'
+                )
         parts += [f'{node}: {message}' for node, message in self._errors.items()]
         return ', '.join(parts)
 

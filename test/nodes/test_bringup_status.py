@@ -116,6 +116,25 @@ def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     )
 
 
+def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seconds():
+    situation = Situation('/')
+
+    def second(estimator, controller):
+        for node, version in ('estimator', estimator), ('controller', controller):
+            situation.diagnosed(said(f'/{node}', mode='holding', checkpoint_version=str(version)))
+
+    for version in range(10):  # the controller follows a moment later
+        second(version, max(version - 1, 0))
+        assert situation.trouble() == ''
+    for _ in range(3):
+        second(20, 3)
+    assert situation.trouble() == (
+        'controller uses network 3, the estimator 20: restart controller'
+    )
+    second(20, 20)
+    assert situation.trouble() == ''
+
+
 def test_an_error_of_any_node_is_shown_until_it_is_over():
     error = DiagnosticStatus.ERROR
     alone = Situation('/')
