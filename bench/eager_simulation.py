@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector
+from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.equilibrium import (
     JOINT_SPEED,
     MODULE_SPEED,

@@ -16,11 +16,11 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.pairing import Pairing
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
+from musculoskeletal_ae.signals.pairing import Pairing
 from musculoskeletal_ae.validity import read_array, read_names, read_posture
 
 
@@ -52,7 +52,7 @@ class Streams(NamedTuple):
     rejected: Counter[str]  # messages left out, by topic and reason
 
     def pairs(self) -> Pairs:
-        """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.pairing`)."""
+        """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.signals.pairing`)."""
         time = self.muscles.time
         pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))

@@ -36,10 +36,10 @@ from musculoskeletal_ae.control.ramps import Ramp
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.control.winches import Winches
-from musculoskeletal_ae.friction import slid
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.friction import slid
 
 PROPORTIONAL, INTEGRAL = 0.7, 4.0  # k_p; k_i [1/s]
 FRICTION = 0.05  # μ where none was learned: the mean of what hands build

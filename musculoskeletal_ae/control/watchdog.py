@@ -17,8 +17,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import Condition, StopCause
-from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 

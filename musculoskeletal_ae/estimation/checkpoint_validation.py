@@ -34,12 +34,12 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.exceptions import GateError
-from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
 
 POSTURES = 64
 SPAN, SPACING = 10.0, 0.1  # [s] of messages, and between those that are kept

@@ -37,12 +37,12 @@ from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimat
 from musculoskeletal_ae.estimation.status import SILENCE
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 #: A pause in the messages counts as at most this much of the time that detectors measure.

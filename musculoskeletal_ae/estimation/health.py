@@ -17,10 +17,10 @@ from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.heat import Heat
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets import preset_named
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.heat import Heat
 
 
 class HealthMonitor:

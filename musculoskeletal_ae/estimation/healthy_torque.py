@@ -12,10 +12,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.contact import ContactEstimator
-from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 MEMORY = 180.0  # [s] of motion whose torques count
 MOVING = 0.05  # [rad/s], or times RACK [m/s], of all joints together, below which an arm rests

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.friction import FrictionDirection
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 WINDOW = 0.25  # [s] that one moment averages
 MOVED = 0.002  # [m] of some muscle since the moment before, beyond which the arm has moved on

@@ -41,7 +41,6 @@ from musculoskeletal_ae.experiments.recording import (
     times,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
-from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.learning.collector import SENSOR
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
@@ -51,6 +50,7 @@ from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors, training_states
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
 from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # of held-out messages, after every update
 FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit

@@ -19,8 +19,8 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.friction import FrictionDirection, directions, end_tension
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 #: random streams of the exploration (plus the individual's seed), and of the held-out motion

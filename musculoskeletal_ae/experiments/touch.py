@@ -14,9 +14,9 @@ from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
-from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 TOUCH_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4

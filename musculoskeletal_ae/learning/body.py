@@ -23,9 +23,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints, Singles
-from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.signals.friction import end_tension
 
 FEATURES = 60  # of the residual model that are drawn, per muscle
 WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
-from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.signals.friction import end_tension
 
 CAPACITY = 4000
 SPACING = 0.1  # [s] between messages that are kept

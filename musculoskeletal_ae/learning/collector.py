@@ -21,11 +21,11 @@ from musculoskeletal_ae.learning.margin import AnomalyMargin
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import Settings
-from musculoskeletal_ae.pairing import Paired, Pairing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
 #: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'

@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
+from musculoskeletal_ae.signals.friction import end_tension
 
 DIFFERENCE = 1e-6  # [rad] or [m]
 #: turn of a joint over which Σ T ∂²l/∂θ² of the geometric model is as it was [rad], for prismatic

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.friction import end_tension
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.signals.friction import end_tension
 
 CAPACITY = 400
 #: creep of wires is told from this share of a store on, if as many samples come with all angles

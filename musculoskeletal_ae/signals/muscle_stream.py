@@ -20,9 +20,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
 from musculoskeletal_ae.signals.limits import (
     LENGTH,
     LENGTH_JUMPED,

@@ -26,11 +26,11 @@ import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, Tree, hold
 
 #: l_target of muscles without a command: paid out, so that MSC holds T_bias

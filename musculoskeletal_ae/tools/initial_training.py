@@ -19,7 +19,6 @@ from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.friction import directions, end_tension
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -38,6 +37,7 @@ from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import directions, end_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 UNSEEN = 5000  # states

@@ -11,10 +11,10 @@ from exact_mae import ExactMae
 from musculoskeletal_ae.estimation.contact import CONTACT, ContactEstimator
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
-from musculoskeletal_ae.friction import FrictionDirection
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 ARM = Robot.load('musashi_left_arm')
 THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])

@@ -14,8 +14,8 @@ from nominal_rest import (
 )
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.friction import REVERSAL
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation import simulation
 from musculoskeletal_ae.simulation.equilibrium import JOINT_SPEED
 from musculoskeletal_ae.simulation.simulation import Simulation, on_all_cores

@@ -8,7 +8,7 @@ named in /diagnostics, but the arm is not stopped for it.
 from collections.abc import Iterable
 
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
-from musculoskeletal_ae.heat import Heat
+from musculoskeletal_ae.signals.heat import Heat
 
 COOL = 60.0  # [°C] of the winding
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.pairing import Pairing
+from musculoskeletal_ae.signals.pairing import Pairing
 
 
 def test_the_nearest_angle_within_half_a_period_is_paired():

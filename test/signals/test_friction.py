@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.friction import FrictionDirection, directions
+from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
 DT = 0.01
 

@@ -8,8 +8,8 @@ from numba import njit
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow
 
 ROBOT = Robot.load('arm26')
 COUNT, TENSION = ROBOT.muscle_count, ROBOT.tension
