@@ -4,9 +4,11 @@
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.nodes.stop_recording import FILE
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
@@ -41,6 +43,24 @@ def test_a_stop_pays_out_keeps_commanding_and_ends_only_by_a_reset(moving):
     assert 'stopped' in refused.message
     assert reset(arm).success
     arm.goes_to(HERE)
+
+
+def test_mode_and_stop_cause_are_published_as_identifiers_also_to_late_subscribers(moving):
+    arm = moving()
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    modes = arm.graph.listen(String, 'controller_mode', LATCHED)
+
+    def reported(mode):
+        arm.graph.wait(lambda: modes and modes[-1].data == mode, mode)
+
+    reported('stopped:operator_stop')
+    values = arm.state().values
+    assert (values['mode'], values['stop cause']) == ('stopped', 'operator_stop')
+    assert values['remedy'] == 'call controller/reset'
+    assert reset(arm).success
+    reported('moving')
+    reported('holding')
+    assert 'stop cause' not in arm.state().values
 
 
 def test_the_seconds_before_a_stop_are_saved_as_a_bag(moving, tmp_path, monkeypatch):
