@@ -35,7 +35,7 @@ class EagerSimulation:
     def __init__(self, ours: Simulation) -> None:
         """Begin as ours, of preset `default`, are now, and are commanded, pushed and held."""
         robot, own = ours.robot, QuasiStatics(ours.robot)
-        own.use(ours.mae)
+        own.use(ours.mae, robot)
         self.network = from_mae(ours.mae)
         self.scale = _single(scale_vector(robot.joint_count, robot.muscle_count))
         self.body = type(own.body)(*map(_single, own.body))

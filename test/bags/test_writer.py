@@ -17,8 +17,8 @@ from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
 
 LATCHED = (
-    'robot_description', 'accepted_checkpoint', 'anomaly_detected', 'isolated_muscles',
-    'mae_checkpoint', 'muscle_length_zeros',
+    'robot_description', 'accepted_checkpoint', 'anomaly_detected', 'controller_mode',
+    'isolated_muscles', 'mae_checkpoint', 'muscle_length_zeros',
 )  # fmt: skip
 
 
