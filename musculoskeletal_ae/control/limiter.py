@@ -11,6 +11,9 @@ is a limit of its commanded length:
 It may pay a muscle out faster than the rate limit, if the tension that is measured is above
 `tension.limit`, and it never winds one in. The rate limit compares with the last command that was
 published, whatever has happened in between.
+
+The tension limit is what the heat of the motors allows for a moment (`watchdog.HeatLimit`), at most
+`tension.max`. While the length offsets are unknown it is at most `calibrating.gentle_limit`.
 """
 
 from __future__ import annotations
